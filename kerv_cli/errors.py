@@ -1,0 +1,40 @@
+"""Every error that kerv raises on purpose. The command line prints one line for each and exits with its code."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class KervError(Exception):
+    """Something failed while the command ran. Message: what, where, what to do, in one line."""
+
+    exit_code = 1
+
+
+class UsageError(KervError):
+    """The request itself is wrong: unknown name, wrong key, impossible value."""
+
+    exit_code = 2
+
+
+class UnknownName(UsageError):
+    """A name that no registry knows; the message lists the nearest ones."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        known = list(known)
+        near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+        super().__init__(f"unknown {kind} '{name}': {hint}")
+
+
+class RenderingUnavailable(KervError):
+    """No OpenGL backend can draw a frame here."""
+
+
+class CheckpointError(KervError):
+    """A checkpoint, drafter, dataset or manifest is missing, damaged or belongs to something else."""
+
+
+class StorageError(KervError):
+    """The disk refused: full, read-only, or not permitted."""
