@@ -1,0 +1,94 @@
+"""What happened in one decode and in one episode, in frozen dataclasses.
+
+Rerun files, CSV tables and plots are three readers of these records; nothing else carries results.
+Notation (METHODS §0): D degrees of freedom, H control steps in a chunk, N = H·D tokens of a chunk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+PHASES = ("preprocess", "vision", "prefill", "propose", "verify", "accept", "rectify", "other")
+"""Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of a decode: a draft judged against the target's verdicts.
+
+    `drafted` is the judged path: the accepted tokens followed, where there was a rejection, by the best rejected
+    candidate at the next position. `verdicts` are the target's argmax tokens at the same positions and, when the
+    whole path was accepted and tokens remain, one more: the bonus.
+    """
+
+    mode: str  # "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward)
+    proposer: str  # which proposer drafted: "none", "drafter", "retrieval", "early", "hold", "kalman", ...
+    start: int  # tokens committed before this round
+    drafted: tuple[int, ...]
+    verdicts: tuple[int, ...]
+    accepted: int  # draft tokens accepted
+    committed: int  # tokens committed by this round: accepted + bonus
+    tree_size: int  # nodes verified
+    threshold: tuple[int, ...]  # r per DoF, in bins; empty where no acceptance rule with a threshold ran
+
+
+@dataclass(frozen=True)
+class DecodeRecord:
+    """One call of the decoder: from an observation to the actions to execute."""
+
+    tokens: tuple[int, ...]  # committed tokens, in order; N of them unless the rest of the chunk was dropped
+    actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps <= H
+    forwards: int  # target forwards, prefill included
+    rounds: tuple[Round, ...]
+    mode: str  # decode mode, for the state timeline: "ar", "drafter", "retrieval", "skip", "one_pass", "hold", ...
+    seconds: float  # inference time (METHODS §7), device synchronised at both ends
+    phases: dict[str, float]  # seconds by phase, keys from PHASES
+    compensated: int = 0  # tokens filled by a prediction instead of the target
+    skipped: bool = False  # executed without a verification
+    variability: float | None = None  # K of this decode (METHODS §3.2), normalised action units
+    similarity: float | None = None  # best retrieval similarity, where one was looked up
+    metric: float | None = None  # fused hybrid-boundary metric F (METHODS §4.4)
+    deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
+
+    @property
+    def verifications(self) -> int:
+        """Rounds in which a tree was judged by the target."""
+        return sum(1 for r in self.rounds if r.tree_size > 0 and r.mode != "skip")
+
+    @property
+    def first_rejected(self) -> int | None:
+        """Index in the chunk of the first rejected token of the first verification; N if none; None if no tree."""
+        for r in self.rounds:
+            if r.tree_size > 0 and r.mode != "skip":
+                return r.start + r.accepted if r.accepted < len(r.drafted) else len(self.tokens)
+        return None
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """One episode: a task, a seed, and everything the decoder did."""
+
+    task: str
+    instruction: str
+    seed: int
+    success: bool  # Meta-World's flag at any step within the horizon
+    steps: int  # T, control steps executed
+    decodes: tuple[DecodeRecord, ...]
+    decode_steps: tuple[int, ...]  # control step at which each decode's actions begin, same length as `decodes`
+    actions: np.ndarray  # (T, D) float32, executed, environment units, clipped to [-1, 1]
+    path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
+    gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
+    rand_vec: np.ndarray  # Meta-World's random vector: with the task it rebuilds the initial state
+    frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
+    wall_seconds: float = 0.0  # whole episode, simulation and rendering included
+
+    @property
+    def seconds(self) -> float:
+        """Inference time of the episode."""
+        return sum(d.seconds for d in self.decodes)
+
+    @property
+    def forwards(self) -> int:
+        return sum(d.forwards for d in self.decodes)
