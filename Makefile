@@ -1,0 +1,40 @@
+# Every rule runs from a fresh clone; `make` alone lists them.
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.kerv-installed
+CODE := kerv_cli tests scripts
+
+# One thread: the models are small, and results and timings must not depend on the number of cores.
+test: export OMP_NUM_THREADS := 1
+
+.NOTPARALLEL:
+.PHONY: help setup test demo lint format clean
+
+help: ## list these rules
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+setup: $(STAMP) ## install kerv and its tools into .venv, and the OpenGL libraries if MuJoCo cannot draw
+	@scripts/graphics.sh $(BIN)/python
+
+$(STAMP): pyproject.toml
+	@PYTHON="$(PYTHON)" scripts/install.sh $@
+
+test: lint ## check style and types, then run the tests
+	@$(BIN)/python -m pytest
+
+demo: setup ## run the demo study and report it
+	@$(BIN)/kerv sweep study=demo
+	@$(BIN)/kerv report study=demo
+
+lint: setup ## check style and types
+	@$(BIN)/ruff check $(CODE)
+	@$(BIN)/ruff format --check $(CODE)
+	@$(BIN)/mypy
+
+format: setup ## rewrite the code in the project's style
+	@$(BIN)/ruff check --fix --quiet $(CODE)
+	@$(BIN)/ruff format $(CODE)
+
+clean: ## remove caches and built packages; keeps .venv and results
+	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis MUJOCO_LOG.TXT
+	@find kerv_cli tests scripts conf -name __pycache__ -prune -exec rm -rf {} +
