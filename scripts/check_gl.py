@@ -1,7 +1,7 @@
 """Can MuJoCo draw off screen here? Prints the first OpenGL backend that works; exit status 1 when none does.
 
-Standard library only and no MuJoCo, so that it costs milliseconds and runs before anything is installed. Loading a library proves
-little (libEGL loads on machines without a driver), so each backend must also create an OpenGL context.
+Standard library only and no MuJoCo, so that it costs milliseconds. Loading a library proves little (libEGL loads on
+machines without a driver), so each backend must also create an OpenGL context.
 """
 
 from __future__ import annotations
@@ -22,13 +22,15 @@ OSMESA_RGBA = 0x1908
 MAX_DEVICES = 10
 
 
-def load(names: Sequence[str]) -> ctypes.CDLL | None:
-    """The first library that the loader finds and accepts."""
+def load(names: Sequence[str], function: str) -> ctypes.CDLL | None:
+    """The first library that the loader accepts and that has the function."""
     for name in names:
         try:
-            return ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+            library = ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
         except OSError:
             continue
+        if hasattr(library, function):
+            return library
     return None
 
 
@@ -51,8 +53,8 @@ def _display_creates_context(egl: ctypes.CDLL, display: int) -> bool:
 
 def egl_works(names: Sequence[str] = EGL_LIBRARIES) -> bool:
     """Whether one of EGL's devices (a GPU, or Mesa's software renderer) gives a context without a display server."""
-    egl = load(names)
-    if egl is None or load(GL_LIBRARIES) is None:
+    egl = load(names, "eglGetProcAddress")
+    if egl is None or load(GL_LIBRARIES, "glReadPixels") is None:
         return False
     egl.eglGetProcAddress.restype = ctypes.c_void_p
     query = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
@@ -70,7 +72,7 @@ def egl_works(names: Sequence[str] = EGL_LIBRARIES) -> bool:
 
 def osmesa_works(names: Sequence[str] = OSMESA_LIBRARIES) -> bool:
     """Whether Mesa's off-screen software renderer gives a context."""
-    osmesa = load(names)
+    osmesa = load(names, "OSMesaCreateContextExt")
     if osmesa is None:
         return False
     osmesa.OSMesaCreateContextExt.restype = ctypes.c_void_p

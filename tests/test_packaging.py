@@ -1,0 +1,302 @@
+"""What a stranger gets: the wheel's contents, and the set-up scripts run against stand-ins for Python, apt and sudo."""
+
+from __future__ import annotations
+
+import email
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from configparser import ConfigParser
+from email.message import Message
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+STAMP = Path(".venv/.kerv-installed")
+TOOLS = ("awk", "bash", "cat", "chmod", "dirname", "env", "make", "mkdir", "rm", "sleep", "touch")
+
+# --- the wheel ---
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    built = subprocess.run([*command, "--wheel-dir", folder, ROOT], capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    (path,) = folder.glob("kerv-*.whl")
+    return zipfile.ZipFile(path)
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: zipfile.ZipFile) -> Message:
+    (name,) = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
+    return email.message_from_bytes(wheel.read(name))
+
+
+def test_the_wheel_carries_every_config_file(wheel: zipfile.ZipFile) -> None:
+    expected = {f"kerv_cli/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
+    assert expected, "conf/ holds no YAML file"
+    assert expected <= set(wheel.namelist())
+
+
+def test_the_wheel_carries_the_package_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+    names = {name for name in wheel.namelist() if ".dist-info/" not in name and not name.startswith("kerv_cli/conf/")}
+    assert names >= {path.relative_to(ROOT).as_posix() for path in (ROOT / "kerv_cli").rglob("*.py")}
+    assert {name.split("/")[0] for name in names} == {"kerv_cli"}
+
+
+def test_the_command_names_a_function_that_the_wheel_holds(wheel: zipfile.ZipFile) -> None:
+    (name,) = [name for name in wheel.namelist() if name.endswith("entry_points.txt")]
+    entry_points = ConfigParser()
+    entry_points.read_string(wheel.read(name).decode())
+    module, function = entry_points["console_scripts"]["kerv"].split(":")
+    assert f"def {function}(" in wheel.read(module.replace(".", "/") + ".py").decode()
+
+
+def test_the_wheel_states_its_licence_and_ships_the_text(wheel: zipfile.ZipFile, metadata: Message) -> None:
+    assert metadata["License-Expression"] == "Apache-2.0"
+    (licence,) = [name for name in wheel.namelist() if name.endswith("/licenses/LICENSE")]
+    assert wheel.read(licence) == (ROOT / "LICENSE").read_bytes()
+
+
+def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadata: Message) -> None:
+    requirements = metadata.get_all("Requires-Dist") or []
+    assert "mujoco==3.3.0" in requirements
+    assert any(line.startswith("metaworld") and ">=3.1.1" in line for line in requirements)
+
+
+# --- make setup ---
+
+
+def executable(path: Path, script: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/usr/bin/env bash\n{script}")
+    path.chmod(0o755)
+
+
+# A Python of version $KERV_TEST_VERSION. The one in its environments logs what pip is asked, fails or hangs on request,
+# and says that MuJoCo can draw once the file `drawable` exists.
+PYTHON = r"""
+case "$1 $2" in
+    "-c import sys; sys.exit"*) "$KERV_TEST_PYTHON" -c "import sys; sys.version_info = (${KERV_TEST_VERSION:-3, 11}, 0); $2" ;;
+    "-c import ensurepip"*) true ;;
+    "-m venv") mkdir -p .venv/bin && cat "$0" > .venv/bin/python && chmod +x .venv/bin/python ;;
+    "-m pip") [ "$3" = --version ] && exit 0
+              echo "pip ${@:3}" >> log; [ ! -e pip-hangs ] || sleep 60; [ ! -e pip-fails ] ;;
+    "-I -S") [ -e drawable ] ;;
+    *) echo "unexpected: $*" >&2; exit 97 ;;
+esac
+"""
+
+
+class Checkout:
+    """A copy of the Makefile and its scripts where only stand-ins can be found on the PATH."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.bin = root / "stand-ins"
+        shutil.copytree(ROOT / "scripts", root / "scripts", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "Makefile", root)
+        (root / "pyproject.toml").touch()
+        self.bin.mkdir()
+        for tool in TOOLS:
+            found = shutil.which(tool)
+            assert found, f"{tool} is needed here"
+            (self.bin / tool).symlink_to(found)
+        executable(self.bin / "python3", PYTHON)
+        executable(self.bin / "apt-get", 'echo "apt-get $*" >> log; [ "$1" = update ] || touch drawable')
+        executable(self.bin / "apt-cache", "true")
+        self.user(0)
+        (root / "drawable").touch()
+
+    def user(self, uid: int) -> None:
+        executable(self.bin / "id", f"echo {uid}")
+
+    def environment(self, **extra: str) -> dict[str, str]:
+        return {"PATH": str(self.bin), "HOME": str(self.root), "KERV_TEST_PYTHON": sys.executable, **extra}
+
+    def setup(self, **extra: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["make", "setup"], cwd=self.root, env=self.environment(**extra), capture_output=True, text=True, check=False
+        )
+
+    @property
+    def log(self) -> list[str]:
+        path = self.root / "log"
+        return path.read_text().splitlines() if path.exists() else []
+
+    @property
+    def stamped(self) -> bool:
+        return (self.root / STAMP).exists()
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def setup_lines(result: subprocess.CompletedProcess[str]) -> list[str]:
+    """The lines that the scripts wrote on standard error; make adds its own."""
+    return [line for line in result.stderr.splitlines() if not line.startswith("make")]
+
+
+def test_setup_installs_once(checkout: Checkout) -> None:
+    assert checkout.setup().returncode == 0
+    assert checkout.log == ["pip install --quiet --disable-pip-version-check --editable .[dev]"]
+    second = checkout.setup()
+    assert (second.returncode, second.stdout, second.stderr) == (0, "", "")
+    assert len(checkout.log) == 1
+
+
+def test_setup_installs_again_when_the_requirements_change(checkout: Checkout) -> None:
+    checkout.setup()
+    os.utime(checkout.root / "pyproject.toml", (time.time() + 60, time.time() + 60))
+    checkout.setup()
+    assert len(checkout.log) == 2
+
+
+def test_a_failed_installation_is_tried_again(checkout: Checkout) -> None:
+    (checkout.root / "pip-fails").touch()
+    assert checkout.setup().returncode != 0
+    assert not checkout.stamped
+    (checkout.root / "pip-fails").unlink()
+    assert checkout.setup().returncode == 0
+    assert checkout.stamped
+
+
+def test_an_interrupted_installation_leaves_no_stamp(checkout: Checkout) -> None:
+    (checkout.root / "pip-hangs").touch()
+    running = subprocess.Popen(
+        ["make", "setup"],
+        cwd=checkout.root,
+        env=checkout.environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 20
+    while not checkout.log and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(running.pid, signal.SIGINT)
+    assert running.wait(timeout=20) != 0
+    assert checkout.log, "the installation never started"
+    assert not checkout.stamped
+
+
+@pytest.mark.parametrize("version", ["3, 11", "3, 13"])
+def test_setup_accepts_the_pythons_that_kerv_runs_on(checkout: Checkout, version: str) -> None:
+    assert checkout.setup(KERV_TEST_VERSION=version).returncode == 0
+
+
+@pytest.mark.parametrize("version", ["3, 10", "3, 14"])
+def test_setup_without_a_suitable_python_says_so_in_one_line(checkout: Checkout, version: str) -> None:
+    result = checkout.setup(KERV_TEST_VERSION=version)
+    assert result.returncode != 0
+    (line,) = setup_lines(result)
+    assert "Python 3.11, 3.12 or 3.13" in line
+    assert not (checkout.root / ".venv").exists()
+
+
+def test_setup_prefers_python_3_11(checkout: Checkout) -> None:
+    for name in ("python3.11", "python3.12", "python3"):
+        executable(checkout.bin / name, f'[ "$2" != venv ] || echo {name} >> log\n{PYTHON}')
+    checkout.setup()
+    assert checkout.log[0] == "python3.11"
+
+
+def test_root_gets_the_graphics_libraries_from_fresh_lists(checkout: Checkout) -> None:
+    (checkout.root / "drawable").unlink()
+    assert checkout.setup().returncode == 0
+    update, install = checkout.log[1:]
+    assert update.startswith("apt-get update")
+    assert {"libegl1", "libgl1", "libgl1-mesa-dri", "libosmesa6"} <= set(install.split())
+
+
+def test_graphics_libraries_that_the_system_no_longer_has_are_left_out(checkout: Checkout) -> None:
+    (checkout.root / "drawable").unlink()
+    executable(checkout.bin / "apt-cache", '[ "$2" != libosmesa6 ]')
+    assert checkout.setup().returncode == 0
+    assert "libegl1" in checkout.log[-1].split()
+    assert "libosmesa6" not in checkout.log[-1].split()
+
+
+def test_sudo_is_used_where_it_asks_nothing(checkout: Checkout) -> None:
+    (checkout.root / "drawable").unlink()
+    checkout.user(1000)
+    executable(checkout.bin / "sudo", 'echo "sudo $*" >> log; shift; "$@"')
+    assert checkout.setup().returncode == 0
+    assert any(line.startswith("sudo -n apt-get install") for line in checkout.log)
+
+
+@pytest.mark.parametrize("sudo", [None, "exit 1"])
+def test_without_the_right_to_install_setup_prints_the_command(checkout: Checkout, sudo: str | None) -> None:
+    (checkout.root / "drawable").unlink()
+    checkout.user(1000)
+    if sudo:
+        executable(checkout.bin / "sudo", sudo)
+    result = checkout.setup()
+    assert result.returncode != 0
+    (line,) = setup_lines(result)
+    assert "sudo apt-get update && sudo apt-get install -y libegl1 libgl1 libgl1-mesa-dri libosmesa6" in line
+    assert not any(line.startswith("apt-get") for line in checkout.log)
+    assert checkout.stamped, "the Python part is done and need not be done again"
+
+
+def test_libraries_that_do_not_help_are_an_error(checkout: Checkout) -> None:
+    (checkout.root / "drawable").unlink()
+    executable(checkout.bin / "apt-get", "true")
+    result = checkout.setup()
+    assert result.returncode != 0
+    assert "gives no context" in setup_lines(result)[-1]
+
+
+# --- the check for graphics ---
+
+
+def load_check() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("check_gl", ROOT / "scripts" / "check_gl.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_library_that_is_absent_or_not_opengl_does_not_count_as_graphics() -> None:
+    check = load_check()
+    assert not check.egl_works(("libkerv-absent.so.1",))
+    assert not check.osmesa_works(("libkerv-absent.so.1",))
+    assert check.load(("libkerv-absent.so.1", "libc.so.6"), "printf") is not None
+    assert not check.egl_works(("libc.so.6",))
+    assert not check.osmesa_works(("libc.so.6",))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems bring their own OpenGL")
+def test_the_graphics_check_agrees_that_this_machine_can_draw() -> None:
+    command = [sys.executable, "-I", "-S", ROOT / "scripts" / "check_gl.py"]
+    check = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert check.returncode == 0
+    assert check.stdout.strip() in {"egl", "osmesa"}
+
+
+# --- this checkout ---
+
+
+def test_make_setup_here_does_nothing_and_is_quick() -> None:
+    outer = {"MAKEFLAGS", "MFLAGS", "MAKELEVEL"}  # of the `make test` that runs this
+    environment = {name: value for name, value in os.environ.items() if name not in outer}
+    current = subprocess.run(["make", "--question", STAMP], cwd=ROOT, env=environment, capture_output=True, check=False)
+    if current.returncode:
+        pytest.skip("this checkout's .venv was not made by `make setup`, or pyproject.toml changed since")
+    began = time.monotonic()
+    again = subprocess.run(["make", "setup"], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
+    assert time.monotonic() - began < 5
