@@ -86,7 +86,8 @@ def executable(path: Path, script: str) -> None:
 # and says that MuJoCo can draw once the file `drawable` exists.
 PYTHON = r"""
 case "$1 $2" in
-    "-c import sys; sys.exit"*) "$KERV_TEST_PYTHON" -c "import sys; sys.version_info = (${KERV_TEST_VERSION:-3, 11}, 0); $2" ;;
+    "-c import sys; sys.exit"*)
+        "$KERV_TEST_PYTHON" -c "import sys; sys.version_info = (${KERV_TEST_VERSION:-3, 11}, 0); $2" ;;
     "-c import ensurepip"*) true ;;
     "-m venv") mkdir -p .venv/bin && cat "$0" > .venv/bin/python && chmod +x .venv/bin/python ;;
     "-m pip") [ "$3" = --version ] && exit 0
