@@ -1,0 +1,1 @@
+"""The world: Meta-World behind a small interface. Importing this package loads neither metaworld nor mujoco."""

@@ -1,0 +1,150 @@
+"""The 50 tasks of Meta-World v3: names, instructions, difficulty groups, suites. Imports nothing heavy.
+
+Tasks are joined by name, never by index: published tables order them differently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from kerv_cli.errors import UnknownName
+
+DIFFICULTIES = ("easy", "medium", "hard", "very_hard")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One manipulation task.
+
+    Attributes:
+        name: Meta-World v3 name, e.g. `drawer-open-v3`.
+        instruction: what the robot is told: lower-case words, ten at most, unique among the 50.
+        difficulty: `easy`, `medium`, `hard` or `very_hard` (the groups that published macro averages use).
+    """
+
+    name: str
+    instruction: str
+    difficulty: str
+
+
+# The public table tells push and push-back in one sentence; these 50 are distinct and checked against the experts' motion.
+_INSTRUCTIONS: dict[str, dict[str, str]] = {
+    "easy": {
+        "button-press": "press the button",
+        "button-press-topdown": "press the button from above",
+        "button-press-topdown-wall": "bypass the wall and press the button from above",
+        "button-press-wall": "bypass the wall and press the button",
+        "coffee-button": "press the button of the coffee machine",
+        "dial-turn": "turn the dial",
+        "door-close": "close the door",
+        "door-lock": "turn the lock to lock the door",
+        "door-open": "open the door",
+        "door-unlock": "turn the lock to unlock the door",
+        "drawer-close": "push the drawer closed",
+        "drawer-open": "pull the drawer open",
+        "faucet-close": "turn the faucet off clockwise",
+        "faucet-open": "turn the faucet on counterclockwise",
+        "handle-press": "press the handle down",
+        "handle-press-side": "press the handle down from the side",
+        "handle-pull": "pull the handle up",
+        "handle-pull-side": "pull the handle up from the side",
+        "lever-pull": "pull the lever up",
+        "peg-unplug-side": "unplug the peg sideways",
+        "plate-slide": "slide the plate into the cabinet",
+        "plate-slide-back": "slide the plate back out of the cabinet",
+        "plate-slide-back-side": "slide the plate sideways out of the cabinet",
+        "plate-slide-side": "slide the plate sideways into the cabinet",
+        "reach": "reach the goal position",
+        "reach-wall": "bypass the wall and reach the goal position",
+        "window-close": "slide the window closed",
+        "window-open": "slide the window open",
+    },
+    "medium": {
+        "basketball": "drop the basketball into the basket",
+        "bin-picking": "move the cube from one bin into the other",
+        "box-close": "put the lid on the box",
+        "coffee-pull": "pull the mug away from the coffee machine",
+        "coffee-push": "push the mug under the coffee machine",
+        "hammer": "hit the nail with the hammer",
+        "peg-insert-side": "insert the peg into the hole from the side",
+        "push-wall": "push the puck around the wall to the goal",
+        "soccer": "push the soccer ball into the net",
+        "sweep": "sweep the cube off the table",
+        "sweep-into": "sweep the cube into the hole",
+    },
+    "hard": {
+        "assembly": "put the ring onto the peg",
+        "hand-insert": "put the cube down into the hole",
+        "pick-out-of-hole": "pick the puck out of the hole",
+        "pick-place": "pick up the puck and place it at the goal",
+        "push": "push the puck forward to the goal",
+        "push-back": "drag the cube back to the goal",
+    },
+    "very_hard": {
+        "disassemble": "take the ring off the peg",
+        "pick-place-wall": "lift the puck over the wall to the goal",
+        "shelf-place": "place the cube on the shelf",
+        "stick-pull": "grasp the stick and pull the thermos with it",
+        "stick-push": "grasp the stick and push the thermos with it",
+    },
+}
+
+_MT10 = (
+    "reach",
+    "push",
+    "pick-place",
+    "door-open",
+    "drawer-open",
+    "drawer-close",
+    "button-press-topdown",
+    "peg-insert-side",
+    "window-open",
+    "window-close",
+)
+
+
+def _all_tasks() -> Mapping[str, Task]:
+    tasks = [
+        Task(f"{stem}-v3", instruction, difficulty)
+        for difficulty, group in _INSTRUCTIONS.items()
+        for stem, instruction in group.items()
+    ]
+    return MappingProxyType({task.name: task for task in sorted(tasks, key=lambda task: task.name)})
+
+
+TASKS: Mapping[str, Task] = _all_tasks()
+"""All 50 tasks by full name, in alphabetical order."""
+
+SUITES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"MT10": tuple(f"{stem}-v3" for stem in _MT10), "MT50": tuple(TASKS)}
+)
+"""Suite name -> full task names."""
+
+
+def task(name: str) -> Task:
+    """The task called `name`; the `-v3` suffix may be left out.
+
+    Raises:
+        UnknownName: no such task; the message names the nearest ones.
+    """
+    found = TASKS.get(name) or TASKS.get(f"{name}-v3")
+    if found is None:
+        raise UnknownName("task", name, TASKS)
+    return found
+
+
+def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
+    """Full task names for a list of tasks and suites (`MT10`, `mt50`): order kept, duplicates dropped.
+
+    Raises:
+        UnknownName: a name that is neither a task nor a suite.
+    """
+    resolved: dict[str, None] = {}
+    for name in names:
+        suite = SUITES.get(name.upper())
+        if suite is None and name not in TASKS and f"{name}-v3" not in TASKS:
+            raise UnknownName("task or suite", name, [*SUITES, *TASKS])
+        resolved.update(dict.fromkeys(suite or (task(name).name,)))
+    return tuple(resolved)
