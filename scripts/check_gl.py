@@ -16,8 +16,18 @@ GL_LIBRARIES = ("libOpenGL.so.0", "libGL.so.1")  # PyOpenGL, through which MuJoC
 
 EGL_PLATFORM_DEVICE = 0x313F
 EGL_OPENGL_API = 0x30A2
-# surface type: pbuffer, renderable type: OpenGL, depth 24, end of list
-EGL_PBUFFER_CONFIG = (0x3033, 0x0001, 0x3040, 0x0008, 0x3025, 24, 0x3038)
+# What MuJoCo asks for, as EGL's (attribute, value) pairs.
+EGL_CONFIG = {
+    0x3024: 8,  # red, green, blue and alpha bits
+    0x3023: 8,
+    0x3022: 8,
+    0x3021: 8,
+    0x3025: 24,  # depth bits
+    0x3026: 8,  # stencil bits
+    0x3033: 0x0001,  # surface: off screen
+    0x3040: 0x0008,  # renderable: OpenGL
+}
+EGL_NONE = 0x3038
 OSMESA_RGBA = 0x1908
 MAX_DEVICES = 10
 
@@ -34,21 +44,16 @@ def load(names: Sequence[str], function: str) -> ctypes.CDLL | None:
     return None
 
 
-def _display_creates_context(egl: ctypes.CDLL, display: int) -> bool:
-    handle = ctypes.c_void_p(display)
+def _creates_context(egl: ctypes.CDLL, display: ctypes.c_void_p) -> bool:
+    attributes = [*(word for pair in EGL_CONFIG.items() for word in pair), EGL_NONE]
+    wanted = (ctypes.c_int * len(attributes))(*attributes)
     config, count = ctypes.c_void_p(), ctypes.c_int()
-    wanted = (ctypes.c_int * len(EGL_PBUFFER_CONFIG))(*EGL_PBUFFER_CONFIG)
-    if not egl.eglInitialize(handle, None, None):
+    if not egl.eglChooseConfig(display, wanted, ctypes.byref(config), 1, ctypes.byref(count)) or count.value < 1:
         return False
-    try:
-        if not egl.eglChooseConfig(handle, wanted, ctypes.byref(config), 1, ctypes.byref(count)) or count.value < 1:
-            return False
-        if not egl.eglBindAPI(EGL_OPENGL_API):
-            return False
-        egl.eglCreateContext.restype = ctypes.c_void_p
-        return bool(egl.eglCreateContext(handle, config, None, None))
-    finally:
-        egl.eglTerminate(handle)
+    egl.eglBindAPI(EGL_OPENGL_API)
+    egl.eglCreateContext.restype = ctypes.c_void_p
+    context = ctypes.c_void_p(egl.eglCreateContext(display, config, None, None))
+    return bool(context) and bool(egl.eglMakeCurrent(display, None, None, context))
 
 
 def egl_works(names: Sequence[str] = EGL_LIBRARIES) -> bool:
@@ -66,8 +71,11 @@ def egl_works(names: Sequence[str] = EGL_LIBRARIES) -> bool:
     if not query_devices(MAX_DEVICES, devices, ctypes.byref(count)):
         return False
     platform_display = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint, ctypes.c_void_p, ctypes.c_void_p)(get_display)
-    displays = (platform_display(EGL_PLATFORM_DEVICE, device, None) for device in devices[: count.value])
-    return any(display and _display_creates_context(egl, display) for display in displays)
+    for device in devices[: count.value]:
+        display = ctypes.c_void_p(platform_display(EGL_PLATFORM_DEVICE, device, None))
+        if display and egl.eglInitialize(display, None, None):
+            return _creates_context(egl, display)  # MuJoCo, too, takes the first device that starts
+    return False
 
 
 def osmesa_works(names: Sequence[str] = OSMESA_LIBRARIES) -> bool:

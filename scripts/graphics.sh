@@ -12,12 +12,10 @@ fail() {
 can_draw() { "$python" -I -S "$scripts/check_gl.py" >/dev/null 2>&1; }
 
 packages() {
-    local names="libegl1 libgl1 libgl1-mesa-dri"
-    # Mesa dropped OSMesa in 25.1: leave it out where apt knows the others and not this one. Empty lists know nothing yet.
-    if apt-cache show libosmesa6 >/dev/null 2>&1 || ! apt-cache show libegl1 >/dev/null 2>&1; then
-        names+=" libosmesa6"
-    fi
-    echo "$names"
+    # EGL is enough; OSMesa is the second way. Mesa dropped it in 25.1, so it is named only where apt has it.
+    local second=
+    if apt-cache show libosmesa6 >/dev/null 2>&1; then second=" libosmesa6"; fi
+    echo "libegl1 libgl1 libgl1-mesa-dri$second"
 }
 
 can_draw && exit 0
