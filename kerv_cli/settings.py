@@ -149,3 +149,124 @@ def as_plain(settings: Any) -> dict[str, Any]:
     import dataclasses
 
     return dataclasses.asdict(settings)
+
+
+@dataclass
+class TargetSettings:
+    """Shapes of the target (METHODS §0). `conf/target/*.yaml` are the sizes."""
+
+    size: str = "small"
+    observation: str = "vision"  # vision | state (privileged: object and goal positions are given)
+    width: int = 192
+    layers: int = 8
+    heads: int = 6
+    feed_forward: int = 512
+    chunk: int = 4  # H, control steps per decode
+    dofs: int = 4  # D
+    grid: int = 4  # vision tokens per side
+    keypoints: int = 32  # spatial soft-argmax points of the vision encoder
+    channels: int = 24  # width of the vision encoder's first stage
+    scene_tokens: int = 4  # tokens that carry object and goal positions, estimated (vision) or given (state)
+    instruction_tokens: int = 10
+    image_size: int = 96
+
+
+@dataclass
+class TrainSettings:
+    """Optimisation. The batch of step s depends on (seed, s) alone, so a resumed run repeats the uninterrupted one."""
+
+    steps: int = 20_000
+    batch: int = 64
+    lr: float = 1e-3
+    warmup: int = 300
+    weight_decay: float = 0.02
+    clip: float = 1.0
+    ema: float = 0.999
+    label_sigma: float = 1.0  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
+    scene_weight: float = 1.0  # weight of the position loss (vision only)
+    scene_steps: int = 0  # first steps that train only the vision encoder, on positions
+    held_out: float = 0.1  # share of episodes kept for validation
+    validate_every: int = 2_000
+    closed_loop: int = 0  # episodes per task and validation, closed loop
+    seed: int = 0
+    bf16: bool = True  # autocast the training forward to bfloat16
+
+
+@dataclass
+class TrainTargetSettings:
+    """`kerv train target`."""
+
+    name: str = "mt10-vision"
+    demos: str = "mt10"
+    task: list[str] = field(default_factory=lambda: ["MT10"])
+    target: TargetSettings = field(default_factory=TargetSettings)
+    train: TrainSettings = field(default_factory=TrainSettings)
+    world: WorldSettings = field(default_factory=WorldSettings)
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    results: str = "results"
+
+
+@dataclass
+class DemosSettings:
+    """`kerv demos`."""
+
+    name: str = "mt10"
+    task: list[str] = field(default_factory=lambda: ["MT10"])
+    episodes: int = 100  # per task
+    seed: int = 0
+    perturbed: float = 0.5
+    frame_stride: int = 2
+    world: WorldSettings = field(default_factory=WorldSettings)
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    results: str = "results"
+
+
+@dataclass
+class DrafterSettings:
+    """Shapes of the EAGLE-style drafter: one decoder layer of the target's width (METHODS §2.2)."""
+
+    kind: str = "eagle"
+    layers: int = 1
+    noise: float = 0.0  # uniform noise on the input states, training only
+    unroll: int = 3  # passes that feed the drafter its own predicted states, as drafting does; 1: the paper's
+    samples: int = 12_000  # observations whose greedy decodes it is trained on
+    state_weight: float = 1.0  # smooth-L1 on the hidden state
+    token_weight: float = 0.1  # soft cross-entropy with the target's distribution
+
+
+@dataclass
+class TrainDrafterSettings:
+    """`kerv train drafter`."""
+
+    target: str = "mt10-vision"
+    name: str | None = None  # default: drafter/ beside the target
+    demos: str = "mt10"
+    drafter: DrafterSettings = field(default_factory=DrafterSettings)
+    train: TrainSettings = field(default_factory=TrainSettings)
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    results: str = "results"
+
+
+@dataclass
+class DoctorSettings:
+    """`kerv doctor`."""
+
+    seed: int = EVALUATION_SEED
+    world: WorldSettings = field(default_factory=WorldSettings)
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    results: str = "results"
+
+
+@dataclass
+class ReportSettings:
+    """`kerv report`."""
+
+    study: str | None = None  # name of one study; default: all that are there
+    results: str = "results"
+
+
+@dataclass
+class ViewSettings:
+    """`kerv view`."""
+
+    results: str = "results"

@@ -1,0 +1,118 @@
+"""What every command shares: the error edge, override arguments and their completion, progress bars."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
+
+import typer
+
+from kerv_cli.errors import KervError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+P = ParamSpec("P")
+
+
+def complete_overrides(incomplete: str) -> list[str]:
+    """`method=` -> every method; otherwise the groups. Reads file names only: completion must be instant."""
+    from kerv_cli.config import groups
+
+    known = groups()
+    if "=" in incomplete:
+        group = incomplete.split("=", 1)[0]
+        words = [f"{group}={name}" for name in known.get(group, [])]
+        if group == "task":
+            from kerv_cli.sim.tasks import SUITES, TASKS
+
+            words = [f"task={name}" for name in [*SUITES, *TASKS]]
+    else:
+        words = [f"{name}=" for name in [*known, "task", "results"]]
+    return [word for word in words if word.startswith(incomplete)]
+
+
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(help="Settings as key=value; see --cfg for all of them.", autocompletion=complete_overrides),
+]
+ShowConfig = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
+ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
+
+
+def edge(command: Callable[P, None]) -> Callable[P, None]:
+    """A KervError becomes one line and its exit code; anything else too, and KERV_TRACEBACK=1 shows where it arose."""
+
+    @functools.wraps(command)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except KervError as error:
+            _refuse(str(error), error.exit_code, error)
+        except KeyboardInterrupt:
+            _refuse("interrupted; what was finished is kept, the same command goes on from there", 130, None)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except OSError as error:
+            _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
+        except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
+            _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
+
+    return wrapped
+
+
+def _refuse(message: str, code: int, error: BaseException | None) -> None:
+    if error is not None and os.environ.get("KERV_TRACEBACK"):
+        raise error
+    typer.echo(f"kerv: {' '.join(message.split())}", err=True)
+    raise typer.Exit(code)
+
+
+@contextmanager
+def progress_bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
+    """Yields `advance_to(done, text)`. A bar on a terminal; elsewhere a line per tenth, so that logs stay short."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    if not sys.stderr.isatty():
+        yield _plain_lines(title, total)
+        return
+    columns: tuple[Any, ...] = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}"),
+    )
+    with Progress(*columns, console=console(stderr=True)) as bar:
+        yield _advance(bar, title, total)
+
+
+def _advance(bar: Progress, title: str, total: int) -> Callable[[int, str], None]:
+    task = bar.add_task(title, total=total, text="")
+    return lambda done, text="": bar.update(task, completed=done, text=text)
+
+
+def _plain_lines(title: str, total: int) -> Callable[[int, str], None]:
+    shown = -1
+
+    def advance(done: int, text: str = "") -> None:
+        nonlocal shown
+        tenth = 10 * done // max(1, total)
+        if tenth > shown:
+            shown = tenth
+            typer.echo(f"{title} {done}/{total} {text}".rstrip(), err=True)
+
+    return advance
+
+
+def console(stderr: bool = False) -> Any:
+    from rich.console import Console
+
+    wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
+    return Console(stderr=stderr, width=wide, highlight=False)

@@ -1,0 +1,55 @@
+"""`kerv demos`: record the scripted experts."""
+
+from __future__ import annotations
+
+import typer
+
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+
+
+@edge
+def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+    """Record successful expert episodes, plain and perturbed, as a dataset."""
+    from kerv_cli.config import compose, to_yaml
+    from kerv_cli.settings import DemosSettings
+    from kerv_cli.sim.tasks import resolve_tasks
+
+    settings = compose("demos", overrides or [], DemosSettings)
+    tasks = resolve_tasks(settings.task)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        return
+    from kerv_cli.places import artifact
+
+    folder = artifact(settings.results, "demos", settings.name)
+    if plan:
+        steps = 85 * settings.episodes * len(tasks)
+        minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
+        typer.echo(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
+        return
+    from kerv_cli.sim.camera import CameraConfig
+    from kerv_cli.sim.demos import DemoConfig, record
+    from kerv_cli.settings import as_plain
+
+    config = DemoConfig(
+        tasks=tasks,
+        episodes=settings.episodes,
+        first_seed=settings.seed,
+        perturbed=settings.perturbed,
+        camera=CameraConfig(**as_plain(settings.world.camera)),
+        frame_stride=settings.frame_stride,
+        workers=settings.runtime.workers,
+        horizon=settings.world.horizon,
+    )
+    with progress_bar("demonstrations", settings.episodes * len(tasks)) as advance:
+        manifest = record(config, folder, lambda done, total: advance(done, ""))
+    _summary(manifest, folder)
+
+
+def _summary(manifest: dict, folder: object) -> None:
+    from rich.table import Table
+
+    table = Table("task", "episodes", "mean steps", "failed seeds", title=f"demonstrations in {folder}")
+    for name, row in manifest["tasks"].items():
+        table.add_row(name, str(row["episodes"]), f"{row['mean_steps']:.0f}", str(len(row["failed_seeds"])))
+    console().print(table)

@@ -1,0 +1,134 @@
+"""`kerv doctor`: what works on this machine, how fast a frame is, and what mends what does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import typer
+
+from kerv_cli.commands.common import Overrides, ShowConfig, console, edge
+
+
+@dataclass(frozen=True)
+class Finding:
+    what: str
+    ok: bool
+    says: str
+
+
+@edge
+def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing."""
+    from kerv_cli.config import compose, to_yaml
+    from kerv_cli.settings import DoctorSettings
+
+    settings = compose("doctor", overrides or [], DoctorSettings)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        return
+    findings = [_versions(), _rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
+    from rich.table import Table
+
+    table = Table("check", "", "finding")
+    for finding in findings:
+        table.add_row(finding.what, "ok" if finding.ok else "FAILS", finding.says)
+    console().print(table)
+    if not all(finding.ok for finding in findings):
+        raise typer.Exit(1)
+
+
+def _versions() -> Finding:
+    from kerv_cli.provenance import versions
+
+    return Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items()))
+
+
+def _rendering(settings: object) -> Finding:
+    """Draws real frames of a real world: a backend that loads but cannot draw is no backend."""
+    import time
+
+    from kerv_cli.errors import KervError
+    from kerv_cli.settings import DoctorSettings
+
+    assert isinstance(settings, DoctorSettings)
+    try:
+        from kerv_cli.rollouts.run import camera_config
+        from kerv_cli.sim.camera import choose_backend
+        from kerv_cli.sim.world import World
+
+        backend = choose_backend()
+        with World("reach-v3", camera_config(settings.world.camera)) as world:
+            world.reset(settings.seed)
+            world.frame()
+            began = time.perf_counter()
+            spread = [int(world.frame().std()) for _ in range(20)][-1]
+            milliseconds = 1000 * (time.perf_counter() - began) / 20
+    except KervError as error:
+        return Finding("rendering", False, str(error))
+    size = settings.world.camera.size
+    if spread == 0:
+        return Finding("rendering", False, f"{backend} draws empty frames: try MUJOCO_GL=osmesa kerv doctor")
+    return Finding("rendering", milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
+
+
+def _torch(settings: object) -> Finding:
+    import torch
+
+    from kerv_cli.errors import KervError
+    from kerv_cli.provenance import device_name
+    from kerv_cli.runtime import set_up
+    from kerv_cli.settings import DoctorSettings
+
+    assert isinstance(settings, DoctorSettings)
+    try:
+        device, _ = set_up(settings.runtime)
+    except KervError as error:
+        return Finding("torch", False, str(error))
+    cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"
+    return Finding("torch", True, f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}")
+
+
+def _policies(settings: object) -> list[Finding]:
+    from kerv_cli.errors import KervError
+    from kerv_cli.places import find_target, shipped_dir
+    from kerv_cli.settings import DoctorSettings
+    from kerv_cli.vla.checkpoint import read_description
+
+    assert isinstance(settings, DoctorSettings)
+    findings = []
+    for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
+        try:
+            described = read_description(find_target(settings.results, name), "target")
+            parameters = described["provenance"]["parameters"] / 1e6
+            findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described['sha256'][:12]}"))
+        except KervError as error:
+            findings.append(Finding(f"policy {name}", False, str(error)))
+    return findings or [Finding("policies", True, "none shipped here: 'kerv train target' trains one")]
+
+
+def _disk(settings: object) -> Finding:
+    import shutil
+
+    from kerv_cli.errors import StorageError
+    from kerv_cli.files import atomic_path
+    from kerv_cli.places import results_dir
+    from kerv_cli.settings import DoctorSettings
+
+    assert isinstance(settings, DoctorSettings)
+    folder = results_dir(settings.results)
+    probe = folder / ".kerv-doctor"
+    try:
+        with atomic_path(probe) as temporary:
+            temporary.write_text("probe")
+        probe.unlink()
+    except StorageError as error:
+        return Finding("results", False, str(error))
+    free = shutil.disk_usage(folder).free / 1e9
+    return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
+
+
+def _display() -> Finding:
+    from kerv_cli.rollouts.viewer import has_display
+
+    says = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
+    return Finding("display", True, says)

@@ -1,0 +1,106 @@
+"""`kerv rollout`: episodes of one method, their figures and their Rerun files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from kerv_cli.decoding.record import EpisodeRecord
+    from kerv_cli.settings import RolloutSettings
+
+Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
+
+
+@edge
+def rollout(
+    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, multirun: Many = False
+) -> None:
+    """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per episode."""
+    from kerv_cli.config import compose, expand, to_yaml
+    from kerv_cli.settings import RolloutSettings
+
+    points = expand(overrides or []) if multirun else [list(overrides or [])]
+    for point in points:
+        settings = compose("rollout", point, RolloutSettings)
+        if cfg:
+            typer.echo(to_yaml(settings), nl=False)
+            continue
+        if multirun:
+            typer.echo(" ".join(point))
+        _run(settings, plan)
+
+
+def _run(settings: RolloutSettings, plan: bool) -> None:
+    from kerv_cli.sim.tasks import resolve_tasks
+
+    tasks = resolve_tasks(settings.task)
+    from kerv_cli.rollouts.run import check, close_worlds, run_task
+
+    check(settings)
+    total = len(tasks) * settings.episodes
+    if plan:
+        typer.echo(f"{settings.method}: {len(tasks)} tasks x {settings.episodes} episodes, about {3 * total} s (a guess)")
+        return
+    from kerv_cli.places import results_dir
+
+    folder = results_dir(settings.results) / "rollouts" / settings.method
+    seeds = range(settings.seed, settings.seed + settings.episodes)
+    records: list[EpisodeRecord] = []
+    files: list[Path] = []
+    with progress_bar(settings.method, total) as advance:
+        for name in tasks:
+            for record in run_task(settings, name, seeds):
+                if record.frames:
+                    files.append(_save(record, folder, settings))
+                records.append(record)
+                advance(len(records), f"{name} {'success' if record.success else 'failure'}")
+    close_worlds()
+    _summary(settings, tasks, records)
+    if files:
+        typer.echo(f"{len(files)} rollouts in {folder}; open one with: kerv view {files[0]}")
+
+
+def _save(record: EpisodeRecord, folder: Path, settings: RolloutSettings) -> Path:
+    from kerv_cli.rollouts.rerun_log import save_episode
+
+    path = folder / f"{record.task}-{record.seed}.rrd"
+    return save_episode(record, path, method=settings.method, tokens_per_step=4)
+
+
+def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[EpisodeRecord]) -> None:
+    from rich.table import Table
+
+    headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
+    table = Table(*headers, title=f"{settings.method}, seeds {settings.seed}…{settings.seed + settings.episodes - 1}")
+    phases = Table("phase", "ms per decode", "share", title="time by phase")
+    for name in (*tasks, "all") if len(tasks) > 1 else tasks:
+        table.add_row(name, *_figures([r for r in records if name in ("all", r.task)]))
+    decodes = [d for r in records for d in r.decodes]
+    total = sum(d.seconds for d in decodes)
+    for phase in decodes[0].phases:
+        seconds = sum(d.phases[phase] for d in decodes)
+        phases.add_row(phase, f"{1000 * seconds / len(decodes):.2f}", f"{seconds / total:.0%}")
+    console().print(table)
+    console().print(phases)
+
+
+def _figures(records: list[EpisodeRecord]) -> list[str]:
+    steps = sum(r.steps for r in records)
+    rounds = [x for r in records for d in r.decodes for x in d.rounds if x.tree_size and x.mode != "skip"]
+    per_round = [
+        f"{sum(getattr(x, field) for x in rounds) / len(rounds):.2f}" if rounds else "–"
+        for field in ("committed", "accepted")
+    ]
+    return [
+        f"{sum(r.success for r in records)}/{len(records)}",
+        f"{steps / len(records):.0f}",
+        f"{sum(r.forwards for r in records) / steps:.2f}",
+        *per_round,
+        f"{1000 * sum(r.seconds / r.steps for r in records) / len(records):.2f}",
+    ]

@@ -1,0 +1,152 @@
+"""The only place that knows Hydra: compose a command's YAML files, check overrides, expand a grid.
+
+Typer owns the process and the messages. An override is checked before torch or MuJoCo load; a wrong one gives one line
+with the nearest known keys.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from kerv_cli.errors import UnknownName, UsageError
+
+T = TypeVar("T")
+
+
+def conf_dir() -> Path:
+    """`$KERV_CONF_DIR`, else the checkout's `conf/`, else the one inside the installed package."""
+    chosen = os.environ.get("KERV_CONF_DIR")
+    package = Path(__file__).resolve().parent
+    places = [Path(chosen).resolve()] if chosen else [package.parent / "conf", package / "conf"]
+    for place in places:
+        if (place / "rollout.yaml").is_file():
+            return place
+    raise UsageError(f"no configuration in {' or '.join(map(str, places))}: set KERV_CONF_DIR to a folder like conf/")
+
+
+def groups() -> dict[str, list[str]]:
+    """Config groups and the names in them: {"method": ["ar", "spec_vla", …], …}."""
+    root = conf_dir()
+    return {d.name: sorted(p.stem for p in d.glob("*.yaml")) for d in sorted(root.iterdir()) if d.is_dir()}
+
+
+def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
+    """The command's settings: `conf/<command>.yaml`, its groups, the overrides, checked against the dataclass.
+
+    Raises:
+        UsageError: an override that cannot be parsed, an unknown key or name, a value of the wrong type.
+    """
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    _check(command, overrides)
+    try:
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            composed = hydra_compose(command, overrides=list(overrides))
+        merged = OmegaConf.merge(OmegaConf.structured(schema), composed)
+        settings = OmegaConf.to_object(merged)
+    except HydraException as error:
+        raise _explained(command, error, overrides) from error
+    except OmegaConfBaseException as error:
+        raise UsageError(_one_line(error)) from error
+    assert isinstance(settings, schema)
+    return settings
+
+
+def expand(overrides: str | Sequence[str]) -> list[list[str]]:
+    """Hydra's grid grammar -> one override list per point: `threshold.r=0,3` or `threshold.r=range(0,4)`.
+
+    A string is split at white space outside quotes.
+    """
+    import shlex
+
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    words = shlex.split(overrides) if isinstance(overrides, str) else list(overrides)
+    try:
+        parsed = OverridesParser.create().parse_overrides(words)
+        axes = [list(_points(o)) for o in parsed]
+    except HydraException as error:
+        raise UsageError(f"cannot read '{' '.join(words)}': {_one_line(error)}") from error
+    return [list(point) for point in itertools.product(*axes)]
+
+
+def _points(override: Any) -> Iterator[str]:
+    if not override.is_sweep_override():
+        yield override.input_line
+        return
+    key = override.get_key_element()
+    for value in override.sweep_string_iterator():
+        yield f"{key}={value}"
+
+
+def swept_keys(overrides: str | Sequence[str]) -> list[str]:
+    """Keys of the overrides that hold several values."""
+    points = expand(overrides)
+    first = points[0] if points else []
+    return [word.split("=", 1)[0] for i, word in enumerate(first) if len({p[i] for p in points}) > 1]
+
+
+def to_yaml(settings: Any) -> str:
+    """A settings dataclass as YAML, for `--cfg`."""
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_yaml(OmegaConf.structured(settings))
+
+
+def _check(command: str, overrides: Sequence[str]) -> None:
+    """Group choices first: Hydra's own message about a missing file is long."""
+    known = groups()
+    for word in overrides:
+        if "=" not in word:
+            raise UsageError(f"'{word}' is not an override: write key=value, see 'kerv {command} --cfg' for the keys")
+        key, value = word.split("=", 1)
+        if key.lstrip("+~") in known and value not in known[key.lstrip("+~")]:
+            raise UnknownName(key.lstrip("+~"), value, known[key.lstrip("+~")])
+
+
+def _explained(command: str, error: Exception, overrides: Sequence[str]) -> UsageError:
+    keys = _keys(command)
+    for word in overrides:
+        key = word.split("=", 1)[0].lstrip("+~")
+        if key not in keys and key not in groups():
+            near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
+            near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
+            hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {command} --cfg' for the keys"
+            return UsageError(f"unknown key '{key}': {hint}")
+    return UsageError(_one_line(error))
+
+
+def _keys(command: str) -> list[str]:
+    """Every key of the command's default configuration, dotted."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from omegaconf import DictConfig, OmegaConf
+
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        plain = hydra_compose(command)
+
+    def walk(node: DictConfig, prefix: str) -> Iterator[str]:
+        for name in node:
+            yield f"{prefix}{name}"
+            if isinstance(OmegaConf.select(node, str(name)), DictConfig):
+                yield from walk(node[name], f"{prefix}{name}.")
+
+    return list(walk(plain, ""))
+
+
+def _one_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    useful = [line for line in lines if not line.startswith(("object_type", "reference_type", "See https"))]
+    keys = [line for line in useful if line.startswith("full_key:")]
+    text = " ".join(line for line in useful if not line.startswith("full_key:"))
+    return f"{keys[0].removeprefix('full_key:').strip()}: {text}" if keys else text

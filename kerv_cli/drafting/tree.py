@@ -1,0 +1,109 @@
+"""TokenTree: what a proposer hands to the verification.
+
+Node i has a token, a parent (−1: the last committed token) and a depth (0 for the first drafted position). Parents come
+before their children. A node at depth d behind `committed` tokens is chunk token committed + d, so its control step and
+DoF are known (METHODS §2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+ROOT = -1
+
+
+@dataclass(frozen=True)
+class TokenTree:
+    """tokens, parents and depths of n nodes, parent before child.
+
+    Raises:
+        ValueError: a parent at or behind its child.
+    """
+
+    tokens: tuple[int, ...]
+    parents: tuple[int, ...]
+    depths: tuple[int, ...]
+
+    @classmethod
+    def build(cls, tokens: Sequence[int], parents: Sequence[int]) -> TokenTree:
+        depths: list[int] = []
+        for i, parent in enumerate(parents):
+            if not ROOT <= parent < i:
+                raise ValueError(f"node {i} has parent {parent}: parents come before their children")
+            depths.append(0 if parent == ROOT else depths[parent] + 1)
+        return cls(tuple(tokens), tuple(parents), tuple(depths))
+
+    @classmethod
+    def chain(cls, tokens: Sequence[int]) -> TokenTree:
+        n = len(tokens)
+        return cls(tuple(tokens), tuple(range(-1, n - 1)), tuple(range(n)))
+
+    def __len__(self) -> int:
+        return len(self.tokens)
+
+    @property
+    def is_chain(self) -> bool:
+        return self.parents == tuple(range(-1, len(self) - 1))
+
+    def ancestors(self) -> np.ndarray:
+        """(n, n) bool: node i sees node j if j is i or an ancestor of i."""
+        seen = np.eye(len(self), dtype=bool)
+        for i, parent in enumerate(self.parents):
+            if parent != ROOT:
+                seen[i] |= seen[parent]
+        return seen
+
+    def truncate(self, depth: int) -> TokenTree:
+        """Nodes of depth < `depth` only."""
+        keep = [i for i, d in enumerate(self.depths) if d < depth]
+        index = {old: new for new, old in enumerate(keep)} | {ROOT: ROOT}
+        return TokenTree(
+            tuple(self.tokens[i] for i in keep),
+            tuple(index[self.parents[i]] for i in keep),
+            tuple(self.depths[i] for i in keep),
+        )
+
+    def path_to(self, node: int) -> list[int]:
+        """Nodes from depth 0 down to `node`; empty for the root."""
+        path: list[int] = []
+        while node != ROOT:
+            path.append(node)
+            node = self.parents[node]
+        return path[::-1]
+
+
+def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
+    """A prefix tree of several drafts; common beginnings become one path."""
+    tokens: list[int] = []
+    parents: list[int] = []
+    children: dict[tuple[int, int], int] = {}
+    for chain in chains:
+        node = ROOT
+        for token in chain:
+            key = (node, int(token))
+            if key not in children:
+                children[key] = len(tokens)
+                tokens.append(int(token))
+                parents.append(node)
+            node = children[key]
+    return TokenTree.build(tokens, parents)
+
+
+def verify_mask(tree: TokenTree, cached: int, like: Tensor) -> Tensor | None:
+    """Additive mask (1 + n, cached + 1 + n) for [last committed token, nodes…] behind `cached` tokens.
+
+    Every row sees the cache and the last committed token; a node sees its ancestors and itself. None where a single
+    token is forwarded and everything may be seen.
+    """
+    n = len(tree)
+    if n == 0:
+        return None
+    hidden = np.zeros((1 + n, cached + 1 + n), dtype=np.float32)
+    hidden[0, cached + 1 :] = -np.inf
+    hidden[1:, cached + 1 :] = np.where(tree.ancestors(), 0.0, -np.inf)
+    return torch.from_numpy(hidden).to(device=like.device, dtype=like.dtype)

@@ -1,0 +1,143 @@
+"""The optimisation loop that the target and the drafters share: schedule, EMA, validation, exact resume.
+
+The batch of step s is a function of (seed, s), and the resume file holds weights, EMA, optimiser moments and the best
+score: a run that was cut and resumed writes the same bytes as one that was not (same machine, same threads).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.errors import CheckpointError, KervError
+from kerv_cli.files import atomic_path, read_json, write_json
+from kerv_cli.settings import TrainSettings
+from kerv_cli.vla.checkpoint import load_tensors, save_tensors
+
+Metrics = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is optimised. `loss(batch indices, step)` -> scalar loss and logged numbers; `validate(module)` -> metrics
+    with a `score` (higher is better) on the EMA weights; `save(module, metrics)` keeps the best."""
+
+    module: nn.Module
+    samples: int
+    loss: Callable[[Tensor, int], tuple[Tensor, Metrics]]
+    validate: Callable[[nn.Module], Metrics]
+    save: Callable[[nn.Module, Metrics], None]
+
+
+class Loop:
+    """Runs a `Job`. folder: where `resume.safetensors`, `progress.json` and `log.csv` live."""
+
+    def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str) -> None:
+        self.job, self.settings, self.folder = job, settings, folder
+        self.identity = identity  # hash of everything that determines the run; another run is never resumed
+        self.step, self.best = 0, -math.inf
+        self.history: list[Metrics] = []
+        decay = [p for p in job.module.parameters() if p.dim() >= 2]
+        rest = [p for p in job.module.parameters() if p.dim() < 2]
+        groups = [{"params": decay, "weight_decay": settings.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+        self.optimiser = torch.optim.AdamW(groups, lr=settings.lr, betas=(0.9, 0.95), fused=True)
+        self.ema = {k: v.detach().clone() for k, v in job.module.state_dict().items()}
+
+    def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
+        """Train to `settings.steps`, resuming what is there -> metrics of the best checkpoint."""
+        self.restore()
+        settings = self.settings
+        while self.step < settings.steps:
+            metrics = self.update()
+            self.step += 1
+            on_step(self.step, metrics)
+            if self.step % settings.validate_every == 0 or self.step == settings.steps:
+                self.check(metrics)
+                on_step(self.step, self.history[-1])
+        return max(self.history, key=lambda m: m["score"])
+
+    def update(self) -> Metrics:
+        settings = self.settings
+        for group in self.optimiser.param_groups:
+            group["lr"] = settings.lr * schedule(self.step, settings)
+        generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
+        indices = torch.randint(self.job.samples, (settings.batch,), generator=generator)
+        loss, metrics = self.job.loss(indices, self.step)
+        if not math.isfinite(float(loss)):
+            raise KervError(f"training diverged at step {self.step} (loss {float(loss)}): lower train.lr")
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.job.module.parameters(), settings.clip)
+        self.optimiser.step()
+        decay = min(settings.ema, (1 + self.step) / (10 + self.step))
+        live = self.job.module.state_dict()
+        with torch.no_grad():
+            torch._foreach_lerp_([self.ema[k] for k in live], list(live.values()), 1 - decay)
+        return {"loss": float(loss.detach()), **metrics}
+
+    def check(self, training: Metrics) -> None:
+        """Validate the EMA weights, keep the best, write the resume file."""
+        module = self.job.module
+        live = {k: v.detach().clone() for k, v in module.state_dict().items()}
+        module.load_state_dict(self.ema)
+        module.eval()
+        metrics = {"step": float(self.step), "train_loss": training["loss"], **self.job.validate(module)}
+        self.history.append(metrics)
+        if metrics["score"] >= self.best:
+            self.best = metrics["score"]
+            self.job.save(module, metrics)
+        module.load_state_dict(live)
+        module.train()
+        self.store()
+
+    def store(self) -> None:
+        """The JSON, written last, names the step whose tensors it belongs to."""
+        tensors = {f"model.{k}": v for k, v in self.job.module.state_dict().items()}
+        tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
+        for i, moments in self.optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
+        tensors["step"] = torch.tensor(self.step)
+        save_tensors(self.folder / "resume.safetensors", tensors)
+        progress = {"identity": self.identity, "step": self.step, "best": self.best, "history": self.history}
+        write_json(self.folder / "progress.json", progress)
+        columns = list(self.history[-1])
+        rows = [",".join(f"{m.get(c, math.nan):.6g}" for c in columns) for m in self.history]
+        with atomic_path(self.folder / "log.csv") as temporary:
+            temporary.write_text("\n".join([",".join(columns), *rows]) + "\n")
+
+    def restore(self) -> None:
+        path = self.folder / "progress.json"
+        if not path.is_file():
+            return
+        progress = read_json(path)
+        if progress["identity"] != self.identity:
+            raise CheckpointError(
+                f"{self.folder} holds a run with other settings or data: choose another name=, or delete that folder"
+            )
+        tensors = load_tensors(self.folder / "resume.safetensors", "training state")
+        step = int(tensors.pop("step"))
+        self.job.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
+        self.ema = {k[4:]: v for k, v in tensors.items() if k.startswith("ema.")}
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, tensor in tensors.items():
+            if name.startswith("optimiser."):
+                _, index, key = name.split(".")
+                state.setdefault(int(index), {})[key] = tensor
+        groups = self.optimiser.state_dict()["param_groups"]
+        self.optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self.step = step
+        # a cut between the two files leaves tensors one validation ahead of the JSON; history is then one row short
+        self.best, self.history = progress["best"], progress["history"]
+
+
+def schedule(step: int, settings: TrainSettings) -> float:
+    """Linear warm-up, then cosine to 2 % of the peak."""
+    if step < settings.warmup:
+        return (step + 1) / settings.warmup
+    share = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
+    return 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, share)))

@@ -1,0 +1,153 @@
+"""A training run from settings to a folder on disk: what is read, where it is saved, what is written down about it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import nn
+
+from kerv_cli.drafting.drafter import Drafter, save_drafter
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.places import artifact, drafter_beside, find_target
+from kerv_cli.provenance import provenance
+from kerv_cli.runtime import set_up
+from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.sim.demo_dataset import DemoDataset
+from kerv_cli.sim.tasks import resolve_tasks
+from kerv_cli.training.distillation import Distillation, distillation_job, teach
+from kerv_cli.training.imitation import Imitation, Samples, imitation_job, load_samples, new_target, split, vocabulary
+from kerv_cli.training.loop import Loop, Metrics
+from kerv_cli.vla.checkpoint import load_target, save_target
+from kerv_cli.vla.target import Target
+
+Progress = Callable[[int, int], None]
+VALIDATION_SEED = EVALUATION_SEED // 2
+"""First seed of closed-loop validation: neither a training seed nor an evaluation seed."""
+
+
+def identity_of(**parts: Any) -> str:
+    """Hash of everything that determines a run."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class TargetRun:
+    """`kerv train target`."""
+
+    def __init__(self, settings: TrainTargetSettings) -> None:
+        self.settings = settings
+        self.tasks = resolve_tasks(settings.task)
+        if settings.target.observation not in ("vision", "state"):
+            raise UsageError(f"target.observation={settings.target.observation}: vision or state")
+        if settings.target.image_size != settings.world.camera.size:
+            raise UsageError(
+                f"target.image_size={settings.target.image_size} but world.camera.size={settings.world.camera.size}: "
+                "the policy must be shown what it was trained on, set both alike"
+            )
+        self.folder = artifact(settings.results, "target", settings.name)
+        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.samples: Samples | None = None
+
+    def plan(self) -> str:
+        train, episodes = self.settings.train, [e for e in self.dataset.episodes if e.task in self.tasks]
+        return (
+            f"{self.folder}: {self.settings.target.size} on {self.settings.target.observation}, {len(episodes)} "
+            f"demonstrations of {len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples"
+        )
+
+    def load(self, progress: Progress) -> None:
+        self.device, _ = set_up(self.settings.runtime)
+        self.samples = load_samples(self.dataset, self.settings.target, vocabulary(), self.tasks, progress)
+
+    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
+        assert self.samples is not None
+        settings = self.settings
+        target = new_target(settings.target, self.samples, settings.train.seed).to(self.device)
+        identity = identity_of(
+            target=asdict(settings.target), train=asdict(settings.train), demos=self.dataset.sha256, tasks=self.tasks
+        )
+        run = Imitation(target, self.samples, settings.train, torch.device(self.device))
+        closed_loop = self.closed_loop if settings.train.closed_loop else None
+        loop = Loop(imitation_job(run, self.save, closed_loop), settings.train, self.folder, identity)
+        target.train()
+        return loop.run(on_step)
+
+    def closed_loop(self, target: Target) -> float:
+        """Success in [0, 1] of greedy decoding over the tasks, on seeds of their own."""
+        from kerv_cli.rollouts.run import success_of
+
+        seeds = range(VALIDATION_SEED, VALIDATION_SEED + self.settings.train.closed_loop)
+        return success_of(target, self.tasks, seeds, self.settings.world)
+
+    def save(self, module: nn.Module, metrics: Metrics) -> None:
+        assert isinstance(module, Target)
+        made = {
+            "command": "kerv train target",
+            "settings": asdict(self.settings),
+            "demos": {"sha256": self.dataset.sha256, "seeds": self.dataset.manifest["seeds"]},
+            "validation": metrics,
+            "parameters": sum(p.numel() for p in module.parameters()),
+            **provenance(self.device),
+        }
+        save_target(self.folder, module, made)
+
+
+class DrafterRun:
+    """`kerv train drafter`."""
+
+    def __init__(self, settings: TrainDrafterSettings) -> None:
+        self.settings = settings
+        if settings.drafter.kind != "eagle":
+            raise UnknownName("drafter.kind", settings.drafter.kind, ["eagle"])
+        self.target_folder = find_target(settings.results, settings.target)
+        beside = drafter_beside(self.target_folder)
+        self.folder = artifact(settings.results, "drafter", settings.name) if settings.name else beside
+        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+
+    def plan(self) -> str:
+        s = self.settings
+        return (
+            f"{self.folder}: {s.drafter.layers}-layer drafter of {self.target_folder}, greedy decodes of "
+            f"{s.drafter.samples} observations, {s.train.steps} steps of {s.train.batch}"
+        )
+
+    def load(self, progress: Progress) -> None:
+        self.device, _ = set_up(self.settings.runtime)
+        self.target, self.described = load_target(self.target_folder, self.device)
+        tasks = tuple(dict.fromkeys(e.task for e in self.dataset.episodes))
+        samples = load_samples(self.dataset, self.target.settings, self.target.words, tasks)
+        training, held_out = split(samples, self.settings.train.held_out)
+        limit = self.settings.drafter.samples
+        self.states = teach(self.target, training, limit, lambda done, total: progress(done, total))
+        self.held_out = teach(self.target, held_out, max(60, limit // 50), lambda done, total: None)
+
+    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
+        settings = self.settings
+        torch.manual_seed(settings.train.seed)
+        drafter = Drafter.beside(settings.drafter, self.target).to(self.device)
+        identity = identity_of(
+            drafter=asdict(settings.drafter),
+            train=asdict(settings.train),
+            demos=self.dataset.sha256,
+            target=self.described["sha256"],
+        )
+        run = Distillation(drafter, self.target, self.states, self.held_out, settings.drafter)
+        loop = Loop(distillation_job(run, self.save), settings.train, self.folder, identity)
+        drafter.train()
+        return loop.run(on_step)
+
+    def save(self, module: nn.Module, metrics: Metrics) -> None:
+        assert isinstance(module, Drafter)
+        made = {
+            "command": "kerv train drafter",
+            "settings": asdict(self.settings),
+            "demos": {"sha256": self.dataset.sha256, "seeds": self.dataset.manifest["seeds"]},
+            "validation": metrics,
+            "parameters": sum(p.numel() for p in module.parameters()),
+            **provenance(self.device),
+        }
+        save_drafter(self.folder, module, self.described["sha256"], made)
