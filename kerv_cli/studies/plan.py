@@ -1,0 +1,152 @@
+"""From settings and tasks to cells; a cell's id is the hash of what determines its result."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from kerv_cli.settings import RolloutSettings
+
+Identity = Mapping[str, str]
+"""Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
+
+# Of RolloutSettings, what leaves an episode's result as it is: where it is written, what is recorded of it, how it is
+# called. Task and seeds enter the id as the cell's own, the policy through its hashes. A field that is not named here
+# counts, so a setting that is added later makes new cells instead of being overlooked.
+_NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
+_NOT_DETERMINING_RUNTIME = frozenset({"workers"})
+_NOT_DETERMINING_POLICY = frozenset({"target", "drafter"})
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One setting on one task: the unit that is run, stored and reused.
+
+    Two labels that resolve to the same result share one id.
+    """
+
+    id: str  # 16 hex digits, see `cell_id`
+    label: str  # the setting's name in the study
+    overrides: str  # what the user wrote to get it
+    task: str
+    seeds: tuple[int, ...]  # one episode each
+    settings: dict[str, Any]  # plain RolloutSettings with task = [task]
+    identity: dict[str, str] = field(default_factory=dict)  # hashes of target, drafter, ...
+
+
+def cell_id(identity: Mapping[str, Any]) -> str:
+    """First 16 hex digits of the SHA-256 of canonical JSON.
+
+    Raises:
+        ValueError: NaN or infinity, which JSON has not.
+        TypeError: a value that is not plain.
+    """
+    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
+
+
+def determinants(
+    settings: Mapping[str, Any], identity: Identity, task: str, seeds: Sequence[int], version: str
+) -> dict[str, Any]:
+    """Everything that determines a cell's result, from plain RolloutSettings; the argument of `cell_id`."""
+    kept = {key: value for key, value in settings.items() if key not in _NOT_DETERMINING}
+    kept["runtime"] = _without(settings["runtime"], _NOT_DETERMINING_RUNTIME)
+    policy = _without(settings["policy"], _NOT_DETERMINING_POLICY)
+    return {
+        "settings": kept,
+        "policy": {**policy, **{f"{name}_sha256": value for name, value in identity.items()}},
+        "task": task,
+        "seeds": list(seeds),
+        "kerv": version,
+    }
+
+
+def _without(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in set(names)}
+
+
+def make_cell(label: str, overrides: str, settings: Mapping[str, Any], identity: Identity, task: str) -> Cell:
+    """The cell of one setting (plain RolloutSettings) on one task, for this version of kerv.
+
+    Raises:
+        ValueError: the device is still `auto`, which two machines resolve differently.
+    """
+    if settings["runtime"]["device"] == "auto":
+        raise ValueError(f"setting '{label}': resolve runtime.device before planning")
+    seeds = tuple(range(settings["seed"], settings["seed"] + settings["episodes"]))
+    name = cell_id(determinants(settings, identity, task, seeds, kerv_version()))
+    return Cell(name, label, overrides, task, seeds, {**settings, "task": [task]}, dict(identity))
+
+
+def plan(
+    settings_by_label: Mapping[str, RolloutSettings],
+    tasks: Sequence[str],
+    identity: Identity | Callable[[RolloutSettings], Identity],
+    *,
+    baseline: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+) -> list[Cell]:
+    """One cell per task and label, task by task and the baseline first: what is compared runs close in time.
+
+    Args:
+        settings_by_label: resolved settings; their order is kept.
+        tasks: Meta-World task names, suites already expanded.
+        identity: hashes of the weights, one mapping for all settings or a function where settings differ in them.
+        baseline: label to put first.
+        overrides: what the user wrote for each label, kept for the tables.
+
+    Raises:
+        ValueError: `baseline` is no label, or a device is `auto`.
+    """
+    if baseline is not None and baseline not in settings_by_label:
+        raise ValueError(f"baseline '{baseline}' is not among the settings {list(settings_by_label)}")
+    labels = sorted(settings_by_label, key=lambda label: label != baseline)
+    hashes = {label: identity(s) if callable(identity) else identity for label, s in settings_by_label.items()}
+    plain = {label: dataclasses.asdict(settings) for label, settings in settings_by_label.items()}
+    written = overrides or {}
+    return [
+        make_cell(label, written.get(label, ""), plain[label], hashes[label], task)
+        for task in dict.fromkeys(tasks)
+        for label in labels
+    ]
+
+
+def unique_cells(cells: Iterable[Cell]) -> list[Cell]:
+    """The first cell of every id, in order: what has to be run."""
+    first: dict[str, Cell] = {}
+    for cell in cells:
+        first.setdefault(cell.id, cell)
+    return list(first.values())
+
+
+def kerv_version() -> str:
+    return importlib.metadata.version("kerv")
+
+
+def seeds_text(seeds: Iterable[int]) -> str:
+    """Seeds as ranges: (5, 6, 7, 9) -> "5-7;9"."""
+    runs: list[list[int]] = []
+    for seed in sorted(set(seeds)):
+        if runs and seed == runs[-1][1] + 1:
+            runs[-1][1] = seed
+        else:
+            runs.append([seed, seed])
+    return ";".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """The inverse of `seeds_text`.
+
+    Raises:
+        ValueError: not a list of ranges.
+    """
+    seeds: list[int] = []
+    for part in str(text).split(";"):
+        first, _, last = part.partition("-")
+        seeds.extend(range(int(first), int(last or first) + 1))
+    return tuple(seeds)

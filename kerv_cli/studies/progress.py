@@ -1,0 +1,90 @@
+"""Events on a terminal: a progress bar, or plain lines where there is no terminal. Lives in the parent process."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from kerv_cli.studies.events import CellDone, CellFailed, CellReused, CellStarted, Event, SweepFinished, SweepStarted
+from kerv_cli.studies.plan import Cell
+
+
+class ProgressDisplay:
+    """Context manager whose instances are `on_event` callbacks."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        self._total = self._finished = 0
+        self._running: dict[str, Cell] = {}
+
+    def __enter__(self) -> ProgressDisplay:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, SweepStarted):
+            self._start(event)
+        elif isinstance(event, CellStarted):
+            self._running[event.cell.id] = event.cell
+        elif isinstance(event, CellDone):
+            rate = event.seconds / max(1, event.episodes)
+            result = f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode"
+            self._finish(event.cell, f"{escape(event.cell.label)} on {event.cell.task}: {result}")
+        elif isinstance(event, CellFailed):
+            line = f"{escape(event.cell.label)} on {event.cell.task}: [red]failed[/red]: {escape(event.reason)}"
+            self._finish(event.cell, line)
+        elif isinstance(event, CellReused):
+            self._finish(event.cell, f"{escape(event.cell.label)} on {event.cell.task}: completed by another sweep")
+        elif isinstance(event, SweepFinished) and self._bar is not None:
+            self._bar.stop()
+        self._refresh()
+
+    def _start(self, event: SweepStarted) -> None:
+        self._total = event.total
+        if event.reused:
+            self.console.print(f"{event.reused} cells are complete already")
+        if not self.console.is_terminal or not event.total:
+            return
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        self._bar = Progress(*columns, console=self.console, transient=True)
+        self._task = self._bar.add_task("cells", total=event.total)
+        self._bar.start()
+
+    def _finish(self, cell: Cell, line: str) -> None:
+        self._running.pop(cell.id, None)
+        self._finished += 1
+        width = len(str(self._total))
+        self.console.print(f"[dim]{self._finished:{width}}/{self._total}[/dim] {line}", soft_wrap=True, highlight=False)
+
+    def _refresh(self) -> None:
+        if self._bar is None:
+            return
+        names = [f"{cell.label} on {cell.task}" for cell in self._running.values()]
+        more = f" +{len(names) - 1}" if len(names) > 1 else ""
+        now = escape(names[0] + more if names else "cells")
+        self._bar.update(self._task, completed=self._finished, description=now)

@@ -1,0 +1,202 @@
+"""Records of episodes and decodes as rows of parquet tables, and back."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord, Round
+
+_PHASE_FIELDS = [(f"seconds.{phase}", pa.float64()) for phase in PHASES]
+
+EPISODE_SCHEMA = pa.schema(
+    [
+        ("task", pa.string()),
+        ("seed", pa.int64()),
+        ("success", pa.bool_()),
+        ("steps", pa.int64()),  # control steps executed
+        ("decodes", pa.int64()),
+        ("seconds", pa.float64()),  # inference time
+        *_PHASE_FIELDS,
+        ("forwards", pa.int64()),
+        ("verifications", pa.int64()),
+        ("tokens", pa.int64()),  # committed, by whatever round
+        ("committed", pa.int64()),  # committed by verifications, bonus included
+        ("accepted", pa.int64()),  # draft tokens accepted by verifications
+        ("bonus", pa.int64()),
+        ("first_rejected_sum", pa.int64()),  # over chunks that had a verification
+        ("first_rejected_count", pa.int64()),
+        ("compensated_tokens", pa.int64()),
+        ("compensated_decodes", pa.int64()),
+        ("skipped_decodes", pa.int64()),
+        ("retrieval_decodes", pa.int64()),
+        ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
+        ("deviation_count", pa.int64()),
+        ("wall_seconds", pa.float64()),
+        ("rand_vec", pa.list_(pa.float64())),
+        ("worker_pid", pa.int64()),
+        ("started", pa.string()),  # ISO 8601, when the cell began
+    ]
+)
+
+_TOKENS = pa.list_(pa.int32())
+_ROUND = pa.struct(
+    [
+        ("mode", pa.string()),
+        ("proposer", pa.string()),
+        ("start", pa.int32()),
+        ("drafted", _TOKENS),
+        ("verdicts", _TOKENS),
+        ("accepted", pa.int32()),
+        ("committed", pa.int32()),
+        ("tree_size", pa.int32()),
+        ("threshold", _TOKENS),
+    ]
+)
+_MEASURES = ("variability", "similarity", "metric", "deviation")
+
+DECODE_SCHEMA = pa.schema(
+    [
+        ("task", pa.string()),
+        ("seed", pa.int64()),
+        ("index", pa.int64()),  # decode of the episode
+        ("step", pa.int64()),  # control step at which its actions begin
+        ("mode", pa.string()),
+        ("forwards", pa.int64()),
+        ("seconds", pa.float64()),
+        *_PHASE_FIELDS,
+        ("tokens", _TOKENS),
+        ("actions", pa.list_(pa.list_(pa.float32()))),  # (steps, D)
+        ("rounds", pa.list_(_ROUND)),
+        ("compensated", pa.int64()),
+        ("skipped", pa.bool_()),
+        *[(name, pa.float64()) for name in _MEASURES],
+    ]
+)
+
+
+def episode_row(record: EpisodeRecord, worker_pid: int, started: str) -> dict[str, Any]:
+    """One row of episodes.parquet.
+
+    Raises:
+        ValueError: a decode names a phase that is not in PHASES.
+    """
+    decodes = record.decodes
+    judged = [r for d in decodes for r in d.rounds if _verifies(r)]
+    first = [d.first_rejected for d in decodes if d.first_rejected is not None]
+    deviations = [d.deviation for d in decodes if d.deviation is not None]
+    accepted, committed = sum(r.accepted for r in judged), sum(r.committed for r in judged)
+    phases = [_phase_seconds(d) for d in decodes]
+    return {
+        "task": record.task,
+        "seed": record.seed,
+        "success": record.success,
+        "steps": record.steps,
+        "decodes": len(decodes),
+        "seconds": record.seconds,
+        **{name: sum(p[name] or 0.0 for p in phases) for name, _ in _PHASE_FIELDS},
+        "forwards": record.forwards,
+        "verifications": len(judged),
+        "tokens": sum(len(d.tokens) for d in decodes),
+        "committed": committed,
+        "accepted": accepted,
+        "bonus": committed - accepted,
+        "first_rejected_sum": sum(first),
+        "first_rejected_count": len(first),
+        "compensated_tokens": sum(d.compensated for d in decodes),
+        "compensated_decodes": sum(d.compensated > 0 for d in decodes),
+        "skipped_decodes": sum(d.skipped for d in decodes),
+        "retrieval_decodes": sum(any(r.proposer == "retrieval" for r in d.rounds) for d in decodes),
+        "deviation_sum": float(sum(deviations)),
+        "deviation_count": len(deviations),
+        "wall_seconds": record.wall_seconds,
+        "rand_vec": np.asarray(record.rand_vec, dtype=np.float64).ravel().tolist(),
+        "worker_pid": worker_pid,
+        "started": started,
+    }
+
+
+def _verifies(r: Round) -> bool:
+    """The same rounds that DecodeRecord.verifications counts."""
+    return r.tree_size > 0 and r.mode != "skip"
+
+
+def _phase_seconds(decode: DecodeRecord) -> dict[str, float | None]:
+    unknown = set(decode.phases) - set(PHASES)
+    if unknown:
+        raise ValueError(f"phases {sorted(unknown)} are not in PHASES")
+    return {f"seconds.{phase}": decode.phases.get(phase) for phase in PHASES}
+
+
+def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
+    """The rows of decodes.parquet of one episode, in order."""
+    return [
+        {
+            "task": record.task,
+            "seed": record.seed,
+            "index": index,
+            "step": step,
+            "mode": decode.mode,
+            "forwards": decode.forwards,
+            "seconds": decode.seconds,
+            **_phase_seconds(decode),
+            "tokens": list(decode.tokens),
+            "actions": np.asarray(decode.actions, dtype=np.float32).tolist(),
+            "rounds": [_round_row(r) for r in decode.rounds],
+            "compensated": decode.compensated,
+            "skipped": decode.skipped,
+            **{name: getattr(decode, name) for name in _MEASURES},
+        }
+        for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
+    ]
+
+
+def _round_row(r: Round) -> dict[str, Any]:
+    row = {field.name: getattr(r, field.name) for field in _ROUND}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in row.items()}
+
+
+def decode_record(row: Mapping[str, Any]) -> DecodeRecord:
+    """A row of decodes.parquet (as `to_pylist` gives it) as the record it was made from."""
+    prefix = "seconds."
+    phases = {key.removeprefix(prefix): value for key, value in row.items() if key.startswith(prefix)}
+    return DecodeRecord(
+        tokens=tuple(row["tokens"]),
+        actions=np.asarray(row["actions"], dtype=np.float32),
+        forwards=row["forwards"],
+        rounds=tuple(_round(r) for r in row["rounds"]),
+        mode=row["mode"],
+        seconds=row["seconds"],
+        phases={phase: seconds for phase, seconds in phases.items() if seconds is not None},
+        compensated=row["compensated"],
+        skipped=row["skipped"],
+        **{name: row[name] for name in _MEASURES},
+    )
+
+
+def _round(row: Mapping[str, Any]) -> Round:
+    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in row.items()}
+    return Round(**values)
+
+
+def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
+    """Rows as the bytes of a parquet file. Written to memory first: the disk is the store's business.
+
+    Raises:
+        ValueError: a row has a column that the schema does not know.
+    """
+    for row in rows:
+        if unknown := set(row) - set(schema.names):
+            raise ValueError(f"columns {sorted(unknown)} are not in the schema")
+    buffer = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def episode_rows(records: Iterable[EpisodeRecord], worker_pid: int, started: str) -> list[dict[str, Any]]:
+    return [episode_row(record, worker_pid, started) for record in records]

@@ -1,0 +1,130 @@
+"""Intervals and tests of METHODS §7. Numbers in, numbers out: no tables here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import binomtest
+
+RESAMPLES = 10_000
+BOOTSTRAP_SEED = 20_260_301  # fixed: the same cells give the same table
+
+
+class Interval(NamedTuple):
+    low: float
+    high: float
+
+
+class Estimate(NamedTuple):
+    """A value with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class PairedCounts(NamedTuple):
+    """Episodes by success of the baseline and of the method from the same initial state."""
+
+    both: int
+    only_baseline: int
+    only_method: int
+    neither: int
+
+
+NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
+
+
+def wilson(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
+    """Wilson score interval of a success rate; NaN without episodes."""
+    if episodes == 0:
+        return Interval(math.nan, math.nan)
+    found = binomtest(successes, episodes).proportion_ci(confidence, method="wilson")
+    return Interval(float(found.low), float(found.high))
+
+
+def macro_wilson(groups: Sequence[tuple[int, int]], confidence: float = 0.95) -> Interval:
+    """Interval of the unweighted mean of the groups' success rates, from their Wilson intervals.
+
+    A mean of proportions has no Wilson interval of its own; the method of variance estimates recovery (Zou and
+    Donner, 2008) combines those of the groups and is the Wilson interval where there is one group.
+
+    Args:
+        groups: (successes, episodes) per group, at least one episode each.
+    """
+    if not groups:
+        return Interval(math.nan, math.nan)
+    rates = np.array([successes / episodes for successes, episodes in groups])
+    bounds = np.array([wilson(successes, episodes, confidence) for successes, episodes in groups])  # (groups, 2)
+    spread = np.sqrt(((bounds - rates[:, None]) ** 2).sum(axis=0)) / len(groups)
+    mean = float(rates.mean())
+    return Interval(mean - float(spread[0]), mean + float(spread[1]))
+
+
+def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
+    """Two bool arrays (pairs,) of successes from the same initial states."""
+    a, b = np.asarray(baseline, dtype=bool), np.asarray(method, dtype=bool)
+    return PairedCounts(int((a & b).sum()), int((a & ~b).sum()), int((~a & b).sum()), int((~a & ~b).sum()))
+
+
+def mcnemar(counts: PairedCounts) -> float:
+    """Exact two-sided p of McNemar's test: are the discordant pairs a fair coin? 1 without discordant pairs."""
+    discordant = counts.only_baseline + counts.only_method
+    if discordant == 0:
+        return 1.0
+    return float(binomtest(counts.only_method, discordant, 0.5).pvalue)
+
+
+def speedup(
+    baseline: np.ndarray,
+    method: np.ndarray,
+    strata: Sequence[str],
+    groups: Sequence[str] | None = None,
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = BOOTSTRAP_SEED,
+) -> Estimate:
+    """Ratio of mean time per step, baseline over method, with a paired bootstrap 95 % interval.
+
+    Pairs are drawn with replacement within their stratum (the task), both times of a pair together, and the ratio of
+    the means is taken of every draw.
+
+    Args:
+        baseline: (pairs,) time per step of the baseline's episodes, any unit.
+        method: (pairs,) the method's, same initial states, same unit.
+        strata: (pairs,) task of each pair.
+        groups: (pairs,) difficulty group of each pair: the means are then unweighted means over the groups' means.
+
+    Returns:
+        NaN without pairs; NaN bounds where a stratum has one pair only, which resampling cannot vary.
+    """
+    a, b = np.asarray(baseline, dtype=np.float64), np.asarray(method, dtype=np.float64)
+    if a.size == 0:
+        return NO_ESTIMATE
+    times = np.stack([a, b], axis=1)  # (pairs, 2)
+    weights = _weights(a.size, groups)
+    mean_a, mean_b = weights @ times
+    value = float(mean_a / mean_b)
+    names, members = np.unique(np.asarray(strata, dtype=object).astype(str), return_inverse=True)
+    if np.bincount(members).min() < 2:
+        return Estimate(value, math.nan, math.nan)
+    generator = np.random.default_rng(seed)
+    means = np.zeros((resamples, 2))
+    for stratum in range(len(names)):
+        rows = np.flatnonzero(members == stratum)
+        drawn = generator.integers(0, rows.size, size=(resamples, rows.size))
+        # a stratum lies in one group, so its pairs weigh the same
+        means += times[rows][drawn].mean(axis=1) * weights[rows].sum()
+    low, high = np.quantile(means[:, 0] / means[:, 1], [0.025, 0.975])
+    return Estimate(value, float(low), float(high))
+
+
+def _weights(pairs: int, groups: Sequence[str] | None) -> np.ndarray:
+    """Weight of every pair in the mean, summing to 1: uniform, or uniform over groups."""
+    if groups is None:
+        return np.full(pairs, 1.0 / pairs)
+    _, members, sizes = np.unique(np.asarray(groups, dtype=object).astype(str), return_inverse=True, return_counts=True)
+    return 1.0 / (sizes[members] * len(sizes))

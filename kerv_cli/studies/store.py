@@ -1,0 +1,355 @@
+"""The results folder of a study. A cell is either complete or absent.
+
+    results/studies/<name>/
+        plan.yaml                     what was asked for
+        cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
+        failures/<id>.txt             traceback of the last attempt, until one succeeds
+        rollouts/*.rrd
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import re
+import secrets
+import shutil
+import socket
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+
+from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
+from kerv_cli.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors
+from kerv_cli.settings import StudySettings
+from kerv_cli.studies import rows
+from kerv_cli.studies.plan import Cell
+from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+
+_CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
+_STATUS = "status.json"
+_TEMPORARY = re.compile(r"\.(?P<id>[0-9a-f]+)\.(?P<host>.+)\.(?P<pid>\d+)-[0-9a-f]+\.tmp")
+_OTHER_HOSTS_STALE_HOURS = 7 * 24.0  # whether a process of another machine lives cannot be asked
+
+
+@dataclass(frozen=True)
+class StoredCell:
+    """A complete cell as read back."""
+
+    id: str
+    folder: Path
+    config: dict[str, Any]  # study, label, overrides, task, seeds, identity, settings
+    status: dict[str, Any]  # provenance, run, seconds, sums
+    episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA
+
+
+@dataclass(frozen=True)
+class StudySummary:
+    """One line of a listing."""
+
+    name: str
+    title: str
+    planned: int  # cells of plan.yaml
+    complete: int
+
+
+class StudyStore:
+    """`results/studies/<name>`. Only a path: picklable, and nothing is created before the first write.
+
+    Raises:
+        UsageError: a name that is no plain folder name.
+    """
+
+    def __init__(self, results: Path | str, name: str) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+            raise UsageError(f"study name '{name}' must be letters, digits, '_', '-', '.'")
+        self.name = name
+        self.root = Path(results) / "studies" / name
+        self.cells = self.root / "cells"
+        self.rollouts = self.root / "rollouts"
+        self.plan_path = self.root / "plan.yaml"
+        self.failures = self.root / "failures"
+
+    def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
+        """Stores the plan; cells of an earlier plan stay where this one would hold them had it named their task.
+
+        So two sweeps that share the tasks of a study between them end in one report, and a changed setting or other
+        seeds replace what they change.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells))
+        with _write_lock(self.plan_path):
+            with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
+                new = merge_plans(self.read_plan(), new)
+            with atomic_path(self.plan_path) as temporary:
+                temporary.write_text(plan_text(new), encoding="utf-8")
+        return new
+
+    def read_plan(self) -> StudyPlan:
+        """The stored plan.
+
+        Raises:
+            UsageError: there is no such study; the message names what to run.
+            CheckpointError: the plan is damaged.
+        """
+        try:
+            return plan_from_text(self.plan_path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, NotADirectoryError):
+            raise UsageError(f"no study '{self.name}' in {self.root.parent}: {self.how_to_run()}") from None
+        except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+            why = " ".join(str(error).split())[:120]
+            raise CheckpointError(f"{self.plan_path} is damaged ({why}): {self.how_to_run()} again") from error
+
+    def how_to_run(self) -> str:
+        return f"run `kerv sweep study={self.name}`"
+
+    def has_cell(self, name: str) -> bool:
+        """Whether the cell is there, whole and unchanged.
+
+        Raises:
+            CheckpointError: the folder is there but damaged; the message names it and the remedy.
+        """
+        folder = self.cells / name
+        if not folder.exists():
+            return False
+        self._status(folder)
+        return True
+
+    def _status(self, folder: Path) -> dict[str, Any]:
+        """status.json, after every file was compared with the hash that it holds."""
+        try:
+            status = read_json(folder / _STATUS)
+            for file in _CELL_FILES:
+                if sha256_of(folder / file) != status["files"][file]:
+                    raise CheckpointError(f"{file} is not what was written")
+        except (CheckpointError, KeyError, TypeError) as error:
+            raise self._damaged(folder, error) from error
+        return status
+
+    def _damaged(self, folder: Path, error: Exception) -> CheckpointError:
+        why = str(error).replace(f"{folder}/", "")
+        return CheckpointError(f"cell {folder} is damaged ({why}): delete that folder and {self.how_to_run()} again")
+
+    def write_cell(
+        self, cell: Cell, records: Sequence[EpisodeRecord], status: Mapping[str, Any], started: str = ""
+    ) -> bool:
+        """Writes a complete cell under a temporary name, syncs it and renames it.
+
+        Args:
+            cell: what ran.
+            records: its episodes, in the order of `cell.seeds`.
+            status: provenance, run and seconds, JSON values.
+            started: ISO time of the cell's beginning.
+
+        Returns:
+            False where another process had completed the cell before: its result stays, this one is discarded.
+
+        Raises:
+            StorageError: the disk refused; nothing is left of the cell.
+            ValueError: the records are not of this cell's task and seeds.
+        """
+        if [(r.task, r.seed) for r in records] != [(cell.task, seed) for seed in cell.seeds]:
+            raise ValueError(f"records of other episodes than cell {cell.id} asks for ({cell.task}, {cell.seeds})")
+        folder = self.cells / cell.id
+        temporary = self.cells / f".{cell.id}.{socket.gethostname()}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+        files = self._cell_files(cell, records, status, started)
+        try:
+            with storage_errors(folder):
+                temporary.mkdir(parents=True)
+                for file, content in files.items():
+                    _write_synced(temporary / file, content)
+                _sync_folder(temporary)
+                return _rename_once(temporary, folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+    def _cell_files(
+        self, cell: Cell, records: Sequence[EpisodeRecord], status: Mapping[str, Any], started: str
+    ) -> dict[str, bytes]:
+        config = {
+            "study": self.name,
+            "id": cell.id,
+            "label": cell.label,
+            "overrides": cell.overrides,
+            "task": cell.task,
+            "seeds": list(cell.seeds),
+            "identity": cell.identity,
+            "settings": cell.settings,
+        }
+        decodes = [row for record in records for row in rows.decode_rows(record)]
+        files = {
+            "config.yaml": yaml.safe_dump(config, sort_keys=False).encode(),
+            "episodes.parquet": rows.parquet_bytes(
+                rows.episode_rows(records, os.getpid(), started), rows.EPISODE_SCHEMA
+            ),
+            "decodes.parquet": rows.parquet_bytes(decodes, rows.DECODE_SCHEMA),
+        }
+        full = {
+            "state": "complete",
+            "episodes": len(records),
+            "successes": sum(r.success for r in records),
+            "wall_seconds": sum(r.wall_seconds for r in records),
+            "started": started,
+            **status,
+            "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+        }
+        files[_STATUS] = (json.dumps(full, indent=2, allow_nan=False) + "\n").encode()
+        return files
+
+    def read_cell(self, name: str) -> StoredCell:
+        """A complete cell.
+
+        Raises:
+            CheckpointError: it is absent or damaged, or its columns are those of another version.
+        """
+        folder = self.cells / name
+        if not folder.exists():
+            raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
+        status = self._status(folder)
+        try:
+            config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+            episodes = pq.read_table(folder / "episodes.parquet", columns=rows.EPISODE_SCHEMA.names).to_pandas()
+        except (OSError, yaml.YAMLError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
+            raise self._damaged(folder, error) from error
+        return StoredCell(name, folder, config, status, episodes)
+
+    def read_decodes(self, name: str) -> dict[int, list[DecodeRecord]]:
+        """Seed -> that episode's decodes, in order, as they were recorded.
+
+        Raises:
+            CheckpointError: the cell is absent or damaged.
+        """
+        if not self.has_cell(name):
+            raise CheckpointError(f"cell {self.cells / name} is missing: {self.how_to_run()}")
+        table = pq.read_table(self.cells / name / "decodes.parquet")
+        by_seed: dict[int, list[DecodeRecord]] = {}
+        for row in table.to_pylist():
+            by_seed.setdefault(row["seed"], []).append(rows.decode_record(row))
+        return by_seed
+
+    def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
+        """The complete ones of these cells by id, and those that are absent.
+
+        Raises:
+            CheckpointError: a cell is damaged.
+            UsageError: not one is complete; the message names what to run.
+        """
+        found: dict[str, StoredCell] = {}
+        absent: list[Cell] = []
+        for cell in cells:
+            if cell.id in found:
+                continue
+            if (self.cells / cell.id).exists():
+                found[cell.id] = self.read_cell(cell.id)
+            else:
+                absent.append(cell)
+        if not found:
+            raise UsageError(f"study '{self.name}' has no complete cell: {self.how_to_run()}")
+        return found, absent
+
+    def write_failure(self, name: str, text: str) -> None:
+        """Keeps the traceback of a cell that failed, for people."""
+        with atomic_path(self.failures / f"{name}.txt") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    def clear_failure(self, name: str) -> None:
+        with contextlib.suppress(OSError):
+            (self.failures / f"{name}.txt").unlink(missing_ok=True)
+
+    def clean_stale(self, hours: float = 6.0) -> list[Path]:
+        """Removes the temporary folders that killed processes left: older than `hours`, their process gone."""
+        removed: list[Path] = []
+        for folder in sorted(self.cells.glob(".*.tmp")):
+            named = _TEMPORARY.fullmatch(folder.name)
+            if named and _is_stale(folder, named["host"], int(named["pid"]), hours):
+                shutil.rmtree(folder, ignore_errors=True)
+                removed.append(folder)
+        return removed
+
+
+def list_studies(results: Path | str) -> list[StudySummary]:
+    """Every study with a readable plan, by name. Folders are counted, not verified."""
+    summaries = []
+    for path in sorted((Path(results) / "studies").glob("*/plan.yaml")):
+        store = StudyStore(results, path.parent.name)
+        with contextlib.suppress(CheckpointError):
+            plan = store.read_plan()
+            names = {cell.id for cell in plan.cells}
+            complete = sum((store.cells / name).exists() for name in names)
+            summaries.append(StudySummary(store.name, plan.title, len(names), complete))
+    return summaries
+
+
+def _is_stale(folder: Path, host: str, pid: int, hours: float) -> bool:
+    try:
+        age = (time.time() - folder.stat().st_mtime) / 3600
+    except FileNotFoundError:  # its owner was faster
+        return False
+    if host != socket.gethostname():
+        return age > max(hours, _OTHER_HOSTS_STALE_HOURS)
+    return age > hours and not _alive(pid)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _rename_once(temporary: Path, folder: Path) -> bool:
+    """Renames a folder where none is yet; False where another process was first."""
+    try:
+        os.rename(temporary, folder)
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            return False
+        raise
+    _sync_folder(folder.parent)
+    return True
+
+
+@contextlib.contextmanager
+def _write_lock(path: Path) -> Any:
+    """One writer at a time reads, merges and replaces `path`; readers need no lock."""
+    import fcntl
+
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.with_name(f".{path.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+
+
+__all__ = ["StorageError", "StoredCell", "StudyStore", "StudySummary", "list_studies"]

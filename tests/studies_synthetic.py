@@ -1,0 +1,104 @@
+"""Records that look like those of real episodes, made up from a seed; no world, no model."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+
+from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.settings import RolloutSettings, StudySettings
+from kerv_cli.studies.plan import Cell, plan
+
+TOKENS = 16
+IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
+
+
+def settings_of(method: str, r: int = 0, episodes: int = 4, proposer: str = "drafter") -> RolloutSettings:
+    settings = RolloutSettings(method=method, episodes=episodes)
+    settings.proposer.kind = "none" if method == "ar" else proposer
+    settings.acceptance.kind = "relaxed" if r else "strict"
+    settings.threshold.r = r
+    return settings
+
+
+def threshold_study(tasks: list[str], episodes: int = 4, radii: tuple[int, ...] = (3, 9)) -> list[Cell]:
+    settings = {"ar": settings_of("ar", episodes=episodes), "naive_sd": settings_of("naive_sd", episodes=episodes)}
+    settings |= {f"spec_vla r={r}": settings_of("spec_vla", r, episodes) for r in radii}
+    overrides = {label: f"method={label.replace(' ', ' threshold.')}" for label in settings}
+    return plan(settings, tasks, IDENTITY, baseline="ar", overrides=overrides)
+
+
+def threshold_settings() -> StudySettings:
+    return StudySettings(name="threshold", title="Acceptance threshold", baseline="ar", axis="threshold.r")
+
+
+def generator(*parts: object) -> np.random.Generator:
+    digest = hashlib.sha256(repr(parts).encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "big"))
+
+
+def run_cell(cell: Cell) -> list[EpisodeRecord]:
+    """A stand-in for the lead's: higher r, longer acceptance, a little less success."""
+    return [episode(cell, seed) for seed in cell.seeds]
+
+
+def episode(cell: Cell, seed: int) -> EpisodeRecord:
+    world = generator(cell.task, seed)
+    rand_vec, difficulty = world.uniform(size=3), world.uniform()
+    rng = generator(cell.task, seed, cell.label)
+    r = cell.settings["threshold"]["r"]
+    slow = cell.settings["method"] == "ar"
+    decodes = tuple(ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25)))
+    steps = 4 * len(decodes)
+    return EpisodeRecord(
+        task=cell.task,
+        instruction="reach the goal",
+        seed=seed,
+        success=bool(difficulty < 0.9 - 0.015 * max(0, r - 5)),
+        steps=steps,
+        decodes=decodes,
+        decode_steps=tuple(range(0, steps, 4)),
+        actions=np.zeros((steps, 4), np.float32),
+        path=np.zeros((steps + 1, 3), np.float32),
+        gripper=np.zeros(steps + 1, np.float32),
+        rand_vec=rand_vec,
+        wall_seconds=2.0 * sum(d.seconds for d in decodes),
+    )
+
+
+def decode_of(rounds: list[Round], phases: dict[str, float], mode: str) -> DecodeRecord:
+    return DecodeRecord(
+        tokens=tuple(range(TOKENS)),
+        actions=np.full((4, 4), 0.25, np.float32),
+        forwards=len(rounds),
+        rounds=tuple(rounds),
+        mode=mode,
+        seconds=sum(phases.values()),
+        phases=phases,
+    )
+
+
+def ar_decode(rng: np.random.Generator) -> DecodeRecord:
+    rounds = [Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(TOKENS)]
+    noise = rng.lognormal(0, 0.1)
+    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "verify": 0.0, "other": 0.045 * noise}
+    return decode_of(rounds, phases, "ar")
+
+
+def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
+    rounds, committed = [Round("prefill", "none", 0, (), (0,), 0, 1, 0, ())], 1
+    while committed < TOKENS:
+        depth = min(5, TOKENS - committed)
+        accepted = min(depth, int(rng.binomial(5, 0.45 + 0.03 * min(r, 15))))
+        gain = min(accepted + 1, TOKENS - committed)
+        drafted = tuple(range(min(depth, accepted + 1)))
+        rounds.append(
+            Round("verify", "drafter", committed, drafted, drafted, accepted, gain, 24, (r, r, r, 0))
+        )
+        committed += gain
+    noise, cycles = rng.lognormal(0, 0.1), len(rounds) - 1
+    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}
+    phases |= {"verify": 0.0055 * cycles * noise, "accept": 0.0004 * cycles, "other": 0.0008}
+    return replace(decode_of(rounds, phases, "drafter"), variability=float(rng.uniform()))

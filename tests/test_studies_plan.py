@@ -1,0 +1,154 @@
+"""Cells: what makes them differ, in which order they run, how a plan is stored."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from studies_synthetic import IDENTITY, settings_of, threshold_settings, threshold_study
+
+from kerv_cli.settings import RolloutSettings
+from kerv_cli.studies.plan import cell_id, parse_seeds, plan, seeds_text, unique_cells
+from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+
+
+def only_id(settings: RolloutSettings, task: str = "reach-v3", identity: dict[str, str] | None = None) -> str:
+    (cell,) = plan({"x": settings}, [task], identity or IDENTITY)
+    return cell.id
+
+
+def changed(path: str, value: Any) -> RolloutSettings:
+    settings = settings_of("spec_vla", 9)
+    part: Any = settings
+    *groups, name = path.split(".")
+    for group in groups:
+        part = getattr(part, group)
+    assert getattr(part, name) != value
+    setattr(part, name, value)
+    return settings
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("proposer.kind", "hold"),
+        ("proposer.depth", 3),
+        ("acceptance.strict_gripper", True),
+        ("threshold.r", 5),
+        ("rectifier.kind", "compensate"),
+        ("boundary.kind", "fused"),
+        ("world.horizon", 200),
+        ("world.camera.size", 64),
+        ("runtime.device", "cuda"),
+        ("runtime.dtype", "bfloat16"),
+        ("runtime.threads", 2),
+        ("deviation_every", 4),
+        ("seed", 100_001),
+        ("episodes", 5),
+    ],
+)
+def test_what_determines_the_result_changes_the_id(path: str, value: Any) -> None:
+    assert only_id(changed(path, value)) != only_id(settings_of("spec_vla", 9))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("runtime.workers", 2),
+        ("results", "elsewhere"),
+        ("record", -1),
+        ("record_size", 480),
+        ("method", "other_name"),
+        ("policy.target", "same-weights-elsewhere"),
+        ("task", ["push-v3"]),
+    ],
+)
+def test_what_does_not_determine_the_result_leaves_the_id(path: str, value: Any) -> None:
+    assert only_id(changed(path, value)) == only_id(settings_of("spec_vla", 9))
+
+
+def test_task_weights_and_version_change_the_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = settings_of("ar")
+    before = only_id(settings)
+    assert only_id(settings, task="push-v3") != before
+    assert only_id(settings, identity={**IDENTITY, "drafter": "c" * 64}) != before
+    monkeypatch.setattr("kerv_cli.studies.plan.kerv_version", lambda: "9.9.9")
+    assert only_id(settings) != before
+
+
+def test_id_is_the_hash_of_canonical_json() -> None:
+    expected = hashlib.sha256(b'{"a":1,"b":{"c":[1,2],"d":null}}').hexdigest()[:16]
+    assert cell_id({"b": {"d": None, "c": [1, 2]}, "a": 1}) == expected
+    with pytest.raises(ValueError, match="JSON compliant"):
+        cell_id({"a": float("nan")})
+
+
+def test_a_device_that_two_machines_resolve_differently_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"runtime\.device"):
+        only_id(changed("runtime.device", "auto"))
+
+
+def test_tasks_in_turn_and_the_baseline_first() -> None:
+    settings = {"a": settings_of("spec_vla", 3), "ar": settings_of("ar"), "b": settings_of("spec_vla", 9)}
+    cells = plan(settings, ["reach-v3", "push-v3"], IDENTITY, baseline="ar")
+    assert [(c.task, c.label) for c in cells] == [
+        (task, label) for task in ("reach-v3", "push-v3") for label in ("ar", "a", "b")
+    ]
+    assert cells[0].seeds == (100_000, 100_001, 100_002, 100_003)
+    assert cells[3].settings["task"] == ["push-v3"]
+
+
+def test_settings_may_have_weights_of_their_own() -> None:
+    settings = {"a": settings_of("ar"), "b": settings_of("ar")}
+    settings["b"].policy.target = "other"
+    cells = plan(settings, ["reach-v3"], lambda s: {"target": s.policy.target})
+    assert [c.identity["target"] for c in cells] == ["mt10-vision", "other"]
+    assert cells[0].id != cells[1].id
+
+
+def test_two_labels_of_one_result_are_one_cell() -> None:
+    cells = plan({"a": settings_of("ar"), "b": settings_of("ar")}, ["reach-v3"], IDENTITY)
+    assert cells[0].id == cells[1].id
+    assert [c.label for c in unique_cells(cells)] == ["a"]
+
+
+@pytest.mark.parametrize(("seeds", "text"), [((5, 6, 7, 9), "5-7;9"), ((3,), "3"), ((2, 1), "1-2")])
+def test_seeds_as_ranges_and_back(seeds: tuple[int, ...], text: str) -> None:
+    assert seeds_text(seeds) == text
+    assert parse_seeds(text) == tuple(sorted(seeds))
+
+
+def study_plan(tasks: list[str], **settings: Any) -> StudyPlan:
+    study = threshold_settings()
+    return StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(threshold_study(tasks, **settings)))
+
+
+def test_plan_file_holds_the_plan() -> None:
+    original = study_plan(["reach-v3", "push-v3"])
+    text = plan_text(original)
+    assert plan_from_text(text) == original
+    json.dumps(original.cells[0].settings)  # plain values only
+
+
+def test_sweeps_that_share_the_tasks_end_in_one_plan() -> None:
+    merged = merge_plans(study_plan(["reach-v3"]), study_plan(["push-v3"]))
+    assert {c.id for c in merged.cells} == {c.id for c in study_plan(["reach-v3", "push-v3"]).cells}
+
+
+def test_a_plan_with_other_episodes_replaces_the_old_one() -> None:
+    new = study_plan(["push-v3"], episodes=7)
+    assert merge_plans(study_plan(["reach-v3"]), new) == new
+
+
+def test_a_changed_setting_replaces_only_its_own_cells() -> None:
+    old, new = study_plan(["reach-v3"]), study_plan(["push-v3"])
+    cells = [
+        c if c.label != "naive_sd" else replace(plan({"naive_sd": settings_of("ar")}, [c.task], IDENTITY)[0])
+        for c in new.cells
+    ]
+    merged = merge_plans(old, replace(new, cells=tuple(cells)))
+    kept = {c.label for c in merged.cells if c.task == "reach-v3"}
+    assert kept == {"ar", "spec_vla r=3", "spec_vla r=9"}

@@ -1,0 +1,144 @@
+"""Intervals and tests against closed forms, slower references and simulated coverage."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from kerv_cli.studies.stats import PairedCounts, macro_wilson, mcnemar, paired_counts, speedup, wilson
+
+Z = 1.959963984540054  # 97.5th percentile of the normal distribution
+
+
+def wilson_formula(successes: int, episodes: int) -> tuple[float, float]:
+    p = successes / episodes
+    centre = p + Z**2 / (2 * episodes)
+    half = Z * math.sqrt(p * (1 - p) / episodes + Z**2 / (4 * episodes**2))
+    return (centre - half) / (1 + Z**2 / episodes), (centre + half) / (1 + Z**2 / episodes)
+
+
+@pytest.mark.parametrize(("successes", "episodes"), [(0, 10), (10, 10), (7, 10), (43, 50), (1, 3)])
+def test_wilson_is_the_score_interval(successes: int, episodes: int) -> None:
+    assert wilson(successes, episodes) == pytest.approx(wilson_formula(successes, episodes), abs=1e-12)
+
+
+def test_wilson_without_episodes_is_unknown() -> None:
+    assert all(math.isnan(bound) for bound in wilson(0, 0))
+
+
+def test_macro_interval_of_one_group_is_wilson() -> None:
+    assert macro_wilson([(7, 10)]) == pytest.approx(wilson(7, 10), abs=1e-12)
+
+
+def test_macro_interval_of_two_groups_by_hand() -> None:
+    (low_a, high_a), (low_b, high_b) = wilson_formula(9, 10), wilson_formula(6, 20)
+    low = 0.6 - 0.5 * math.hypot(0.9 - low_a, 0.3 - low_b)
+    high = 0.6 + 0.5 * math.hypot(high_a - 0.9, high_b - 0.3)
+    assert macro_wilson([(9, 10), (6, 20)]) == pytest.approx((low, high), abs=1e-12)
+
+
+def test_macro_interval_covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    truth, sizes = np.array([0.95, 0.7, 0.3]), np.array([20, 15, 10])
+    draws = rng.binomial(sizes, truth, size=(600, 3))
+    intervals = [macro_wilson(list(zip(successes, sizes, strict=True))) for successes in draws]
+    inside = [low <= truth.mean() <= high for low, high in intervals]
+    assert 0.92 <= np.mean(inside) <= 0.985
+
+
+def test_paired_counts_are_the_four_cells() -> None:
+    baseline = np.array([1, 1, 1, 0, 0, 0, 0], bool)
+    method = np.array([1, 1, 0, 1, 1, 1, 0], bool)
+    assert paired_counts(baseline, method) == PairedCounts(both=2, only_baseline=1, only_method=3, neither=1)
+
+
+@pytest.mark.parametrize(("lost", "won"), [(0, 1), (3, 0), (11, 0), (5, 2), (4, 4), (1, 9)])
+def test_mcnemar_is_twice_the_binomial_tail(lost: int, won: int) -> None:
+    n = lost + won
+    tail = sum(math.comb(n, k) for k in range(min(lost, won) + 1)) / 2**n
+    assert mcnemar(PairedCounts(10, lost, won, 10)) == pytest.approx(min(1.0, 2 * tail), abs=1e-12)
+
+
+def test_mcnemar_without_discordant_pairs_is_one() -> None:
+    assert mcnemar(PairedCounts(5, 0, 0, 5)) == 1.0
+
+
+def test_speedup_is_the_ratio_of_means_not_the_mean_of_ratios() -> None:
+    found = speedup(np.array([1.0, 9.0]), np.array([1.0, 3.0]), ["a", "a"])
+    assert found.value == pytest.approx(10 / 4)
+
+
+def test_macro_speedup_weighs_groups_equally() -> None:
+    baseline, method = np.array([2.0, 4.0, 6.0, 30.0, 34.0]), np.array([1.0, 2.0, 3.0, 20.0, 20.0])
+    groups = ["easy", "easy", "easy", "hard", "hard"]
+    found = speedup(baseline, method, ["a", "a", "a", "b", "b"], groups)
+    assert found.value == pytest.approx((4.0 + 32.0) / (2.0 + 20.0))
+    assert speedup(baseline, method, ["a", "a", "a", "b", "b"]).value == pytest.approx(76.0 / 46.0)
+
+
+def slow_bootstrap(baseline: np.ndarray, method: np.ndarray, strata: list[str], draws: int) -> tuple[float, float]:
+    rng = np.random.default_rng(99)
+    names = sorted(set(strata))
+    ratios = []
+    for _ in range(draws):
+        picked = [
+            int(rng.choice([i for i, s in enumerate(strata) if s == name]))
+            for name in names
+            for _ in range(strata.count(name))
+        ]
+        ratios.append(baseline[picked].sum() / method[picked].sum())
+    return tuple(np.quantile(ratios, [0.025, 0.975]))
+
+
+def test_interval_agrees_with_a_bootstrap_written_as_loops() -> None:
+    rng = np.random.default_rng(5)
+    strata = ["a"] * 8 + ["b"] * 5
+    baseline = rng.lognormal(0.0, 0.3, 13)
+    method = baseline / 1.5 * rng.lognormal(0.0, 0.2, 13)
+    found = speedup(baseline, method, strata)
+    assert (found.low, found.high) == pytest.approx(slow_bootstrap(baseline, method, strata, 2000), rel=0.02)
+
+
+def test_resampling_stays_within_tasks() -> None:
+    """Tasks of very different cost, constant within: between-task resampling would give a wide interval."""
+    baseline, method = np.array([1.0, 1.0, 100.0, 100.0]), np.array([1.0, 1.0, 50.0, 50.0])
+    found = speedup(baseline, method, ["a", "a", "b", "b"])
+    assert (found.low, found.high) == pytest.approx((found.value, found.value))
+
+
+def test_pairs_stay_together() -> None:
+    rng = np.random.default_rng(3)
+    baseline = rng.lognormal(0.0, 1.0, 40)
+    together = speedup(baseline, baseline / 2, ["a"] * 40)
+    apart = speedup(baseline, rng.permutation(baseline / 2), ["a"] * 40)
+    assert together.high - together.low < 1e-9 < 0.2 < apart.high - apart.low
+
+
+def test_interval_covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(11)
+    inside = []
+    for _ in range(300):
+        shared = rng.lognormal(0.0, 0.3, 40)
+        baseline, method = 1.6 * shared * rng.lognormal(0, 0.1, 40), shared * rng.lognormal(0, 0.1, 40)
+        found = speedup(baseline, method, ["a"] * 20 + ["b"] * 20, resamples=800)
+        inside.append(found.low <= 1.6 <= found.high)
+    assert 0.90 <= np.mean(inside) <= 0.985
+
+
+def test_same_numbers_every_time() -> None:
+    rng = np.random.default_rng(1)
+    baseline, method = rng.uniform(1, 2, 9), rng.uniform(1, 2, 9)
+    assert speedup(baseline, method, ["a"] * 9) == speedup(baseline, method, ["a"] * 9)
+
+
+def test_one_pair_per_task_has_no_interval() -> None:
+    found = speedup(np.array([2.0, 4.0]), np.array([1.0, 2.0]), ["a", "b"])
+    assert found.value == 2.0
+    assert math.isnan(found.low)
+    assert math.isnan(found.high)
+
+
+def test_without_pairs_there_is_no_speedup() -> None:
+    assert math.isnan(speedup(np.array([]), np.array([]), []).value)
