@@ -28,7 +28,8 @@ _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 _PROBE = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
 _PROBE_SECONDS = 60.0
 
-_answer: str | RenderingUnavailable | None = None
+_backend: str | None = None
+_refusal: str | None = None
 _open_cameras: weakref.WeakSet[Camera] = weakref.WeakSet()
 
 
@@ -75,15 +76,16 @@ def choose_backend() -> str:
         RenderingUnavailable: nothing can draw here, `MUJOCO_GL` switches drawing off, or mujoco was already imported
             without a headless backend.
     """
-    global _answer
-    if _answer is None:
+    global _backend, _refusal
+    if _refusal is not None:
+        raise RenderingUnavailable(_refusal)
+    if _backend is None:
         try:
-            _answer = _find_backend()
+            _backend = _find_backend()
         except RenderingUnavailable as error:
-            _answer = error
-    if isinstance(_answer, RenderingUnavailable):
-        raise _answer
-    return _answer
+            _refusal = str(error)
+            raise
+    return _backend
 
 
 def _find_backend() -> str:
@@ -102,12 +104,16 @@ def _find_backend() -> str:
 
 def _probe_backends() -> str:
     if "mujoco.gl_context" in sys.modules:
-        raise RenderingUnavailable("mujoco was imported before a GL backend was chosen: set MUJOCO_GL=egl and run again")
+        raise RenderingUnavailable("mujoco was imported before a GL backend was chosen: set MUJOCO_GL=egl")
     for backend in _HEADLESS:
         environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
         try:
             probe = subprocess.run(
-                [sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=False
+                [sys.executable, "-c", _PROBE],
+                env=environment,
+                capture_output=True,
+                timeout=_PROBE_SECONDS,
+                check=False,
             )
         except subprocess.TimeoutExpired:
             continue
@@ -143,7 +149,7 @@ class Camera:
         model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
         try:
             self._renderer: Any = mujoco.Renderer(model, height=pixels, width=pixels)
-        except Exception as error:  # noqa: BLE001 - each backend raises its own types
+        except Exception as error:  # each backend raises types of its own
             raise RenderingUnavailable(
                 f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
             ) from error

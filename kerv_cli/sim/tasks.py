@@ -29,7 +29,7 @@ class Task:
     difficulty: str
 
 
-# The public table tells push and push-back in one sentence; these 50 are distinct and checked against the experts' motion.
+# The public table has one sentence for push and push-back. These 50 are distinct, and say what the experts do.
 _INSTRUCTIONS: dict[str, dict[str, str]] = {
     "easy": {
         "button-press": "press the button",
@@ -47,15 +47,15 @@ _INSTRUCTIONS: dict[str, dict[str, str]] = {
         "faucet-close": "turn the faucet off clockwise",
         "faucet-open": "turn the faucet on counterclockwise",
         "handle-press": "press the handle down",
-        "handle-press-side": "press the handle down from the side",
+        "handle-press-side": "press the sideways handle down",
         "handle-pull": "pull the handle up",
-        "handle-pull-side": "pull the handle up from the side",
+        "handle-pull-side": "pull the sideways handle up",
         "lever-pull": "pull the lever up",
         "peg-unplug-side": "unplug the peg sideways",
-        "plate-slide": "slide the plate into the cabinet",
-        "plate-slide-back": "slide the plate back out of the cabinet",
-        "plate-slide-back-side": "slide the plate sideways out of the cabinet",
-        "plate-slide-side": "slide the plate sideways into the cabinet",
+        "plate-slide": "slide the plate into the net",
+        "plate-slide-back": "slide the plate back out of the net",
+        "plate-slide-back-side": "slide the plate sideways out of the net",
+        "plate-slide-side": "slide the plate sideways into the net",
         "reach": "reach the goal position",
         "reach-wall": "bypass the wall and reach the goal position",
         "window-close": "slide the window closed",
