@@ -131,24 +131,17 @@ class StudySettings:
     name: str = "threshold"
     title: str = ""
     baseline: str = "ar"  # label of the setting that the others are compared with
+    common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
 
 
 @dataclass
 class SweepSettings:
-    """`kerv sweep`: a study's settings over tasks and seeds."""
+    """`kerv sweep`: a study. Everything else on the command line goes to each of its settings."""
 
     study: StudySettings = field(default_factory=StudySettings)
-    rollout: RolloutSettings = field(default_factory=RolloutSettings)
     results: str = "results"
-
-
-def as_plain(settings: Any) -> dict[str, Any]:
-    """A settings dataclass as nested dicts and lists."""
-    import dataclasses
-
-    return dataclasses.asdict(settings)
 
 
 @dataclass
@@ -261,7 +254,7 @@ class DoctorSettings:
 class ReportSettings:
     """`kerv report`."""
 
-    study: str | None = None  # name of one study; default: all that are there
+    only: str | None = None  # name of one study (study=NAME on the command line); default: all that are there
     results: str = "results"
 
 

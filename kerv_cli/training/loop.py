@@ -68,8 +68,8 @@ class Loop:
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
         indices = torch.randint(self.job.samples, (settings.batch,), generator=generator)
         loss, metrics = self.job.loss(indices, self.step)
-        if not math.isfinite(float(loss)):
-            raise KervError(f"training diverged at step {self.step} (loss {float(loss)}): lower train.lr")
+        if not math.isfinite(loss.item()):
+            raise KervError(f"training diverged at step {self.step} (loss {loss.item()}): lower train.lr")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.job.module.parameters(), settings.clip)
@@ -78,7 +78,7 @@ class Loop:
         live = self.job.module.state_dict()
         with torch.no_grad():
             torch._foreach_lerp_([self.ema[k] for k in live], list(live.values()), 1 - decay)
-        return {"loss": float(loss.detach()), **metrics}
+        return {"loss": loss.item(), **metrics}
 
     def check(self, training: Metrics) -> None:
         """Validate the EMA weights, keep the best, write the resume file."""
@@ -136,8 +136,9 @@ class Loop:
 
 
 def schedule(step: int, settings: TrainSettings) -> float:
-    """Linear warm-up, then cosine to 2 % of the peak."""
-    if step < settings.warmup:
-        return (step + 1) / settings.warmup
-    share = (step - settings.warmup) / max(1, settings.steps - settings.warmup)
+    """Linear warm-up, then cosine to 2 % of the peak; once for the position phase and once for the rest."""
+    begin, end = (0, settings.scene_steps) if step < settings.scene_steps else (settings.scene_steps, settings.steps)
+    if step - begin < settings.warmup:
+        return (step - begin + 1) / settings.warmup
+    share = (step - begin - settings.warmup) / max(1, end - begin - settings.warmup)
     return 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(1.0, share)))

@@ -88,7 +88,7 @@ class TargetRun:
         made = {
             "command": "kerv train target",
             "settings": asdict(self.settings),
-            "demos": {"sha256": self.dataset.sha256, "seeds": self.dataset.manifest["seeds"]},
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
@@ -145,7 +145,7 @@ class DrafterRun:
         made = {
             "command": "kerv train drafter",
             "settings": asdict(self.settings),
-            "demos": {"sha256": self.dataset.sha256, "seeds": self.dataset.manifest["seeds"]},
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),

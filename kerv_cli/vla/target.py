@@ -139,7 +139,10 @@ class Target(nn.Module):
         assert inputs.images is not None
         images = inputs.images.to(self.head.weight.dtype) / 255.0 - 0.5
         tokens, points = self.vision(images)
-        located = self.locate(torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype))
+        # bfloat16 would round image points to a fifth of a cell: millimetres matter here
+        with torch.autocast(points.device.type, enabled=False):
+            features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
+            located = self.locate(features)
         return tokens, located.float() * 0.1 + self.centre.repeat(2)
 
     def forward(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,34 @@
+"""`kerv report`: tables, plots and a page from the cells of a results folder."""
+
+from __future__ import annotations
+
+import typer
+
+from kerv_cli.commands.common import Overrides, ShowConfig, console, edge
+
+
+@edge
+def report(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+    """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
+    from kerv_cli.config import compose, to_yaml
+    from kerv_cli.settings import ReportSettings
+
+    # study=NAME names a folder of results here; to Hydra it would be a choice among the files of conf/study
+    words = [f"only={o[6:]}" if o.startswith("study=") else o for o in overrides or []]
+    settings = compose("report", words, ReportSettings)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        return
+    from kerv_cli.places import results_dir
+    from kerv_cli.studies.report import report as write_report
+    from kerv_cli.studies.store import StudyStore, list_studies
+    from kerv_cli.studies.summary import summary_table
+    from kerv_cli.studies.tables import load_study, study_table
+
+    results = results_dir(settings.results)
+    written = write_report(results, settings.only)
+    names = [settings.only] if settings.only else [s.name for s in list_studies(results) if s.complete]
+    for name in names:
+        console().print(summary_table(study_table(load_study(StudyStore(results, name)))))
+    for path in written:
+        typer.echo(str(path))

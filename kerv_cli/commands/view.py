@@ -1,0 +1,39 @@
+"""`kerv view`: open rollouts in Rerun."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kerv_cli.commands.common import ShowConfig, edge
+
+
+@edge
+def view(
+    arguments: Annotated[
+        list[str] | None, typer.Argument(help="Recordings (.rrd) or folders of them, and results=DIR.")
+    ] = None,
+    cfg: ShowConfig = False,
+    summary: Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")] = False,
+) -> None:
+    """Open recordings in the Rerun viewer; without a display, print the command that does."""
+    from kerv_cli.config import compose, to_yaml
+    from kerv_cli.settings import ViewSettings
+
+    words = arguments or []
+    overrides = [w for w in words if w.split("=", 1)[0] == "results" and "=" in w]
+    settings = compose("view", overrides, ViewSettings)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        return
+    from kerv_cli.rollouts.viewer import find_recordings, open_recording, read_summary
+
+    places = [Path(w) for w in words if w not in overrides] or [Path(settings.results)]
+    recordings = find_recordings(places)
+    if summary:
+        for recording in recordings:
+            typer.echo(read_summary(recording))
+        return
+    typer.echo(open_recording(recordings))

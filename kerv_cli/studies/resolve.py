@@ -1,0 +1,55 @@
+"""A study's YAML and the command line -> one resolved setting per label."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from kerv_cli.config import compose, expand, swept_keys
+from kerv_cli.errors import UsageError
+from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
+
+
+@dataclass(frozen=True)
+class ResolvedStudy:
+    study: StudySettings
+    settings: Mapping[str, RolloutSettings]  # by label, the study's order
+    overrides: Mapping[str, str]  # by label, as written
+
+
+def resolve(overrides: Sequence[str]) -> ResolvedStudy:
+    """`study…` and `results` belong to the sweep, everything else to each of its settings.
+
+    Raises:
+        UsageError: an unknown key or name; a key on the command line that the study itself varies.
+    """
+    mine = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in ("study", "results")]
+    theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
+    sweep = compose("sweep", mine, SweepSettings)
+    given = {_key(o) for o in theirs}
+    common = [o for o in shlex.split(sweep.study.common) if _key(o) not in given] + theirs
+    written = _points(sweep.study)
+    for words in written.values():
+        varied = given & {_key(word) for word in words}
+        if varied:
+            raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
+    if sweep.study.baseline not in written:
+        raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(written)}")
+    settings = {label: compose("rollout", [*common, *words], RolloutSettings) for label, words in written.items()}
+    return ResolvedStudy(sweep.study, settings, {label: " ".join(words) for label, words in written.items()})
+
+
+def _key(override: str) -> str:
+    return override.split("=", 1)[0]
+
+
+def _points(study: StudySettings) -> dict[str, list[str]]:
+    """Labels of a grid carry its values: `spec_vla r=3`."""
+    written: dict[str, list[str]] = {}
+    for label, text in study.settings.items():
+        varied = swept_keys(text)
+        for words in expand(text):
+            values = [f"{_key(w).rsplit('.', 1)[-1]}={w.split('=', 1)[1]}" for w in words if _key(w) in varied]
+            written[" ".join([label, *values])] = words
+    return written
