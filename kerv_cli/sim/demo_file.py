@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ from kerv_cli.files import atomic_path
 from kerv_cli.sim.world import ACTION_SIZE, STATE_SIZE
 
 FORMAT = 1
+_LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
 
 
 @dataclass(frozen=True)
@@ -77,9 +80,23 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "steps": str(episode.steps),
         "frame_size": str(episode.frames.shape[1]),
     }
-    data = save(tensors, metadata=metadata)  # save_file would hide a full disk behind an error type of its own
+    # save_file would hide a full disk behind an error type of its own.
+    data = _with_sorted_metadata(save(tensors, metadata=metadata))
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+
+
+def _with_sorted_metadata(data: bytes) -> bytes:
+    """The same safetensors bytes with the metadata's keys in order.
+
+    safetensors writes them in random order, and two recordings of one episode would differ in their hash.
+    """
+    start = _LENGTH.size + _LENGTH.unpack_from(data)[0]
+    header = json.loads(data[_LENGTH.size : start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
+    return _LENGTH.pack(len(text)) + text + data[start:]
 
 
 def load_episode(path: Path) -> DemoEpisode:

@@ -167,8 +167,24 @@ def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None
     choose_backend()
     identity = _identity(config)
     _claim_folder(out, identity)
-    kept: dict[str, list[dict[str, Any]]] = {task: [] for task in config.tasks}
-    failed: dict[str, list[int]] = {task: [] for task in config.tasks}
+    try:
+        kept, failed = _collect(config, out, on_progress)
+    finally:
+        _release_world()
+    manifest = {**identity, **_summary(config, kept, failed)}
+    write_json(out / "manifest.json", manifest)
+    return manifest
+
+
+_Entries = dict[str, list[dict[str, Any]]]  # task -> the manifest's entries
+_Failures = dict[str, list[int]]  # task -> seeds
+
+
+def _collect(
+    config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None
+) -> tuple[_Entries, _Failures]:
+    kept: _Entries = {task: [] for task in config.tasks}
+    failed: _Failures = {task: [] for task in config.tasks}
     wanted = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
     while any(wanted.values()):
         for task, outcomes in _run_jobs(config, out, _jobs(wanted)):
@@ -177,9 +193,7 @@ def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None
             if on_progress is not None:
                 on_progress(sum(map(len, kept.values())), config.episodes * len(config.tasks))
         wanted = {task: _next_seeds(config, len(kept[task]), wanted[task]) for task in config.tasks}
-    manifest = {**identity, **_summary(config, kept, failed)}
-    write_json(out / "manifest.json", manifest)
-    return manifest
+    return kept, failed
 
 
 def _jobs(wanted: Mapping[str, range]) -> list[tuple[str, range]]:
@@ -231,11 +245,7 @@ _Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, No
 
 def _run_jobs(config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]]) -> Iterator[tuple[str, _Outcomes]]:
     if config.workers == 1 or len(jobs) == 1:
-        try:
-            for task, seeds in jobs:
-                yield _record_seeds(config, out, task, seeds)
-        finally:
-            _release_world()
+        yield from (_record_seeds(config, out, task, seeds) for task, seeds in jobs)
         return
     from joblib import Parallel, delayed, parallel_config
 
@@ -296,9 +306,7 @@ def _valid_episode(path: Path, task: str, seed: int) -> DemoEpisode | None:
     return episode if (episode.task, episode.seed) == (task, seed) else None
 
 
-def _summary(
-    config: DemoConfig, kept: Mapping[str, list[dict[str, Any]]], failed: Mapping[str, list[int]]
-) -> dict[str, Any]:
+def _summary(config: DemoConfig, kept: _Entries, failed: _Failures) -> dict[str, Any]:
     empty = [task for task, entries in kept.items() if not entries]
     if empty:
         raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")

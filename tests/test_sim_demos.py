@@ -1,0 +1,229 @@
+"""Recorded demonstrations on real Meta-World: contents, resuming, refusals, damage."""
+
+import itertools
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.sim.camera import CameraConfig
+from kerv_cli.sim.demos import DemoConfig, DemoDataset, record
+from kerv_cli.sim.perturbation import Perturbation, is_perturbed
+from kerv_cli.sim.world import Expert, World
+
+CONFIG = DemoConfig(
+    tasks=("reach",), episodes=6, frame_stride=10, camera=CameraConfig(size=24, supersample=1), workers=1, tail=5
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demos")
+    progress = []
+    manifest = record(CONFIG, out, lambda done, total: progress.append((done, total)))
+    assert progress[-1] == (6, 6)
+    assert manifest == json.loads((out / "manifest.json").read_text())
+    return out
+
+
+@pytest.fixture
+def copied(recorded, tmp_path):
+    return shutil.copytree(recorded, tmp_path / "demos")
+
+
+def files_of(folder):
+    return {path.relative_to(folder): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+def noise_of(episode):
+    if not episode.perturbed:
+        return lambda action: action
+    noise = (CONFIG.noise_low, CONFIG.noise_high)
+    return Perturbation(episode.task, episode.seed, noise, CONFIG.burst_probability)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
+    episode = DemoDataset.open(recorded).load(index)
+    expert, perturb, frames = Expert("reach"), noise_of(episode), []
+    with World("reach", CONFIG.camera) as world:
+        observation = world.reset(episode.seed)
+        assert world.rand_vec.tobytes() == episode.rand_vec.tobytes()
+        for step in range(episode.steps):
+            assert not observation.success
+            if step % CONFIG.frame_stride == 0:
+                frames.append(world.frame())
+            label = expert(observation)
+            action = perturb(label)
+            assert observation.state.astype(np.float32).tobytes() == episode.states[step].tobytes()
+            assert label.astype(np.float32).tobytes() == episode.labels[step].tobytes()
+            assert action.astype(np.float32).tobytes() == episode.executed[step].tobytes()
+            observation = world.step(action)
+        assert observation.success
+        for label in episode.labels[episode.steps :]:
+            assert expert(observation).astype(np.float32).tobytes() == label.tobytes()
+            observation = world.step(expert(observation))
+    assert episode.frames.tobytes() == np.stack(frames).tobytes()
+
+
+def test_an_episodes_arrays_fit_together(recorded):
+    dataset = DemoDataset.open(recorded)
+    assert [(entry.task, entry.seed) for entry in dataset.episodes] == [("reach-v3", seed) for seed in range(6)]
+    assert [entry.perturbed for entry in dataset.episodes] == [False, True] * 3
+    for index, entry in enumerate(dataset.episodes):
+        episode = dataset.load(index)
+        assert (episode.task, episode.seed, episode.steps) == (entry.task, entry.seed, entry.steps)
+        assert episode.frame_steps.tolist() == list(range(0, episode.steps, 10))
+        assert episode.frames.shape == (len(episode.frame_steps), 24, 24, 3)
+        assert episode.states.shape == (episode.steps, 39)
+        assert episode.labels.shape == (episode.steps + 5, 4)
+        assert episode.executed.shape == (episode.steps, 4)
+        assert episode.end_effector.shape == (episode.steps, 3)
+        assert np.abs(episode.labels).max() <= 1.0
+        assert np.abs(episode.executed).max() <= 1.0
+
+
+def test_noise_moves_the_hand_and_never_the_gripper(recorded):
+    dataset = DemoDataset.open(recorded)
+    for index, entry in enumerate(dataset.episodes):
+        episode = dataset.load(index)
+        difference = np.abs(episode.executed - episode.labels[: episode.steps])
+        assert difference[:, 3].max() == 0.0
+        assert (difference[:, :3].mean() > 0.05) == entry.perturbed
+        assert (difference.max() > 0.0) == entry.perturbed
+
+
+def test_the_manifest_tells_what_was_recorded(recorded):
+    manifest = DemoDataset.open(recorded).manifest
+    assert manifest["config"]["tasks"] == ["reach-v3"]
+    assert manifest["seeds"] == {"first": 0, "last": 5}
+    assert (manifest["episodes"], manifest["missing"]) == (6, 0)
+    assert set(manifest["versions"]) == {"metaworld", "mujoco", "numpy", "python"}
+    task = manifest["tasks"]["reach-v3"]
+    assert task["mean_steps"] == pytest.approx(np.mean([entry["steps"] for entry in task["episodes"]]), abs=0.01)
+
+
+def test_a_killed_recording_goes_on(copied):
+    before = DemoDataset.open(copied)
+    missing, damaged = before.episodes[1].path, before.episodes[4].path
+    kept = files_of(copied / "episodes")
+    missing.unlink()
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    (copied / "manifest.json").unlink()
+    with pytest.raises(CheckpointError, match="unfinished"):
+        DemoDataset.open(copied)
+    assert record(CONFIG, copied, None)["sha256"] == before.sha256
+    again = files_of(copied / "episodes")
+    assert {path.name for path in again if again[path] != kept[path]} == {missing.name, damaged.name}
+
+
+def test_the_number_of_workers_changes_nothing(recorded, tmp_path):
+    manifest = record(replace(CONFIG, workers=2), tmp_path / "parallel")
+    assert manifest == DemoDataset.open(recorded).manifest
+
+
+def test_another_configuration_is_refused_and_nothing_touched(copied):
+    before = files_of(copied)
+    with pytest.raises(UsageError, match="episodes=6, not 7: choose another folder"):
+        record(replace(CONFIG, episodes=7), copied)
+    with pytest.raises(UsageError, match="camera="):
+        record(replace(CONFIG, camera=CameraConfig(size=32)), copied)
+    assert files_of(copied) == before
+
+
+def test_failed_seeds_are_replaced_by_the_next_ones(recorded, tmp_path):
+    steps = {entry.seed: entry.steps for entry in DemoDataset.open(recorded).episodes}
+    horizon = sorted(steps.values())[3]
+    config = replace(CONFIG, episodes=3, horizon=horizon)
+    manifest = record(config, tmp_path / "short")
+    task = manifest["tasks"]["reach-v3"]
+    succeeded = [entry["seed"] for entry in task["episodes"]]
+    fast = [seed for seed in steps if steps[seed] <= horizon]
+    assert succeeded == fast[:3]
+    assert task["failed_seeds"] == [seed for seed in range(succeeded[-1]) if seed not in succeeded]
+    assert task["failed_seeds"], "choose a horizon that some seed misses"
+    tried = files_of(tmp_path / "short" / "failed")
+    assert record(config, tmp_path / "short") == manifest
+    assert files_of(tmp_path / "short" / "failed") == tried  # a known failure is not run again
+
+
+def test_an_expert_that_never_succeeds_ends_the_recording(tmp_path):
+    with pytest.raises(KervError, match="no expert episode succeeded within 2 steps for reach-v3"):
+        record(replace(CONFIG, episodes=1, horizon=2), tmp_path / "hopeless")
+    assert len(list((tmp_path / "hopeless" / "failed").rglob("*.json"))) == 22  # bounded: 2 x 1 + 20 seeds
+    assert not (tmp_path / "hopeless" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"first_seed": 99_998}, "for evaluation"),
+        ({"first_seed": -1}, "first seed"),
+        ({"tasks": ()}, "at least one task"),
+        ({"episodes": 0}, "episodes"),
+        ({"perturbed": 1.5}, "perturbed"),
+        ({"noise_low": 0.7}, "noise_low"),
+        ({"burst_probability": -0.1}, "burst_probability"),
+        ({"frame_stride": 0}, "frame_stride"),
+        ({"tail": 500}, "tail"),
+        ({"workers": 0}, "workers"),
+        ({"horizon": 501}, "horizon"),
+    ],
+)
+def test_impossible_settings_are_refused(change, message):
+    with pytest.raises(UsageError, match=message):
+        replace(CONFIG, **change)
+
+
+def test_no_seed_beyond_the_training_range_is_ever_tried():
+    assert replace(CONFIG, first_seed=99_990).seed_limit == 100_000
+    assert CONFIG.seed_limit == 2 * 6 + 20
+
+
+def test_damage_is_found(copied, tmp_path):
+    with pytest.raises(CheckpointError, match="no demonstrations in"):
+        DemoDataset.open(tmp_path / "nothing")
+    dataset = DemoDataset.open(copied)
+    path = dataset.episodes[2].path
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(CheckpointError, match="changed since it was recorded"):
+        dataset.load(2)
+    path.write_bytes(data[:-1])
+    with pytest.raises(CheckpointError, match="cut short"):
+        DemoDataset.open(copied)
+    manifest = dataset.manifest
+    manifest["tasks"]["reach-v3"]["episodes"].pop()
+    (copied / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(CheckpointError, match="hash does not fit"):
+        DemoDataset.open(copied)
+    for text in ("{}", "[]", "{", '{"format": 1, "tasks": 3}'):
+        (copied / "manifest.json").write_text(text)
+        with pytest.raises(CheckpointError, match="manifest"):
+            DemoDataset.open(copied)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5, 1.0])
+def test_noisy_episodes_are_spread_evenly(fraction):
+    noisy = [is_perturbed(seed, fraction) for seed in range(1000)]
+    assert sum(noisy) == pytest.approx(1000 * fraction, abs=1)
+    assert all(abs(sum(noisy[start : start + 10]) - 10 * fraction) <= 1 for start in range(990))
+
+
+def test_bursts_last_three_to_eight_steps_in_one_direction():
+    perturb = Perturbation("reach-v3", 7, (0.2, 0.6), burst_probability=0.1)
+    executed = [perturb(np.array([0.1, 0.2, 0.3, 0.5])) for _ in range(3000)]
+    runs = [1]
+    for last, now in itertools.pairwise(executed):
+        if np.array_equal(last, now):
+            runs[-1] += 1
+        else:
+            runs.append(1)
+    lengths = {run for run in runs if run > 1}
+    assert lengths == {3, 4, 5, 6, 7, 8}
+    assert 0.2 <= perturb.sigma <= 0.6
+    assert all(action[3] == 0.5 for action in executed)

@@ -1,0 +1,267 @@
+"""The world on real Meta-World: pairing, steps, frames, and what happens without a GL backend."""
+
+import os
+import pickle
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from kerv_cli.errors import KervError, RenderingUnavailable, UnknownName, UsageError
+from kerv_cli.sim import camera as camera_module
+from kerv_cli.sim.camera import CameraConfig, box_average, choose_backend
+from kerv_cli.sim.world import Expert, World
+
+# One task for nearly all: a benchmark's 50 placements cost up to a second per seed block. Its poses are stale at reset.
+TASK = "window-close"
+
+
+def episode(world, seed, steps=25, draw=False):
+    """States of the expert's first steps, (steps + 1, 39)."""
+    expert, observation = Expert(TASK), world.reset(seed)
+    states = [observation.state]
+    for _ in range(steps):
+        if draw:
+            world.frame()
+        observation = world.step(expert(observation))
+        states.append(observation.state)
+    return np.array(states)
+
+
+@pytest.fixture(scope="module")
+def world():
+    with World(TASK) as world:
+        yield world
+
+
+def test_a_seed_names_one_episode_to_the_last_bit_drawn_or_not(world):
+    first = episode(world, 57, draw=True)
+    other = episode(world, 3)
+    again = episode(world, 57)
+    with World(TASK) as fresh:
+        untouched = episode(fresh, 57)
+    assert first.tobytes() == again.tobytes() == untouched.tobytes()
+    assert first.tobytes() != other.tobytes()
+
+
+def test_seeds_map_to_benchmark_tasks_in_blocks_of_50(world):
+    import metaworld
+
+    world.reset(57)
+    expected = pickle.loads(metaworld.MT1("window-close-v3", seed=1).train_tasks[7].data)["rand_vec"]
+    assert world.rand_vec.tobytes() == np.asarray(expected, dtype=np.float64).tobytes()
+    world.rand_vec[:] = 0  # a copy: the caller cannot move the goal
+    assert world.rand_vec.tobytes() == np.asarray(expected, dtype=np.float64).tobytes()
+
+
+def test_reset_and_step_report_what_happened(world):
+    start = world.reset(0)
+    assert (start.step, start.success, world.succeeded, world.done) == (0, False, False, False)
+    assert start.state.shape == (39,)
+    assert start.state.dtype == np.float64
+    assert world.instruction == "slide the window closed"
+    moved = world.step([0.0, 0.0, 1.0, -1.0])
+    assert moved.step == 1
+    assert world.end_effector.tolist() == moved.state[:3].tolist()
+    assert moved.state[18:36].tolist() == start.state[:18].tolist()
+
+
+def test_actions_are_clipped(world):
+    world.reset(0)
+    wild = [world.step([9.0, -9.0, 0.5, 3.0]).state for _ in range(5)]
+    world.reset(0)
+    clipped = [world.step([1.0, -1.0, 0.5, 1.0]).state for _ in range(5)]
+    assert np.array(wild).tobytes() == np.array(clipped).tobytes()
+
+
+@pytest.mark.parametrize("action", [[0, 0, 0], [0, np.nan, 0, 0], [np.inf, 0, 0, 0], [[0, 0, 0, 0]]])
+def test_an_action_that_is_not_four_finite_numbers_is_refused(world, action):
+    world.reset(0)
+    with pytest.raises(KervError, match="4 finite numbers"):
+        world.step(action)
+    assert world.observation.step == 0
+
+
+def test_the_episode_ends_at_the_horizon():
+    with World(TASK, horizon=2) as short:
+        short.reset(0)
+        short.step(np.zeros(4))
+        assert not short.done
+        short.step(np.zeros(4))
+        assert short.done
+        with pytest.raises(KervError, match="ended at step 2"):
+            short.step(np.zeros(4))
+        short.reset(1)
+        assert not short.done
+
+
+def test_success_at_any_step_counts_and_reset_forgets_it(world):
+    expert, observation = Expert(TASK), world.reset(1)
+    while not world.done:
+        action = expert(observation)
+        assert action.shape == (4,)
+        assert np.abs(action).max() <= 1.0
+        observation = world.step(action)
+    assert observation.success
+    assert 30 < observation.step < 200
+    flags = [world.step([-1.0, -1.0, 1.0, -1.0]).success for _ in range(3)]
+    assert world.succeeded, flags
+    assert not world.reset(1).success
+    assert not world.succeeded
+
+
+def test_wrong_requests_are_told_before_anything_is_built():
+    with pytest.raises(UnknownName, match="window-close-v3"):
+        World("window-clos")
+    for horizon in (0, 501):
+        with pytest.raises(UsageError, match="horizon"):
+            World(TASK, horizon=horizon)
+    unused = World(TASK)
+    for use in (lambda: unused.step(np.zeros(4)), unused.frame, lambda: unused.done, lambda: unused.rand_vec):
+        with pytest.raises(KervError, match="reset the world"):
+            use()
+    with pytest.raises(UsageError, match="seed"):
+        unused.reset(-1)
+
+
+def test_a_frame_is_upright_and_not_mirrored(world):
+    world.reset(0)
+    frame = world.frame().astype(int)
+    assert frame.shape == (96, 96, 3)
+    red, green, blue = np.moveaxis(frame, 2, 0)
+    wood = (red > green + 15) & (green > blue + 8) & (red < 170)
+    arm = (red > 90) & (green < 50) & (blue < 50)
+    assert wood[48:].sum() > 4 * wood[:48].sum()  # the table is below
+    assert np.nonzero(arm)[1].mean() < 48 - 5  # the arm reaches in from the left
+    assert np.nonzero(arm)[0].mean() < 48 - 5  # and from above
+
+
+def test_the_first_frame_shows_the_poses_of_this_episode(world):
+    """Meta-World leaves the window 0.2 m off until the first step; a frame at reset must not show that."""
+    world.reset(4)
+    at_reset = world.frame().astype(int)
+    world.step(np.zeros(4))
+    assert np.abs(world.frame().astype(int) - at_reset).mean() < 0.5
+
+
+def test_other_views_get_their_own_camera(world):
+    world.reset(0)
+    usual = world.frame()
+    hand = world.frame(CameraConfig("gripperPOV", size=40, supersample=1))
+    wide = world.frame(CameraConfig(fovy=60.0))
+    assert hand.shape == (40, 40, 3)
+    assert np.abs(wide.astype(int) - usual).mean() > 5
+    assert world.frame().tobytes() == usual.tobytes()
+    with pytest.raises(UnknownName, match="corner4"):
+        world.frame(CameraConfig("corner44"))
+
+
+def test_supersampling_is_a_rounded_box_mean(world):
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 18, 3), dtype=np.uint8)
+    for factor in (1, 2, 3):
+        blocks = pixels.reshape(12 // factor, factor, 18 // factor, factor, 3).astype(float)
+        expected = np.floor(blocks.mean(axis=(1, 3)) + 0.5)
+        np.testing.assert_array_equal(box_average(pixels, factor), expected)
+    world.reset(0)
+    fine = world.frame(CameraConfig(size=192, supersample=1))
+    np.testing.assert_array_equal(world.frame(), box_average(fine, 2))
+
+
+def test_frames_are_fast(world):
+    """About 10 ms on one core; 100 ms with MuJoCo's default shadows and multisampling."""
+    world.reset(0)
+    world.frame()
+    times = []
+    for _ in range(9):
+        start = time.perf_counter()
+        world.frame()
+        times.append(time.perf_counter() - start)
+    assert np.median(times) < 0.06
+
+
+def test_a_world_can_be_closed_twice_and_used_again():
+    world = World(TASK)
+    world.close()
+    state = world.reset(5).state
+    world.frame()
+    world.close()
+    world.close()
+    assert world.reset(5).state.tobytes() == state.tobytes()
+    world.close()
+
+
+@pytest.fixture
+def forgotten_backend(monkeypatch):
+    monkeypatch.setattr(camera_module, "_backend", None)
+    monkeypatch.setattr(camera_module, "_refusal", None)
+    monkeypatch.delitem(sys.modules, "mujoco.gl_context", raising=False)
+    for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "LP_NUM_THREADS"):
+        monkeypatch.setenv(name, "")  # so that the old value comes back
+        monkeypatch.delenv(name)
+    return monkeypatch
+
+
+def fake_probe(working):
+    def run(command, env, **_):
+        return subprocess.CompletedProcess(command, returncode=0 if env["MUJOCO_GL"] in working else 1)
+
+    return run
+
+
+def test_osmesa_is_taken_where_egl_does_not_work(forgotten_backend):
+    forgotten_backend.setattr(subprocess, "run", fake_probe({"osmesa"}))
+    assert choose_backend() == "osmesa"
+    assert (os.environ["MUJOCO_GL"], os.environ["PYOPENGL_PLATFORM"]) == ("osmesa", "osmesa")
+    assert os.environ["LP_NUM_THREADS"] == "0"
+
+
+def test_a_backend_that_the_user_chose_is_respected(forgotten_backend):
+    forgotten_backend.setattr(subprocess, "run", fake_probe(set()))
+    forgotten_backend.setenv("MUJOCO_GL", "glfw")
+    assert choose_backend() == "glfw"
+
+
+def test_without_a_backend_one_line_names_the_command(forgotten_backend):
+    forgotten_backend.setattr(subprocess, "run", fake_probe(set()))
+    forgotten_backend.setattr(os, "geteuid", lambda: 1000)
+    for _ in range(2):  # the second answer comes from memory
+        with pytest.raises(RenderingUnavailable) as caught:
+            choose_backend()
+        assert str(caught.value).endswith(": sudo apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1")
+        assert "\n" not in str(caught.value)
+    assert "MUJOCO_GL" not in os.environ
+
+
+def run_python(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+
+
+def test_physics_works_where_nothing_can_be_drawn():
+    code = f"""
+from kerv_cli.errors import RenderingUnavailable
+from kerv_cli.sim.world import World
+world = World("{TASK}")
+world.reset(0)
+world.step([0, 0, 0, 0])
+try:
+    world.frame()
+except RenderingUnavailable as error:
+    print(world.observation.step, error)
+"""
+    result = run_python(code, MUJOCO_GL="disable")
+    assert result.stdout == "1 MUJOCO_GL=disable switches drawing off: unset it, or set it to egl\n", result.stderr
+
+
+def test_an_open_camera_leaves_no_error_at_exit():
+    code = f"""
+from kerv_cli.sim.world import World
+world = World("{TASK}")
+world.reset(0)
+print(world.frame().shape)
+"""
+    result = run_python(code)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "(96, 96, 3)\n", "")
