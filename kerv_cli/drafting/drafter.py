@@ -19,7 +19,7 @@ from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.vla.checkpoint import load_state, read_description, save_module
 from kerv_cli.vla.target import Target
-from kerv_cli.vla.trunk import Cache, Layer, Rotary
+from kerv_cli.vla.trunk import Cache, Layer, Rotary, lay_out_for_inference
 
 
 class Drafter(nn.Module):
@@ -152,4 +152,6 @@ def load_drafter(folder: Path, target: Target, target_sha256: str) -> tuple[Draf
     drafter = Drafter.beside(DrafterSettings(**description["settings"]), target)
     load_state(drafter, folder, "drafter")
     weight = target.head.weight
-    return drafter.to(device=weight.device, dtype=weight.dtype).eval().requires_grad_(False), description
+    drafter = drafter.to(device=weight.device, dtype=weight.dtype).eval().requires_grad_(False)
+    lay_out_for_inference(drafter)
+    return drafter, description

