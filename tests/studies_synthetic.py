@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import signal
+import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -102,3 +106,39 @@ def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
     phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}
     phases |= {"verify": 0.0055 * cycles * noise, "accept": 0.0004 * cycles, "other": 0.0008}
     return replace(decode_of(rounds, phases, "drafter"), variability=float(rng.uniform()))
+
+
+def count_calls() -> tuple[Callable[[Cell], list[EpisodeRecord]], list[str]]:
+    """run_cell, and the list of the labels that it was called for."""
+    calls: list[str] = []
+
+    def run(cell: Cell) -> list[EpisodeRecord]:
+        calls.append(cell.label)
+        return run_cell(cell)
+
+    return run, calls
+
+
+class Odd(Exception):
+    """Cannot be pickled back: its arguments are not its message."""
+
+    def __init__(self, a: int, b: int) -> None:
+        super().__init__(f"{a} and {b}")
+
+
+def misbehave(cell: Cell) -> list[EpisodeRecord]:
+    """Kills its process, raises, or reports its process's thread number as wall seconds, depending on r."""
+    r = cell.settings["threshold"]["r"]
+    if r == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if r == 5:
+        raise Odd(1, 2)
+    time.sleep(0.1)
+    threads = float(os.environ["OMP_NUM_THREADS"])
+    return [replace(record, wall_seconds=threads) for record in run_cell(cell)]
+
+
+def slow_cell(cell: Cell) -> list[EpisodeRecord]:
+    """The baseline at once, everything else in a minute."""
+    time.sleep(0.0 if cell.label == "ar" else 60.0)
+    return run_cell(cell)

@@ -156,7 +156,8 @@ def _over_processes(
 ) -> Generator[tuple[Cell, _Result], None, None]:
     """Loky pools of one persistent worker each: when one dies, only its own cell is lost, and it is known which."""
     waiting = deque(cells)
-    free = [_pool(cells[0]) for _ in range(min(workers, len(cells)))]
+    threads = max((cell.settings["runtime"]["threads"] for cell in cells), default=1)
+    free = [_pool(threads) for _ in range(min(workers, len(cells)))]
     running: dict[Future[_Result], tuple[Any, Cell]] = {}
     finished = False
     try:
@@ -170,7 +171,7 @@ def _over_processes(
                 result, alive = _result(future)
                 if not alive:
                     pool.shutdown(wait=False, kill_workers=True)
-                    pool = _pool(cell)
+                    pool = _pool(threads)
                 free.append(pool)
                 yield cell, result
         finished = True
@@ -193,13 +194,15 @@ def _result(future: Future[_Result]) -> tuple[_Result, bool]:
         return _Result(reason=one_line(error), trace=traceback.format_exc()), True
 
 
-def _pool(cell: Cell) -> Any:
+def _pool(threads: int) -> Any:
     """A pool of one worker, started when it gets its first cell."""
     from joblib.externals.loky import ProcessPoolExecutor
 
-    threads = str(cell.settings["runtime"]["threads"])
     return ProcessPoolExecutor(
-        max_workers=1, initializer=_begin_worker, initargs=(os.getpid(),), env=dict.fromkeys(_THREAD_VARIABLES, threads)
+        max_workers=1,
+        initializer=_begin_worker,
+        initargs=(os.getpid(),),
+        env=dict.fromkeys(_THREAD_VARIABLES, str(threads)),
     )
 
 

@@ -26,7 +26,7 @@ _PERCENT = frozenset({"skip_rate", "compensation_rate", "retrieval_share"})
 
 def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     """The rows of one averaging of `study_table`, for the terminal: 80 columns hold labels of 16 characters."""
-    frame = summary_frame(table, averaging).drop(columns=["AFEP", "lost/won"])
+    frame = _narrow(summary_frame(table, averaging))
     title = Text(_title(table, averaging), style="bold")
     caption = f"95 % intervals in brackets; p: exact McNemar test of success against {table['baseline'].iloc[0]}"
     printed = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD)
@@ -37,6 +37,16 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     for row in frame.itertuples(index=False):
         printed.add_row(*(escape(str(value)) for value in row))
     return printed
+
+
+def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
+    """Without what only a wide page has room for; the shares of decodes in one column."""
+    frame = frame.drop(columns=["AFEP", "lost/won", "deviation"], errors="ignore")
+    shares = [name for key, name in _WHERE_USED.items() if key in _PERCENT and name in frame]
+    if shares:
+        together = frame[shares].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
+        frame.insert(list(frame.columns).index(shares[0]), " / ".join(shares) + " %", together)
+    return frame.drop(columns=shares)
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:

@@ -1,0 +1,288 @@
+"""The results folder: complete or absent, whoever dies and whoever else writes."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from studies_synthetic import episode, run_cell, threshold_settings, threshold_study
+
+from kerv_cli.decoding.record import PHASES
+from kerv_cli.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.studies import rows
+from kerv_cli.studies.plan import Cell
+from kerv_cli.studies.store import StudyStore, list_studies
+
+STATUS = {"run": "r", "workers": 1, "device_name": "test"}
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> StudyStore:
+    return StudyStore(tmp_path, "threshold")
+
+
+@pytest.fixture
+def cell() -> Cell:
+    return threshold_study(["reach-v3"])[-1]
+
+
+def python(script: str, *arguments: object) -> subprocess.Popen[str]:
+    """A real process that knows the tests' helpers."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", script, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> str:
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    return out
+
+
+def test_records_come_back_as_they_were(store: StudyStore, cell: Cell) -> None:
+    records = run_cell(cell)
+    first = dataclasses.replace(records[0].decodes[0], deviation=0.125, similarity=0.5, compensated=3, skipped=True)
+    records[0] = dataclasses.replace(records[0], decodes=(first, *records[0].decodes[1:]))
+    assert store.write_cell(cell, records, STATUS, "2026-01-01T00:00:00+00:00")
+    decodes = store.read_decodes(cell.id)
+    assert list(decodes) == list(cell.seeds)
+    for record in records:
+        assert len(decodes[record.seed]) == len(record.decodes)
+        for read, written in zip(decodes[record.seed], record.decodes, strict=True):
+            a, b = dataclasses.asdict(read), dataclasses.asdict(written)
+            np.testing.assert_array_equal(a.pop("actions"), b.pop("actions"))
+            assert a == b
+    assert decodes[cell.seeds[0]][0].verifications == first.verifications
+
+
+def test_a_cell_tells_what_it_is(store: StudyStore, cell: Cell) -> None:
+    store.write_cell(cell, run_cell(cell), STATUS, "2026-01-01T00:00:00+00:00")
+    stored = store.read_cell(cell.id)
+    assert stored.config["settings"] == cell.settings
+    assert stored.config["identity"] == cell.identity
+    assert stored.status["device_name"] == "test"
+    assert set(stored.episodes["worker_pid"]) == {os.getpid()}
+    assert list(stored.episodes["seed"]) == list(cell.seeds)
+    assert sorted(path.name for path in stored.folder.iterdir()) == [
+        "config.yaml",
+        "decodes.parquet",
+        "episodes.parquet",
+        "status.json",
+    ]
+
+
+def test_episode_rows_sum_their_decodes(cell: Cell) -> None:
+    record = episode(cell, 100_000)
+    row = rows.episode_row(record, 1, "")
+    assert sum(row[f"seconds.{phase}"] for phase in PHASES) == pytest.approx(row["seconds"])
+    assert row["seconds.verify"] == pytest.approx(sum(d.phases["verify"] for d in record.decodes))
+    assert row["committed"] + row["decodes"] == row["tokens"]  # the prefill gives one token of each chunk
+    assert row["bonus"] == row["committed"] - row["accepted"] > 0
+
+
+def test_an_unknown_phase_is_refused(cell: Cell) -> None:
+    record = episode(cell, 100_000)
+    odd = dataclasses.replace(record.decodes[0], phases={"thinking": 1.0})
+    with pytest.raises(ValueError, match="thinking"):
+        rows.episode_row(dataclasses.replace(record, decodes=(odd,)), 1, "")
+
+
+def test_records_of_other_seeds_are_refused(store: StudyStore, cell: Cell) -> None:
+    with pytest.raises(ValueError, match="other episodes"):
+        store.write_cell(cell, run_cell(cell)[:-1], STATUS)
+    assert not store.has_cell(cell.id)
+
+
+KILLED_WRITER = """
+import os, signal, sys
+from studies_synthetic import run_cell, threshold_study
+from kerv_cli.studies import store as module
+
+cell = threshold_study(["reach-v3"])[-1]
+store = module.StudyStore(sys.argv[1], "threshold")
+records = run_cell(cell)
+write, sync = module._write_synced, module._sync_folder
+for stage in range(5):  # before each of the four files, and between the last one and the rename
+    child = os.fork()
+    if child == 0:
+        left = [stage]
+        def die_when_due():
+            if left[0] == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+            left[0] -= 1
+        def half_written(path, content):
+            write(path, content[: len(content) // 2])
+            die_when_due()
+            write(path, content)
+        module._write_synced = half_written
+        module._sync_folder = lambda folder: (die_when_due(), sync(folder))
+        store.write_cell(cell, records, {})
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL, (stage, status)
+    assert not store.has_cell(cell.id), stage
+"""
+
+
+def test_a_writer_killed_at_any_point_leaves_no_half_cell(store: StudyStore, cell: Cell, tmp_path: Path) -> None:
+    finish(python(KILLED_WRITER, tmp_path))
+    left = list(store.cells.iterdir())
+    assert len(left) == 5
+    assert all(folder.name.startswith(".") for folder in left)
+    assert store.clean_stale() == []  # young: might be in use
+    for folder in left:
+        os.utime(folder, (0, time.time() - 7 * 3600))
+    assert sorted(store.clean_stale()) == sorted(left)
+    assert store.write_cell(cell, run_cell(cell), STATUS)
+    assert store.has_cell(cell.id)
+
+
+def test_folders_of_living_processes_and_young_ones_of_other_machines_stay(store: StudyStore, cell: Cell) -> None:
+    import socket
+
+    mine = store.cells / f".{cell.id}.{socket.gethostname()}.{os.getpid()}-abcd.tmp"
+    theirs = store.cells / f".{cell.id}.elsewhere.1-abcd.tmp"
+    for folder in (mine, theirs):
+        folder.mkdir(parents=True)
+        os.utime(folder, (0, time.time() - 24 * 3600))
+    assert store.clean_stale() == []
+
+
+CONCURRENT_WRITER = """
+import pathlib, sys, time
+from studies_synthetic import run_cell, threshold_settings, threshold_study
+from kerv_cli.studies.store import StudyStore
+
+results, me, task = sys.argv[1:]
+store = StudyStore(results, "threshold")
+shared = threshold_study(["reach-v3", "push-v3", "door-open-v3", "drawer-open-v3"], episodes=1, radii=(1, 3, 5, 9, 15))
+records = {cell.id: run_cell(cell) for cell in shared}
+pathlib.Path(results, me).touch()
+while len(list(pathlib.Path(results).glob("writer*"))) < 2:
+    time.sleep(0.001)
+won = sum(store.write_cell(cell, records[cell.id], {"writer": me}) for cell in shared)
+for _ in range(5):
+    store.write_plan(threshold_settings(), threshold_study([task], episodes=1))
+print(won)
+"""
+
+
+def test_two_writers_in_one_folder(store: StudyStore, tmp_path: Path) -> None:
+    writers = [
+        python(CONCURRENT_WRITER, tmp_path, "writer1", "reach-v3"),
+        python(CONCURRENT_WRITER, tmp_path, "writer2", "push-v3"),
+    ]
+    won = [int(finish(writer)) for writer in writers]
+    names = sorted(path.name for path in store.cells.iterdir())
+    assert sum(won) == len(names) == 28  # each cell by exactly one of them, nothing temporary left
+    assert all(store.has_cell(name) for name in names)
+    assert {cell.task for cell in store.read_plan().cells} == {"reach-v3", "push-v3"}
+
+
+def test_the_first_writer_wins(store: StudyStore, cell: Cell) -> None:
+    assert store.write_cell(cell, run_cell(cell), {**STATUS, "writer": 1})
+    assert not store.write_cell(cell, run_cell(cell), {**STATUS, "writer": 2})
+    assert store.read_cell(cell.id).status["writer"] == 1
+
+
+@pytest.mark.parametrize("file", ["config.yaml", "episodes.parquet", "decodes.parquet", "status.json"])
+@pytest.mark.parametrize("harm", ["cut", "gone", "changed"])
+def test_a_damaged_cell_is_named_with_its_remedy(store: StudyStore, cell: Cell, file: str, harm: str) -> None:
+    store.write_cell(cell, run_cell(cell), STATUS)
+    path = store.cells / cell.id / file
+    content = path.read_bytes()
+    if harm == "gone":
+        path.unlink()
+    elif harm == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    else:
+        path.write_bytes(content.replace(b"s", b"z", 40))
+    for look in (store.has_cell, store.read_cell, store.read_decodes):
+        with pytest.raises(CheckpointError) as caught:
+            look(cell.id)
+        message = str(caught.value)
+        assert str(store.cells / cell.id) in message
+        assert "delete that folder and run `kerv sweep study=threshold` again" in message
+        assert "\n" not in message
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+@pytest.mark.parametrize("function", ["fsync", "mkdir", "rename"])
+def test_a_disk_that_refuses(
+    store: StudyStore, cell: Cell, monkeypatch: pytest.MonkeyPatch, function: str, code: int
+) -> None:
+    records = run_cell(cell)
+    store.cells.mkdir(parents=True)
+
+    def refuse(*arguments: Any, **keywords: Any) -> None:
+        raise OSError(code, os.strerror(code))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, function, refuse)
+        with pytest.raises(StorageError) as caught:
+            store.write_cell(cell, records, STATUS)
+    assert str(store.cells / cell.id) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert list(store.cells.iterdir()) == []
+
+
+def test_a_plan_on_a_full_disk_keeps_the_old_one(store: StudyStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.write_plan(threshold_settings(), threshold_study(["reach-v3"]))
+    before = store.plan_path.read_bytes()
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match="disk is full"):
+        store.write_plan(threshold_settings(), threshold_study(["push-v3"]))
+    assert store.plan_path.read_bytes() == before
+
+
+def test_a_study_that_is_not_there_names_what_to_run(store: StudyStore, cell: Cell) -> None:
+    with pytest.raises(UsageError, match=r"no study 'threshold'.*run `kerv sweep study=threshold`"):
+        store.read_plan()
+    with pytest.raises(UsageError, match=r"no complete cell: run `kerv sweep study=threshold`"):
+        store.read_cells([cell])
+    with pytest.raises(CheckpointError, match="is missing: run `kerv sweep"):
+        store.read_cell(cell.id)
+
+
+def test_a_damaged_plan_is_reported_and_replaced_by_the_next_sweep(store: StudyStore) -> None:
+    store.root.mkdir(parents=True)
+    store.plan_path.write_text("cells: [", encoding="utf-8")
+    with pytest.raises(CheckpointError, match=r"plan\.yaml is damaged"):
+        store.read_plan()
+    store.write_plan(threshold_settings(), threshold_study(["push-v3"]))
+    assert len(store.read_plan().cells) == 4
+
+
+@pytest.mark.parametrize("name", ["../up", "a/b", "", ".hidden"])
+def test_a_study_name_is_a_folder_name(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="study name"):
+        StudyStore(tmp_path, name)
+
+
+def test_listing(store: StudyStore, tmp_path: Path) -> None:
+    cells = threshold_study(["reach-v3"])
+    store.write_plan(threshold_settings(), cells)
+    store.write_cell(cells[0], run_cell(cells[0]), STATUS)
+    (found,) = list_studies(tmp_path)
+    assert (found.name, found.title, found.planned, found.complete) == ("threshold", "Acceptance threshold", 4, 1)
+    assert list_studies(tmp_path / "nowhere") == []
+
+
+def test_status_is_json_for_people(store: StudyStore, cell: Cell) -> None:
+    store.write_cell(cell, run_cell(cell), STATUS)
+    status = json.loads((store.cells / cell.id / "status.json").read_text())
+    assert status["state"] == "complete"
+    assert status["episodes"] == 4

@@ -1,0 +1,368 @@
+"""Tables against numbers worked out by hand; files that come out the same every time."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+from studies_synthetic import IDENTITY, run_cell, settings_of, threshold_settings, threshold_study
+
+from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.errors import UsageError
+from kerv_cli.settings import StudySettings
+from kerv_cli.studies.execute import execute
+from kerv_cli.studies.measures import MACRO, MICRO
+from kerv_cli.studies.plan import Cell, plan
+from kerv_cli.studies.report import report
+from kerv_cli.studies.store import StudyStore
+from kerv_cli.studies.summary import summary_frame, summary_table
+from kerv_cli.studies.tables import StudyData, csv_text, load_study, per_task_table, study_table
+
+PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
+STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip", "torch_version": "2", "git_commit": "c"}
+
+
+def verify(start: int, drafted: Sequence[int], accepted: int, committed: int) -> Round:
+    return Round("verify", "drafter", start, tuple(drafted), (0,) * len(drafted), accepted, committed, 4, (9, 9, 9, 0))
+
+
+def decode(seconds: float, rounds: Sequence[Round], **more: Any) -> DecodeRecord:
+    """One control step of four tokens: N = 4."""
+    forwards = sum(r.mode != "skip" for r in rounds)
+    phases = {"prefill": seconds / 4, "other": 3 * seconds / 4}
+    action = np.zeros((1, 4), np.float32)
+    return DecodeRecord((1, 2, 3, 4), action, forwards, tuple(rounds), "x", seconds, phases, **more)
+
+
+def ar(seconds: float) -> DecodeRecord:
+    return decode(seconds, [PREFILL, *(Round("decode", "none", i, (), (1,), 0, 1, 0, ()) for i in (1, 2, 3))])
+
+
+def record(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord]) -> EpisodeRecord:
+    steps = len(decodes)
+    return EpisodeRecord(
+        task=task,
+        instruction="",
+        seed=seed,
+        success=success,
+        steps=steps,
+        decodes=tuple(decodes),
+        decode_steps=tuple(range(steps)),
+        actions=np.zeros((steps, 4), np.float32),
+        path=np.zeros((steps + 1, 3), np.float32),
+        gripper=np.zeros(steps + 1, np.float32),
+        rand_vec=np.array([float(seed)]),
+        wall_seconds=1.0,
+    )
+
+
+ALL_ACCEPTED = decode(0.2, [PREFILL, verify(1, (5, 6, 7), accepted=3, committed=3)])
+SECOND_REJECTED = decode(
+    0.3,
+    [PREFILL, verify(1, (5, 9), accepted=1, committed=2), verify(3, (8,), accepted=1, committed=1)],
+    compensated=2,
+    deviation=0.1,
+)
+SKIPPED = decode(0.05, [Round("skip", "retrieval", 0, (1, 2, 3, 4), (), 4, 4, 4, ())], skipped=True, deviation=0.3)
+
+# reach is easy, push is hard; (task, label) -> episodes from seed 100000 on
+EPISODES: dict[tuple[str, str], list[tuple[bool, list[DecodeRecord]]]] = {
+    ("reach-v3", "ar"): [(True, [ar(0.4), ar(0.6)]), (True, [ar(0.3)])],
+    ("reach-v3", "kerv"): [(True, [ALL_ACCEPTED, SECOND_REJECTED]), (True, [SKIPPED])],
+    ("push-v3", "ar"): [(True, [ar(1.0)]), (True, [ar(1.0)]), (False, [ar(1.0)])],
+    ("push-v3", "kerv"): [(True, [ALL_ACCEPTED] * 2), (False, [ALL_ACCEPTED]), (False, [ALL_ACCEPTED])],
+}
+
+
+def records_of(cell: Cell) -> list[EpisodeRecord]:
+    episodes = EPISODES[cell.task, cell.label]
+    return [record(cell.task, seed, *episode) for seed, episode in zip(cell.seeds, episodes, strict=True)]
+
+
+def hand_cells() -> list[Cell]:
+    cells = []
+    for task, count in (("reach-v3", 2), ("push-v3", 3)):
+        settings = {"ar": settings_of("ar", episodes=count), "kerv": settings_of("kerv", 9, episodes=count)}
+        cells += plan(settings, [task], IDENTITY, baseline="ar", overrides={"kerv": "method=kerv"})
+    return cells
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> StudyData:
+    store = StudyStore(tmp_path, "hand")
+    for cell in hand_cells():
+        store.write_cell(cell, records_of(cell), STATUS)
+    store.write_plan(StudySettings("hand", "By hand", "ar"), hand_cells())
+    return load_study(store, hand_cells())
+
+
+def row_of(table: pd.DataFrame, **wanted: str) -> dict[str, Any]:
+    for column, value in wanted.items():
+        table = table[table[column] == value]
+    (row,) = table.to_dict("records")
+    return {str(name): value for name, value in row.items()}
+
+
+def test_one_task_by_hand(data: StudyData) -> None:
+    row = row_of(per_task_table(data), task="reach-v3", label="kerv")
+    expected = {
+        "episodes": 2,
+        "successes": 2,
+        "success": 1.0,
+        "time_per_step_ms": 1000 * ((0.2 + 0.3) / 2 + 0.05) / 2,  # 150
+        "speedup": ((0.4 + 0.6) / 2 + 0.3) / ((0.2 + 0.3) / 2 + 0.05),  # 0.4 s over 0.15 s
+        "AL": (3 + 2 + 1) / 3,
+        "accepted_per_round": (3 + 1 + 1) / 3,
+        "AFEP": (4 + 2) / 2,  # N where nothing was rejected; the skipped chunk had no verification
+        "forwards_per_step": (2 + 3 + 0) / 3,
+        "skip_rate": 1 / 3,
+        "compensation_rate": 1 / 3,
+        "retrieval_share": 1 / 3,
+        "deviation": 0.2,
+        "deviation_samples": 2,
+        "steps": 3,
+        "decodes": 3,
+        "pairs": 2,
+        "both": 2,
+        "only_baseline": 0,
+        "mcnemar_p": 1.0,
+        "ms.prefill": 150 / 4,
+        "ms.other": 150 * 3 / 4,
+        "ms.verify": 0.0,
+    }
+    assert {name: row[name] for name in expected} == pytest.approx(expected)
+    # every one of the 4 draws of two pairs is one of three ratios
+    assert row["speedup_low"] == pytest.approx(0.5 / 0.25)
+    assert row["speedup_high"] == pytest.approx(0.3 / 0.05)
+
+
+def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData) -> None:
+    row = row_of(per_task_table(data), task="reach-v3", label="ar")
+    assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == 1.0
+    assert row["forwards_per_step"] == 4.0
+    assert all(math.isnan(row[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
+    assert row["skip_rate"] == 0.0
+
+
+def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> None:
+    table = study_table(data)
+    micro, macro = row_of(table, averaging=MICRO, label="kerv"), row_of(table, averaging=MACRO, label="kerv")
+    own, reference = [0.25, 0.05, 0.2, 0.2, 0.2], [0.5, 0.3, 1.0, 1.0, 1.0]
+    assert micro["success"] == pytest.approx(3 / 5)
+    assert macro["success"] == pytest.approx((1 + 1 / 3) / 2)
+    assert micro["time_per_step_ms"] == pytest.approx(1000 * sum(own) / 5)
+    assert macro["time_per_step_ms"] == pytest.approx(1000 * (0.15 + 0.2) / 2)
+    assert micro["speedup"] == pytest.approx(sum(reference) / sum(own))
+    assert macro["speedup"] == pytest.approx((0.4 + 1.0) / (0.15 + 0.2))
+    assert micro["AL"] == pytest.approx((6 + 4 * 3) / (3 + 4))
+    assert macro["AL"] == pytest.approx((2 + 3) / 2)
+    assert micro["forwards_per_step"] == pytest.approx((5 + 8) / (3 + 4))
+    assert macro["forwards_per_step"] == pytest.approx((5 / 3 + 2) / 2)
+    assert macro["deviation"] == pytest.approx(0.2)  # push was not sampled
+    for row in (micro, macro):
+        assert (row["both"], row["only_baseline"], row["only_method"], row["neither"]) == (3, 1, 0, 1)
+        assert row["mcnemar_p"] == 1.0
+        assert row["task"] == "push-v3;reach-v3"
+        assert row["difficulty"] == "easy;hard"
+        assert (row["tasks"], row["episodes"], row["pairs"]) == (2, 5, 5)
+
+
+def test_a_row_says_everything(data: StudyData) -> None:
+    row = row_of(study_table(data), averaging=MICRO, label="kerv")
+    expected = {
+        "study": "hand",
+        "method": "kerv",
+        "overrides": "method=kerv",
+        "proposer.kind": "drafter",
+        "acceptance.kind": "relaxed",
+        "threshold.r": 9,
+        "rectifier.kind": "reinfer",
+        "boundary.kind": "always",
+        "seeds": "100000-100002",
+        "target": "mt10-vision",
+        "target_sha256": "a" * 64,
+        "drafter_sha256": "b" * 64,
+        "device": "cpu",
+        "device_name": "chip",
+        "dtype": "float32",
+        "threads": 1,
+        "workers": "1",
+        "torch_version": "2",
+        "git_commit": "c",
+        "horizon": 500,
+        "camera": "corner4",
+        "run": "r1",
+        "same_run": True,
+    }
+    assert {name: row[name] for name in expected} == expected
+    assert {"metaworld_version", "mujoco_version", "numpy_version", "python_version", "kerv_version"} <= set(row)
+    assert row["cell"].split(";") == [cell.id for cell in hand_cells() if cell.label == "kerv"]
+
+
+def write_reach(tmp_path: Path, **harm: Any) -> dict[str, Any]:
+    """The reach cells, the setting's harmed: status or rand_vec; its row of the table."""
+    store = StudyStore(tmp_path, "hand")
+    cells = hand_cells()[:2]
+    records = records_of(cells[1])
+    if "rand_vec" in harm:
+        records[0] = replace(records[0], rand_vec=np.array([harm.pop("rand_vec")]))
+    store.write_cell(cells[0], records_of(cells[0]), STATUS)
+    store.write_cell(cells[1], records, {**STATUS, **harm})
+    store.write_plan(StudySettings("hand", "", "ar"), cells)
+    return row_of(per_task_table(load_study(store)), label="kerv")
+
+
+def test_other_devices_are_not_compared(tmp_path: Path) -> None:
+    row = write_reach(tmp_path, device_name="another chip")
+    assert (row["pairs"], row["same_run"]) == (0, False)
+    assert math.isnan(row["speedup"])
+    assert math.isnan(row["mcnemar_p"])
+    assert row["success"] == 1.0
+
+
+def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:
+    row = write_reach(tmp_path, rand_vec=0.5)
+    assert row["pairs"] == 1
+    assert row["speedup"] == pytest.approx(0.3 / 0.05)
+    assert math.isnan(row["speedup_low"])
+
+
+def test_another_run_is_compared_and_said(tmp_path: Path) -> None:
+    row = write_reach(tmp_path, run="r2")
+    assert row["speedup"] == pytest.approx(0.4 / 0.15)
+    assert row["same_run"] is False
+
+
+def test_without_the_baselines_cell_there_is_a_row_but_no_speedup(tmp_path: Path) -> None:
+    store = StudyStore(tmp_path, "hand")
+    cells = hand_cells()[:2]
+    store.write_cell(cells[1], records_of(cells[1]), STATUS)
+    store.write_plan(StudySettings("hand", "", "ar"), cells)
+    data = load_study(store)
+    assert data.absent == [cells[0]]
+    table = study_table(data)
+    assert list(table["label"]) == ["kerv", "kerv"]
+    assert table["speedup"].isna().all()
+    assert summary_frame(table)["speedup"].tolist() == ["–"]
+
+
+def test_two_labels_of_one_cell_are_two_rows(tmp_path: Path) -> None:
+    store = StudyStore(tmp_path, "hand")
+    cell = hand_cells()[0]
+    store.write_cell(cell, records_of(cell), STATUS)
+    store.write_plan(StudySettings("hand", "", "ar"), [cell, replace(cell, label="again")])
+    table = per_task_table(load_study(store))
+    assert list(table["label"]) == ["ar", "again"]
+    assert list(table["speedup"]) == [1.0, 1.0]
+
+
+def test_csv_has_sensible_digits_and_empty_cells(data: StudyData) -> None:
+    text = csv_text(per_task_table(data))
+    lines = text.splitlines()
+    assert len(lines) == 5
+    values = dict(zip(lines[0].split(","), lines[4].split(","), strict=True))
+    assert (values["task"], values["label"]) == ("reach-v3", "kerv")
+    assert values["speedup"] == "2.66667"
+    assert values["accepted_per_round"] == "1.66667"
+    assert dict(zip(lines[0].split(","), lines[3].split(","), strict=True))["AL"] == ""
+
+
+def printed(table: pd.DataFrame) -> list[str]:
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(summary_table(table))
+    return console.export_text().splitlines()
+
+
+def test_summary_on_a_terminal(data: StudyData) -> None:
+    lines = printed(study_table(data))
+    assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
+    at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
+    words = " ".join(lines[at : at + 2]).split()
+    assert {"60", "(23–88)", "4.22", "180", "2.57", "1.86", "14/14/14"} <= set(words)
+    assert "/ compensated" in " ".join(lines)
+
+
+def test_summary_leaves_out_what_no_setting_uses(results: Path) -> None:
+    lines = printed(study_table(load_study(StudyStore(results, "threshold"))))
+    assert "skipped" not in " ".join(lines)
+    rows = [line for line in lines if line.startswith(("ar", "naive_sd", "spec_vla"))]
+    assert len(rows) == 4  # nothing wraps at 80 columns
+    assert all(len(line) <= 80 and "…" not in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A threshold study over three tasks, one cell missing."""
+    folder = tmp_path_factory.mktemp("results")
+    store = StudyStore(folder, "threshold")
+    cells = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
+    store.write_plan(threshold_settings(), cells)
+    execute(cells[:-1], run_cell, store)
+    report(folder, "threshold")
+    return folder
+
+
+def test_report_writes_the_same_bytes_again(results: Path) -> None:
+    written = report(results)
+    names = [path.relative_to(results).as_posix() for path in written]
+    assert names == [
+        "tables/threshold.csv",
+        "tables/threshold_per_task.csv",
+        "plots/threshold.png",
+        "plots/threshold.svg",
+        "plots/threshold_phases.png",
+        "plots/threshold_phases.svg",
+        "studies/threshold/report.html",
+    ]
+    before = {path: path.read_bytes() for path in written}
+    for path in written:
+        path.unlink()
+    assert report(results, "threshold") == written
+    assert {path: path.read_bytes() for path in written} == before
+    assert all(content.startswith(b"\x89PNG") for path, content in before.items() if path.suffix == ".png")
+    assert all(len(content) > 2000 for path, content in before.items() if path.suffix != ".csv")
+
+
+def test_the_page_stands_alone(results: Path) -> None:
+    page = (results / "studies" / "threshold" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<svg") == 2
+    assert "src=" not in page
+    assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
+        "http://creativecommons.org", ""
+    ).replace("https://matplotlib.org", "")
+    assert "1 of 12 planned cells are not complete: spec_vla r=9 on door-open-v3" in page
+    assert "Run `kerv sweep study=threshold` to run them" in page
+    assert "Micro over tasks" in page
+    assert "Macro over difficulty groups" in page
+    ids = [part.split('"')[0] for part in page.split(' id="')[1:]]
+    assert len(ids) == len(set(ids))
+
+
+def test_figures_show_the_axis_and_the_references(results: Path) -> None:
+    from kerv_cli.studies.plots import series_of, study_figures
+
+    table = study_table(load_study(StudyStore(results, "threshold")))
+    rows = table[table["averaging"] == MICRO]
+    series = series_of(rows, "threshold.r")
+    assert {name: list(group["x"]) for name, group in series.items()} == {"naive_sd": [0], "spec_vla": [3, 9]}
+    speedup = study_figures(table, "threshold.r", "Title")[""].axes[0]
+    lines = {line.get_label(): list(np.atleast_1d(line.get_ydata())) for line in speedup.get_lines()}
+    assert lines["spec_vla"] == list(rows[rows["method"] == "spec_vla"]["speedup"])
+    assert lines["ar"] == [1.0, 1.0]
+    by_setting = study_figures(table, "", "Title")[""].axes[0]
+    assert [label.get_text() for label in by_setting.get_yticklabels()] == list(rows["label"])
+
+
+def test_nothing_to_report_names_what_to_run(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="run `kerv sweep study=NAME`"):
+        report(tmp_path)
+    with pytest.raises(UsageError, match="run `kerv sweep study=threshold`"):
+        report(tmp_path, "threshold")
