@@ -48,6 +48,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     from omegaconf.errors import OmegaConfBaseException
 
     _check(command, overrides)
+    overrides = [_task_list(word) for word in overrides]
     try:
         with initialize_config_dir(str(conf_dir()), version_base="1.3"):
             composed = hydra_compose(command, overrides=list(overrides))
@@ -112,6 +113,12 @@ def _check(command: str, overrides: Sequence[str]) -> None:
         key, value = word.split("=", 1)
         if key.lstrip("+~") in known and value not in known[key.lstrip("+~")]:
             raise UnknownName(key.lstrip("+~"), value, known[key.lstrip("+~")])
+
+
+def _task_list(word: str) -> str:
+    """`task=reach` and `task=reach,push` are lists of tasks without the brackets."""
+    key, value = word.split("=", 1)
+    return f"task=[{value}]" if key == "task" and not value.startswith("[") else word
 
 
 def _explained(command: str, error: Exception, overrides: Sequence[str]) -> UsageError:

@@ -75,7 +75,7 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
-    """Yields `advance_to(done, text)`. A bar on a terminal; elsewhere a line per tenth, so that logs stay short."""
+    """Yields `advance_to(done, text)`. A bar on a terminal; elsewhere a line now and then, so that logs stay short."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     if not sys.stderr.isatty():
@@ -99,13 +99,13 @@ def _advance(bar: Progress, title: str, total: int) -> Callable[[int, str], None
 
 
 def _plain_lines(title: str, total: int) -> Callable[[int, str], None]:
-    shown = -1
+    shown, parts = -1, 50 if total >= 2000 else 10
 
     def advance(done: int, text: str = "") -> None:
         nonlocal shown
-        tenth = 10 * done // max(1, total)
-        if tenth > shown:
-            shown = tenth
+        part = parts * done // max(1, total)
+        if part > shown:
+            shown = part
             typer.echo(f"{title} {done}/{total} {text}".rstrip(), err=True)
 
     return advance

@@ -16,7 +16,7 @@ from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.places import artifact, drafter_beside, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
-from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.training.distillation import Distillation, distillation_job, teach
@@ -30,8 +30,13 @@ VALIDATION_SEED = EVALUATION_SEED // 2
 """First seed of closed-loop validation: neither a training seed nor an evaluation seed."""
 
 
+def determining(train: TrainSettings) -> dict[str, Any]:
+    """What of the optimisation settings makes two runs different. A run may be resumed with more or fewer steps."""
+    return {k: v for k, v in asdict(train).items() if k not in ("steps", "validate_every", "closed_loop")}
+
+
 def identity_of(**parts: Any) -> str:
-    """Hash of everything that determines a run."""
+    """Hash of everything that determines a run's next step."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -68,7 +73,7 @@ class TargetRun:
         settings = self.settings
         target = new_target(settings.target, self.samples, settings.train.seed).to(self.device)
         identity = identity_of(
-            target=asdict(settings.target), train=asdict(settings.train), demos=self.dataset.sha256, tasks=self.tasks
+            target=asdict(settings.target), train=determining(settings.train), demos=self.dataset.sha256, tasks=self.tasks
         )
         run = Imitation(target, self.samples, settings.train, torch.device(self.device))
         closed_loop = self.closed_loop if settings.train.closed_loop else None
@@ -131,7 +136,7 @@ class DrafterRun:
         drafter = Drafter.beside(settings.drafter, self.target).to(self.device)
         identity = identity_of(
             drafter=asdict(settings.drafter),
-            train=asdict(settings.train),
+            train=determining(settings.train),
             demos=self.dataset.sha256,
             target=self.described["sha256"],
         )

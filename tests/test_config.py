@@ -1,0 +1,93 @@
+"""Every config composes into its dataclass; wrong overrides get one helpful line."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+import pytest
+
+from kerv_cli import settings as s
+from kerv_cli.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.errors import UsageError
+from kerv_cli.studies.resolve import resolve
+
+SCHEMAS = {
+    "rollout": s.RolloutSettings,
+    "demos": s.DemosSettings,
+    "train_target": s.TrainTargetSettings,
+    "train_drafter": s.TrainDrafterSettings,
+    "doctor": s.DoctorSettings,
+    "report": s.ReportSettings,
+    "view": s.ViewSettings,
+    "sweep": s.SweepSettings,
+}
+# which command each group belongs to
+HOMES = {"target": "train_target", "drafter": "train_drafter", "study": "sweep"}
+
+
+def test_every_command_has_a_schema_and_composes() -> None:
+    assert {p.stem for p in conf_dir().glob("*.yaml")} == set(SCHEMAS)
+    for command, schema in SCHEMAS.items():
+        settings = compose(command, [], schema)
+        assert "results: results" in to_yaml(settings)
+
+
+@pytest.mark.parametrize("choice", list(chain(*([(g, n) for n in names] for g, names in groups().items()))))
+def test_every_config_composes(choice: tuple[str, str]) -> None:
+    group, name = choice
+    command = HOMES.get(group, f"train_{name}" if group == "train" else "rollout")
+    compose(command, [f"{group}={name}"], SCHEMAS[command])
+
+
+@pytest.mark.parametrize("study", groups()["study"])
+def test_every_study_resolves(study: str) -> None:
+    resolved = resolve([f"study={study}"])
+    assert resolved.study.name == study
+    assert resolved.study.baseline in resolved.settings
+    assert len({r.seed for r in resolved.settings.values()}) == 1
+
+
+def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
+    method = compose("rollout", ["method=spec_vla", "acceptance=strict", "threshold.r=4"], s.RolloutSettings)
+    assert (method.proposer.kind, method.acceptance.kind, method.threshold.r) == ("drafter", "strict", 4)
+    assert compose("rollout", ["method=ar"], s.RolloutSettings).proposer.kind == "none"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (["method=spec_vl"], "unknown method 'spec_vl': did you mean spec_vla"),
+        (["threshold.rr=3"], "unknown key 'threshold.rr': did you mean threshold.r"),
+        (["thresold.r=3"], "did you mean threshold.r"),
+        (["episodes=many"], "episodes: Value 'many'"),
+        (["world.camera.size=big"], "world.camera.size"),
+        (["nonsense"], "'nonsense' is not an override: write key=value"),
+        (["task=[reach"], "input"),
+    ],
+)
+def test_a_wrong_override_gets_one_line(overrides: list[str], says: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        compose("rollout", overrides, s.RolloutSettings)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_grids_expand_in_hydras_grammar() -> None:
+    assert expand("method=ar,spec_vla threshold.r=0,9") == [
+        ["method=ar", "threshold.r=0"],
+        ["method=ar", "threshold.r=9"],
+        ["method=spec_vla", "threshold.r=0"],
+        ["method=spec_vla", "threshold.r=9"],
+    ]
+    assert [p[0] for p in expand("threshold.r=range(0,7,3)")] == ["threshold.r=0", "threshold.r=3", "threshold.r=6"]
+    assert expand("task=[reach-v3,push-v3]") == [["task=[reach-v3,push-v3]"]]
+    assert swept_keys("method=ar threshold.r=0,9") == ["threshold.r"]
+
+
+def test_the_threshold_study_is_the_one_that_is_promised() -> None:
+    resolved = resolve(["study=threshold", "episodes=2"])
+    radii = [r.threshold.r for label, r in resolved.settings.items() if label != "ar"]
+    assert radii == [0, 3, 5, 9, 15, 20]
+    assert {r.episodes for r in resolved.settings.values()} == {2}
+    with pytest.raises(UsageError, match=r"sets threshold\.r itself"):
+        resolve(["study=threshold", "threshold.r=3"])

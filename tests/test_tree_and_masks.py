@@ -1,0 +1,129 @@
+"""Trees, ancestor masks against an independent reference, acceptance against its definition, cache commit."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kerv_cli.decoding.acceptance import accept_by_distance
+from kerv_cli.drafting.tree import ROOT, TokenTree, merge, verify_mask
+from kerv_cli.vla.trunk import Cache, Trunk
+
+
+@st.composite
+def trees(draw: st.DrawFn, most: int = 12, vocabulary: int = 12) -> TokenTree:
+    n = draw(st.integers(0, most))
+    parents = [draw(st.integers(-1, i - 1)) for i in range(n)]
+    return TokenTree.build([draw(st.integers(0, vocabulary - 1)) for _ in range(n)], parents)
+
+
+def reachable(tree: TokenTree) -> np.ndarray:
+    """Ancestors by another road: the transitive closure of the parent relation, as powers of a matrix."""
+    n = len(tree)
+    step = np.zeros((n, n), dtype=int)
+    for child, parent in enumerate(tree.parents):
+        if parent != ROOT:
+            step[child, parent] = 1
+    closure = np.linalg.matrix_power(np.eye(n, dtype=int) + step, max(1, n))
+    return closure > 0
+
+
+@given(trees())
+def test_ancestors_are_the_transitive_closure_of_parents(tree: TokenTree) -> None:
+    assert (tree.ancestors() == reachable(tree)).all()
+    assert tree.depths == tuple(int(row.sum()) - 1 for row in tree.ancestors())
+
+
+@given(trees(), st.integers(0, 9))
+def test_the_mask_shows_the_cache_the_root_and_the_ancestors(tree: TokenTree, cached: int) -> None:
+    mask = verify_mask(tree, cached, torch.zeros(()))
+    if len(tree) == 0:
+        assert mask is None
+        return
+    assert mask is not None
+    n = len(tree)
+    assert mask.shape == (1 + n, cached + 1 + n)
+    seen = mask.numpy() == 0
+    assert seen[:, : cached + 1].all()
+    assert not seen[0, cached + 1 :].any()
+    assert (seen[1:, cached + 1 :] == reachable(tree)).all()
+    assert np.isneginf(mask.numpy()[~seen]).all()
+
+
+def test_a_child_before_its_parent_is_refused() -> None:
+    with pytest.raises(ValueError, match="parents come before their children"):
+        TokenTree.build([1, 2], [1, -1])
+
+
+@given(st.lists(st.lists(st.integers(0, 3), min_size=1, max_size=4), max_size=5))
+def test_a_merged_tree_holds_exactly_the_prefixes(chains: list[list[int]]) -> None:
+    tree = merge(chains)
+    prefixes = {tuple(c[: k + 1]) for c in chains for k in range(len(c))}
+    paths = [tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))]
+    assert sorted(paths) == sorted(prefixes)
+
+
+@given(trees(), st.integers(0, 5))
+def test_truncation_keeps_the_nodes_above_the_depth(tree: TokenTree, depth: int) -> None:
+    short = tree.truncate(depth)
+    paths = sorted(tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree)) if tree.depths[n] < depth)
+    assert sorted(tuple(short.tokens[i] for i in short.path_to(n)) for n in range(len(short))) == paths
+
+
+def slow_acceptance(tree: TokenTree, verdicts: list[int], start: int, limits: list[int]) -> tuple[int, int]:
+    """METHODS §2.1 read aloud: of all root paths whose every token is within its limit, the longest, then the nearest."""
+    best = (0, 0)
+    for node in range(len(tree)):
+        path = tree.path_to(node)
+        gaps = [abs(tree.tokens[i] - verdicts[tree.parents[i] + 1]) for i in path]
+        allowed = [limits[(start + d) % len(limits)] for d in range(len(path))]
+        if all(gap <= limit for gap, limit in zip(gaps, allowed, strict=True)):
+            best = min(best, (-len(path), sum(gaps)))
+    return best
+
+
+@settings(max_examples=200)
+@given(trees(), st.data(), st.integers(0, 7), st.lists(st.integers(0, 5), min_size=1, max_size=4))
+def test_acceptance_is_its_definition(tree: TokenTree, data: st.DataObject, start: int, limits: list[int]) -> None:
+    verdicts = [data.draw(st.integers(0, 11)) for _ in range(len(tree) + 1)]
+    found = accept_by_distance(tree, verdicts, start, limits)
+    gaps = [abs(tree.tokens[i] - verdicts[tree.parents[i] + 1]) for i in found.path]
+    assert (-len(found.path), sum(gaps)) == slow_acceptance(tree, verdicts, start, limits)
+    assert list(found.path) == (tree.path_to(found.path[-1]) if found.path else [])
+    end = found.path[-1] if found.path else ROOT
+    children = [i for i, parent in enumerate(tree.parents) if parent == end]
+    assert (found.rejected is None) == (not children)
+
+
+@pytest.mark.parametrize(("start", "path"), list(product([0, 5], [[0], [0, 2], [0, 1, 4, 5]])))
+def test_commit_leaves_the_path_behind_the_prefix(start: int, path: list[int]) -> None:
+    cache = Cache(2, 1, 2, 16, 3, torch.zeros(()))
+    cache.buffer.copy_(torch.arange(16.0).view(1, 1, 1, 1, 16, 1).expand_as(cache.buffer).clone())
+    cache.length = start + 6
+    cache.keep(start, torch.tensor(path) + start)
+    assert cache.length == start + len(path)
+    expected = [*range(start), *(start + p for p in path)]
+    assert (cache.layers[1][1][0, 1, : cache.length, 0] == torch.tensor(expected, dtype=torch.float32)).all()
+
+
+def test_tree_forward_equals_forwarding_every_path_alone() -> None:
+    """Positions and masks together: each node's state is what the plain causal trunk gives for its own path."""
+    torch.manual_seed(0)
+    trunk = Trunk(24, 2, 3, 40).eval()
+    prefix, nodes = torch.randn(1, 5, 24), torch.randn(1, 4, 24)
+    tree = TokenTree.build([0, 0, 0, 0], [-1, 0, 0, 1])
+    root = torch.randn(1, 1, 24)
+    with torch.inference_mode():
+        cache = trunk.new_cache(1, 16)
+        trunk(prefix, torch.arange(5), cache)
+        positions = torch.tensor([5, *(6 + d for d in tree.depths)])
+        together = trunk(torch.cat([root, nodes], 1), positions, cache, verify_mask(tree, 5, prefix))
+        for node in range(4):
+            alone = torch.cat([prefix, root, nodes[:, tree.path_to(node)]], 1)
+            expected = trunk(alone, torch.arange(alone.shape[1]))[0, -1]
+            assert torch.allclose(together[0, 1 + node], expected, atol=1e-5)
