@@ -256,12 +256,28 @@ except RenderingUnavailable as error:
     assert result.stdout == "1 MUJOCO_GL=disable switches drawing off: unset it, or set it to egl\n", result.stderr
 
 
-def test_an_open_camera_leaves_no_error_at_exit():
+def test_open_cameras_are_closed_before_the_interpreter_ends():
+    """Otherwise a context may outlive the display, which prints an EGLError."""
     code = f"""
+import atexit
 from kerv_cli.sim.world import World
 world = World("{TASK}")
+atexit.register(lambda: print([camera._renderer for camera in world._cameras.values()]))  # runs last
 world.reset(0)
 print(world.frame().shape)
 """
     result = run_python(code)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "(96, 96, 3)\n", "")
+    assert (result.returncode, result.stdout, result.stderr) == (0, "(96, 96, 3)\n[None]\n", "")
+
+
+def test_shadows_reflections_and_multisampling_are_off(world):
+    world.reset(0)
+    world.frame()
+    quality = world._env.model.vis.quality
+    assert (quality.offsamples, quality.shadowsize) == (0, 0)
+    import mujoco
+
+    (camera, *_) = world._cameras.values()
+    flags = camera._renderer.scene.flags
+    assert not flags[mujoco.mjtRndFlag.mjRND_SHADOW]
+    assert not flags[mujoco.mjtRndFlag.mjRND_REFLECTION]
