@@ -1,0 +1,41 @@
+"""Small real policies for the tests: untrained weights on disk, made by the code that makes trained ones."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> None:
+    """A nano target and its drafter below `results`, as `kerv train` leaves them."""
+    import torch
+
+    from kerv_cli.config import compose
+    from kerv_cli.drafting.drafter import Drafter, save_drafter
+    from kerv_cli.settings import DrafterSettings, TrainTargetSettings
+    from kerv_cli.training.imitation import vocabulary
+    from kerv_cli.vla.action_tokens import ActionTokenizer
+    from kerv_cli.vla.checkpoint import save_target
+    from kerv_cli.vla.target import Target
+
+    torch.manual_seed(seed)
+    settings = compose("train_target", ["target=nano", f"target.observation={observation}"], TrainTargetSettings)
+    target = Target(settings.target, ActionTokenizer(-np.ones(4), np.ones(4)), vocabulary())
+    provenance = {"parameters": sum(p.numel() for p in target.parameters())}
+    digest = save_target(results / "artifacts" / "target" / name, target, provenance)
+    drafter = Drafter.beside(DrafterSettings(), target)
+    save_drafter(results / "artifacts" / "drafter" / name, drafter, digest, provenance)
+
+
+@pytest.fixture(scope="session")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A results folder with the policies `nano-state` and `nano-vision`. Read only: copy it to change it."""
+    results = tmp_path_factory.mktemp("policies")
+    write_policy(results, "nano-state", "state")
+    write_policy(results, "nano-vision", "vision", seed=1)
+    return results

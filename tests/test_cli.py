@@ -1,0 +1,153 @@
+"""The command line as a user meets it: a real process, its output, its exit code."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+FAST = ["episodes=2", "world.horizon=8", "record=0"]
+
+
+def kerv(*arguments: str, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env={**os.environ, **env})
+
+
+def one_line(run: subprocess.CompletedProcess[str], code: int) -> str:
+    """The single line that a refusal consists of."""
+    assert run.returncode == code, run.stdout + run.stderr
+    assert "Traceback" not in run.stderr
+    lines = [line for line in run.stderr.splitlines() if line.startswith("kerv: ")]
+    assert len(lines) == 1, run.stderr
+    return lines[0]
+
+
+def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
+    code = "import sys, kerv_cli.app; print(sorted({'torch', 'mujoco', 'hydra', 'pandas', 'rerun'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+    run = kerv("--help")
+    assert run.returncode == 0
+    for command in ("demos", "train", "rollout", "sweep", "report", "view", "doctor"):
+        assert f"  {command} " in run.stdout
+
+
+def test_help_is_fast() -> None:
+    def seconds() -> float:
+        began = time.perf_counter()
+        kerv("--help")
+        return time.perf_counter() - began
+
+    python = min(_python_start() for _ in range(3))
+    # half a second on an idle machine; a loaded one is judged against its own bare interpreter
+    assert min(seconds() for _ in range(5)) < max(0.5, 12 * python)
+
+
+def _python_start() -> float:
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "pass"], check=True)
+    return time.perf_counter() - began
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("rollout", "task=drawer-opne"), "unknown task 'drawer-opne': did you mean drawer-open"),
+        (("rollout", "method=spec-vla"), "unknown method 'spec-vla': did you mean spec_vla"),
+        (("rollout", "threshold.radius=3"), "unknown key 'threshold.radius'"),
+        (("train", "target", "target=smal"), "unknown target 'smal': did you mean small"),
+        (("rollout", "episodes=0"), "episodes=0: at least 1"),
+        (("rollout", "seed=5"), "seed=5 is a training seed"),
+        (("rollout", "threshold.r=900", "method=spec_vla"), "threshold.r=900"),
+        (("rollout", "runtime.threads=0"), "runtime.threads=0"),
+        (("rollout", "runtime.device=tpu"), "runtime.device=tpu"),
+        (("sweep", "study=treshold"), "unknown study 'treshold': did you mean threshold"),
+    ],
+)
+def test_a_wrong_request_gets_one_line_and_exit_code_2(arguments: tuple[str, ...], says: str, policies: Path) -> None:
+    policy = ["policy=state", "policy.target=nano-state"] if arguments[0] == "rollout" else []
+    assert says in one_line(kerv(*arguments, *policy, f"results={policies}"), 2)
+
+
+def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    shutil.copytree(policies, results)
+    common = ["task=reach-v3", *FAST, f"results={results}"]
+    assert "no target 'absent'" in one_line(kerv("rollout", *common, "policy.target=absent"), 1)
+    weights = results / "artifacts/target/nano-state/model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-7])
+    assert "does not match its description" in one_line(kerv("rollout", *common, "policy.target=nano-state"), 1)
+    shutil.copytree(results / "artifacts/drafter/nano-state", results / "wrong")
+    wrong = ["method=spec_vla", "policy.target=nano-vision", f"policy.drafter={results}/wrong"]
+    assert "was trained for target" in one_line(kerv("rollout", *common, *wrong), 1)
+    assert "demonstrations" in one_line(kerv("train", "target", "name=new", f"results={results}"), 1)
+
+
+def test_an_empty_results_folder_says_what_to_run(tmp_path: Path) -> None:
+    assert "kerv sweep" in one_line(kerv("report", f"results={tmp_path}"), 2)
+    assert "kerv rollout" in one_line(kerv("view", f"results={tmp_path}"), 2)
+
+
+def test_no_graphics_gets_the_command_that_brings_them(policies: Path) -> None:
+    run = kerv(
+        "rollout", "task=reach-v3", *FAST, f"results={policies}", "policy.target=nano-vision", MUJOCO_GL="glfw", DISPLAY=""
+    )
+    assert "MUJOCO_GL" in one_line(run, 1) or "apt-get install" in one_line(run, 1)
+
+
+def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    shutil.copytree(policies, results)
+    run = kerv(
+        "rollout", "method=spec_vla", "task=drawer-open", "episodes=1", "world.horizon=10", "policy.target=nano-vision",
+        f"results={results}",
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    for word in ("success", "forwards/step", "AL", "ms/step", "time by phase", "kerv view"):
+        assert word in run.stdout
+    recording = results / "rollouts/spec_vla/drawer-open-v3-100000.rrd"
+    assert recording.stat().st_size > 10_000
+    seen = kerv("view", "--summary", str(recording))
+    assert seen.returncode == 0, seen.stderr
+    assert "drawer-open-v3" in seen.stdout
+
+
+def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    shutil.copytree(policies, results)
+    command = ["sweep", "study=demo", "task=reach-v3", *FAST, "policy=state", "policy.target=nano-state", f"results={results}"]
+    plan = kerv(*command, "--plan")
+    assert "7 cells to run, 0 reused" in plan.stdout, plan.stderr
+    first = kerv(*command)
+    assert first.returncode == 0, first.stderr
+    assert "7 cells run, 0 reused, 0 failed" in first.stdout
+    cells = sorted((results / "studies/demo/cells").iterdir())
+    shutil.rmtree(cells[0])
+    assert "1 cells run, 6 reused, 0 failed" in kerv(*command).stdout
+    told = kerv("report", "study=demo", f"results={results}")
+    assert told.returncode == 0, told.stderr
+    table = pd.read_csv(results / "tables/demo.csv")
+    assert set(table["averaging"]) == {"micro", "macro"}
+    assert {"ar", "spec_vla r=0", "spec_vla r=20"} <= set(table["label"])
+    assert (results / "plots").glob("demo*.png")
+
+
+def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:
+    run = kerv("rollout", "method=spec_vla", "threshold.r=3", "--cfg")
+    assert run.returncode == 0
+    assert "kind: drafter" in run.stdout
+    assert "  r: 3" in run.stdout
+
+
+def test_completion_knows_groups_and_names() -> None:
+    from kerv_cli.commands.common import complete_overrides
+
+    assert "method=spec_vla" in complete_overrides("method=s")
+    assert "method=" in complete_overrides("me")
+    assert "task=drawer-open-v3" in complete_overrides("task=drawer")
