@@ -11,7 +11,7 @@ import pytest
 
 from kerv_cli.errors import KervError, RenderingUnavailable, UnknownName, UsageError
 from kerv_cli.sim import camera as camera_module
-from kerv_cli.sim.camera import CameraConfig, box_average, choose_backend
+from kerv_cli.sim.camera import CAMERAS, CameraConfig, box_average, choose_backend
 from kerv_cli.sim.world import Expert, World
 
 # One task for nearly all: a benchmark's 50 placements cost up to a second per seed block. Its poses are stale at reset.
@@ -154,8 +154,20 @@ def test_other_views_get_their_own_camera(world):
     assert hand.shape == (40, 40, 3)
     assert np.abs(wide.astype(int) - usual).mean() > 5
     assert world.frame().tobytes() == usual.tobytes()
+
+
+def test_impossible_views_are_refused():
     with pytest.raises(UnknownName, match="corner4"):
-        world.frame(CameraConfig("corner44"))
+        CameraConfig("corner44")
+    for wrong in ({"fovy": 0.0}, {"fovy": 180.0}, {"size": 0}, {"supersample": 17}):
+        with pytest.raises(UsageError, match="camera"):
+            CameraConfig(**wrong)
+
+
+def test_every_model_has_the_cameras(world):
+    world.reset(0)
+    model = world._env.model
+    assert {model.camera(index).name for index in range(model.ncam)} == set(CAMERAS)
 
 
 def test_supersampling_is_a_rounded_box_mean(world):
@@ -175,10 +187,10 @@ def test_frames_are_fast(world):
     world.frame()
     times = []
     for _ in range(9):
-        start = time.perf_counter()
+        start = time.process_time()  # not wall time: other work on the machine must not fail this
         world.frame()
-        times.append(time.perf_counter() - start)
-    assert np.median(times) < 0.06
+        times.append(time.process_time() - start)
+    assert np.median(times) < 0.04
 
 
 def test_a_world_can_be_closed_twice_and_used_again():

@@ -22,6 +22,8 @@ from kerv_cli.errors import RenderingUnavailable, UnknownName, UsageError
 if TYPE_CHECKING:
     import mujoco
 
+CAMERAS = ("corner", "corner2", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")
+"""The views that every Meta-World model has."""
 _PACKAGES = "libegl1 libosmesa6 libgl1-mesa-dri libgl1"
 _HEADLESS = ("egl", "osmesa")
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
@@ -42,6 +44,9 @@ class CameraConfig:
         fovy: vertical field of view in degrees; 45 doubles the pixels on hand and object that 60 gives.
         size: width and height of a frame in pixels.
         supersample: each pixel is the mean of supersample x supersample rendered ones.
+
+    Raises:
+        UnknownName, UsageError: no such camera; impossible numbers.
     """
 
     name: str = "corner4"
@@ -50,10 +55,14 @@ class CameraConfig:
     supersample: int = 2
 
     def __post_init__(self) -> None:
+        if self.name not in CAMERAS:
+            raise UnknownName("camera", self.name, CAMERAS)
         if not 0.0 < self.fovy < 180.0:
             raise UsageError(f"camera fovy must lie between 0 and 180 degrees, not {self.fovy}")
         if self.size < 1 or not 1 <= self.supersample <= 16:
-            raise UsageError(f"camera size {self.size} and supersample {self.supersample} must be >= 1 (and <= 16)")
+            raise UsageError(
+                f"camera size {self.size} and supersample {self.supersample} must be 1 or more (supersample 16 at most)"
+            )
 
 
 def install_command() -> str:
@@ -129,15 +138,11 @@ class Camera:
         """Opens an offscreen context for `model`.
 
         Raises:
-            UnknownName: the model has no camera of that name.
             RenderingUnavailable: the GL backend cannot open a context.
         """
         backend = choose_backend()
         import mujoco
 
-        names = [model.camera(index).name for index in range(model.ncam)]
-        if config.name not in names:
-            raise UnknownName("camera", config.name, names)
         self.config = config
         self._model = model
         self._camera = int(model.camera(config.name).id)

@@ -185,7 +185,7 @@ class World:
             (size, size, 3) uint8 RGB, upright.
 
         Raises:
-            RenderingUnavailable, UnknownName: no backend, no such camera.
+            RenderingUnavailable: no OpenGL backend can draw here.
             KervError: before the first reset.
         """
         self.observation  # noqa: B018 - raises before the first reset
