@@ -143,9 +143,9 @@ def _keys(command: str) -> list[str]:
         plain = hydra_compose(command)
 
     def walk(node: DictConfig, prefix: str) -> Iterator[str]:
-        for name in node:
+        for name in map(str, node):
             yield f"{prefix}{name}"
-            if isinstance(OmegaConf.select(node, str(name)), DictConfig):
+            if isinstance(OmegaConf.select(node, name), DictConfig):
                 yield from walk(node[name], f"{prefix}{name}.")
 
     return list(walk(plain, ""))

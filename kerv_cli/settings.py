@@ -5,7 +5,7 @@ Nothing heavy is imported here: a wrong override must be answered before torch o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 EVALUATION_SEED = 100_000
@@ -263,3 +263,8 @@ class ViewSettings:
     """`kerv view`."""
 
     results: str = "results"
+
+
+def as_plain(settings: Any) -> dict[str, Any]:
+    """A settings dataclass as nested dicts and lists."""
+    return asdict(settings)

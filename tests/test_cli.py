@@ -96,7 +96,13 @@ def test_an_empty_results_folder_says_what_to_run(tmp_path: Path) -> None:
 
 def test_no_graphics_gets_the_command_that_brings_them(policies: Path) -> None:
     run = kerv(
-        "rollout", "task=reach-v3", *FAST, f"results={policies}", "policy.target=nano-vision", MUJOCO_GL="glfw", DISPLAY=""
+        "rollout",
+        "task=reach-v3",
+        *FAST,
+        f"results={policies}",
+        "policy.target=nano-vision",
+        MUJOCO_GL="glfw",
+        DISPLAY="",
     )
     assert "MUJOCO_GL" in one_line(run, 1) or "apt-get install" in one_line(run, 1)
 
@@ -121,7 +127,15 @@ def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path:
 def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     shutil.copytree(policies, results)
-    command = ["sweep", "study=demo", "task=reach-v3", *FAST, "policy=state", "policy.target=nano-state", f"results={results}"]
+    command = [
+        "sweep",
+        "study=demo",
+        "task=reach-v3",
+        *FAST,
+        "policy=state",
+        "policy.target=nano-state",
+        f"results={results}",
+    ]
     plan = kerv(*command, "--plan")
     assert "7 cells to run, 0 reused" in plan.stdout, plan.stderr
     first = kerv(*command)

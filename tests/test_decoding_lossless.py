@@ -68,7 +68,7 @@ class RandomTrees:
         pass
 
     def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor) -> None:
-        assert hidden.shape[1] == len(chunk.tokens) - first - 1 + (0 if chunk.left else 0)
+        assert hidden.shape[1] == len(chunk.tokens) - first - 1
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         ahead = self.truth[len(chunk.tokens) :]

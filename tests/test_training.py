@@ -110,11 +110,27 @@ def test_batched_greedy_decoding_is_the_decoders() -> None:
 
 
 def train(results: Path, *arguments: str) -> list[str]:
-    return [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", "train", *arguments, f"results={results}", "demos=few"]
+    return [
+        sys.executable,
+        "-W",
+        "ignore",
+        "-m",
+        "kerv_cli.app",
+        "train",
+        *arguments,
+        f"results={results}",
+        "demos=few",
+    ]
 
 
 def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results: Path) -> None:
-    settings = ["target=nano", "target.observation=state", "task=drawer-close", "train.batch=8", "train.validate_every=5"]
+    settings = [
+        "target=nano",
+        "target.observation=state",
+        "task=drawer-close",
+        "train.batch=8",
+        "train.validate_every=5",
+    ]
     command = train(results, "target", *settings, "train.steps=25")
     whole = subprocess.run([*command, "name=whole"], capture_output=True, text=True, timeout=200)
     assert whole.returncode == 0, whole.stderr
@@ -135,14 +151,17 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
     settings = ["target=nano", "task=drawer-close", "train.batch=4", "train.steps=6", "train.scene_steps=2"]
+    settings += ["train.validate_every=3", "train.closed_loop=1", "world.horizon=8"]
     first = subprocess.run(
-        train(results, "target", "name=seen", *settings, "train.validate_every=3", "train.closed_loop=1", "world.horizon=8"),
+        train(results, "target", "name=seen", *settings),
         capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert first.returncode == 0, first.stderr
     assert "closed_loop_success" in first.stdout
     drafter = ["train.steps=4", "train.batch=4", "train.validate_every=2", "drafter.samples=20", "drafter.noise=0.1"]
-    second = subprocess.run(train(results, "drafter", "target=seen", *drafter), capture_output=True, text=True, timeout=300)
+    second = subprocess.run(
+        train(results, "drafter", "target=seen", *drafter), capture_output=True, text=True, timeout=300
+    )
     assert second.returncode == 0, second.stderr
     assert "acceptance_length_r9" in second.stdout
     described = json.loads((results / "artifacts/drafter/seen/drafter.json").read_text())

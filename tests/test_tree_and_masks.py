@@ -76,7 +76,7 @@ def test_truncation_keeps_the_nodes_above_the_depth(tree: TokenTree, depth: int)
 
 
 def slow_acceptance(tree: TokenTree, verdicts: list[int], start: int, limits: list[int]) -> tuple[int, int]:
-    """METHODS §2.1 read aloud: of all root paths whose every token is within its limit, the longest, then the nearest."""
+    """METHODS §2.1 read aloud: the longest root path whose tokens are all within their limits, then the nearest."""
     best = (0, 0)
     for node in range(len(tree)):
         path = tree.path_to(node)

@@ -76,7 +76,14 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
     """Yields `advance_to(done, text)`. A bar on a terminal; elsewhere a line now and then, so that logs stay short."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     if not sys.stderr.isatty():
         yield _plain_lines(title, total)
@@ -95,7 +102,11 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]
 
 def _advance(bar: Progress, title: str, total: int) -> Callable[[int, str], None]:
     task = bar.add_task(title, total=total, text="")
-    return lambda done, text="": bar.update(task, completed=done, text=text)
+
+    def advance(done: int, text: str = "") -> None:
+        bar.update(task, completed=done, text=text)
+
+    return advance
 
 
 def _plain_lines(title: str, total: int) -> Callable[[int, str], None]:

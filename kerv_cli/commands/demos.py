@@ -11,7 +11,7 @@ from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, e
 def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset."""
     from kerv_cli.config import compose, to_yaml
-    from kerv_cli.settings import DemosSettings
+    from kerv_cli.settings import DemosSettings, as_plain
     from kerv_cli.sim.tasks import resolve_tasks
 
     settings = compose("demos", overrides or [], DemosSettings)
@@ -29,7 +29,6 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         return
     from kerv_cli.sim.camera import CameraConfig
     from kerv_cli.sim.demos import DemoConfig, record
-    from kerv_cli.settings import as_plain
 
     config = DemoConfig(
         tasks=tasks,

@@ -100,7 +100,9 @@ def _policies(settings: object) -> list[Finding]:
         try:
             described = read_description(find_target(settings.results, name), "target")
             parameters = described["provenance"]["parameters"] / 1e6
-            findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described['sha256'][:12]}"))
+            findings.append(
+                Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described['sha256'][:12]}")
+            )
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
     return findings or [Finding("policies", True, "none shipped here: 'kerv train target' trains one")]

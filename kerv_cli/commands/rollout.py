@@ -45,7 +45,9 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
     check(settings)
     total = len(tasks) * settings.episodes
     if plan:
-        typer.echo(f"{settings.method}: {len(tasks)} tasks x {settings.episodes} episodes, about {3 * total} s (a guess)")
+        typer.echo(
+            f"{settings.method}: {len(tasks)} tasks x {settings.episodes} episodes, about {3 * total} s (a guess)"
+        )
         return
     from kerv_cli.places import results_dir
 

@@ -69,9 +69,7 @@ class DraftState:
     hidden: Tensor
 
 
-def observe(
-    drafter: Drafter, target: Target, state: DraftState, following: Tensor, hidden: Tensor, first: int
-) -> None:
+def observe(drafter: Drafter, target: Target, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
     """Feed true states: hidden (1, T, E) of the target at positions first, first + 1, … and what follows each of them
     (1, T, E). Entries of an earlier draft tree behind `first` are dropped."""
     state.cache.length = first
@@ -79,13 +77,13 @@ def observe(
     positions = torch.arange(first, first + tokens, device=hidden.device)
     mask = None
     if first and tokens > 1:
-        mask = torch.full((tokens, first + tokens), -torch.inf, dtype=hidden.dtype, device=hidden.device).triu(first + 1)
+        mask = torch.full((tokens, first + tokens), -torch.inf, dtype=hidden.dtype, device=hidden.device).triu(
+            first + 1
+        )
     state.hidden = drafter(following, hidden, positions, state.cache, mask)[0, -1]
 
 
-def grow_tree(
-    drafter: Drafter, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
-) -> TokenTree:
+def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> TokenTree:
     """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
     `nodes` of all. A child is never more probable than its parent, so what is kept is a tree.
     """

@@ -17,16 +17,21 @@ from kerv_cli.settings import RolloutSettings
 class CellLike(Protocol):
     """What of a study's cell an episode needs; studies lie above rollouts."""
 
-    id: str
-    label: str
-    task: str
-    seeds: tuple[int, ...]
-    settings: dict[str, Any]
+    @property
+    def id(self) -> str: ...
+    @property
+    def label(self) -> str: ...
+    @property
+    def task(self) -> str: ...
+    @property
+    def seeds(self) -> tuple[int, ...]: ...
+    @property
+    def settings(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
 class CellRunner:
-    """Picklable. rollouts: folder of the .rrd files, `<cell>-<seed>.rrd`."""
+    """Picklable. rollouts: folder of the .rrd files, one per recorded episode."""
 
     rollouts: Path
 
@@ -35,7 +40,7 @@ class CellRunner:
         records = []
         for record in run_task(settings, cell.task, cell.seeds):
             if record.frames:
-                name = f"{cell.label.replace(' ', '_').replace('=', '')}-{cell.task}-{record.seed}.rrd"
+                name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{record.seed}-{cell.id[:6]}.rrd"
                 save_episode(record, self.rollouts / name, method=cell.label, tokens_per_step=4)
             records.append(dataclasses.replace(record, frames={}))
         return records

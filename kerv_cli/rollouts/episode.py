@@ -16,7 +16,9 @@ from kerv_cli.sim.world import World
 class ActionDecoder(Protocol):
     """What an episode needs of a decoder."""
 
-    needs_frame: bool
+    @property
+    def needs_frame(self) -> bool:
+        """Whether decode() reads a frame; none is rendered otherwise."""
 
     def reset(self, task: str, instruction: str) -> None:
         """A new episode begins: histories are cleared."""

@@ -128,7 +128,10 @@ class Sampled:
 
     def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
         self.decoder, self.reference, self.every, self.count = decoder, reference, every, 0
-        self.needs_frame = decoder.needs_frame
+
+    @property
+    def needs_frame(self) -> bool:
+        return self.decoder.needs_frame
 
     def reset(self, task: str, instruction: str) -> None:
         self.count = 0
@@ -218,8 +221,6 @@ def run_task(
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share of successful AR episodes over tasks and seeds."""
     decoder = Decoder(target, MethodSettings())
-    outcomes = [
-        run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds
-    ]
+    outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
     close_worlds()
     return float(np.mean(outcomes))

@@ -258,7 +258,5 @@ def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_secon
     prior = sum(every) / len(every) if every else prior_seconds
     means = {label: sum(times) / len(times) for label, times in known.items()}
     total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
-    source = (
-        f"measured on {len(every)} stored episodes" if every else f"a guess of {prior_seconds:g} s per episode"
-    )
+    source = f"measured on {len(every)} stored episodes" if every else f"a guess of {prior_seconds:g} s per episode"
     return TimeEstimate(total / max(1, min(workers, len(todo))), len(todo), reused, bool(every), source)

@@ -31,9 +31,7 @@ def plan_text(plan: StudyPlan) -> str:
     labels: dict[str, dict[str, Any]] = {}
     for cell in plan.cells:
         settings = {key: value for key, value in cell.settings.items() if key != "task"}
-        labels.setdefault(
-            cell.label, {"overrides": cell.overrides, "identity": cell.identity, "settings": settings}
-        )
+        labels.setdefault(cell.label, {"overrides": cell.overrides, "identity": cell.identity, "settings": settings})
     head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "labels": labels}
     cells = [{"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds)} for c in plan.cells]
     lines = yaml.safe_dump({"cells": cells}, sort_keys=False, default_flow_style=None, width=1000)

@@ -56,9 +56,7 @@ def report_study(results: Path, name: str) -> list[Path]:
     return [*written, page]
 
 
-def _page(
-    store: StudyStore, data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame, figures: list[str]
-) -> str:
+def _page(store: StudyStore, data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame, figures: list[str]) -> str:
     first = whole.iloc[0]
     about = ", ".join(
         [

@@ -1,10 +1,10 @@
 """The results folder of a study. A cell is either complete or absent.
 
-    results/studies/<name>/
-        plan.yaml                     what was asked for
-        cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
-        failures/<id>.txt             traceback of the last attempt, until one succeeds
-        rollouts/*.rrd
+results/studies/<name>/
+    plan.yaml                     what was asked for
+    cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
+    failures/<id>.txt             traceback of the last attempt, until one succeeds
+    rollouts/*.rrd
 """
 
 from __future__ import annotations

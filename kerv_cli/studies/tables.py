@@ -95,9 +95,7 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[d
             yield _row(data, label, own, baseline, averaging)
 
 
-def _row(
-    data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str
-) -> dict[str, Any]:
+def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> dict[str, Any]:
     tasks = sorted(set(episodes["task"]))
     cells = [c for c in data.plan.cells if c.label == label and c.task in tasks and c.id in data.cells]
     head = {

@@ -30,7 +30,7 @@ from kerv_cli.vla.target import Target
 
 @dataclass(frozen=True)
 class TeacherStates:
-    """The target on n observations. prompt (n, P, E), hidden (n, P + N − 1, E), tokens (n, N); float16 to save memory."""
+    """The target on n observations. prompt (n, P, E), hidden (n, P + N − 1, E), tokens (n, N); in float16."""
 
     prompt: Tensor
     hidden: Tensor
@@ -113,7 +113,7 @@ class Distillation:
         return predicted
 
     def compare(self, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Smooth L1 of the states and soft cross-entropy of the tokens, over the positions that tokens 1 … N − 1 need."""
+        """Smooth L1 of states and soft cross-entropy of tokens, over the positions that tokens 1 … N − 1 need."""
         start = self.target.prompt_length - 1
         guess, truth = predicted[:, start:], hidden[:, start + 1 :]
         teacher = self.target.head(truth).softmax(-1)
@@ -144,4 +144,3 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
 
 def distillation_job(run: Distillation, save: Callable[[nn.Module, Metrics], None]) -> Job:
     return Job(run.drafter, len(run.states), run.loss, run.validate, save)
-

@@ -20,10 +20,10 @@ from kerv_cli.settings import TargetSettings, TrainSettings
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.demo_file import DemoEpisode
 from kerv_cli.sim.tasks import TASKS, task
+from kerv_cli.training.loop import Job, Metrics
 from kerv_cli.vla.action_tokens import DOF_NAMES, VOCABULARY, ActionTokenizer, values_of
 from kerv_cli.vla.target import GOAL, OBJECT, Inputs, Target
 from kerv_cli.vla.text import WordTokenizer
-from kerv_cli.training.loop import Job, Metrics
 
 WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
 
@@ -45,8 +45,8 @@ class Samples:
 
     def where(self, mask: Tensor) -> Samples:
         frames = self.frames[mask] if self.frames is not None else None
-        rest = (self.states, self.chunks, self.words, self.episodes, self.tasks)
-        return Samples(frames, *(x[mask] for x in rest), self.task_names)
+        states, chunks, words = self.states[mask], self.chunks[mask], self.words[mask]
+        return Samples(frames, states, chunks, words, self.episodes[mask], self.tasks[mask], self.task_names)
 
     def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
         images = None

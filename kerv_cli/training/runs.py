@@ -73,7 +73,10 @@ class TargetRun:
         settings = self.settings
         target = new_target(settings.target, self.samples, settings.train.seed).to(self.device)
         identity = identity_of(
-            target=asdict(settings.target), train=determining(settings.train), demos=self.dataset.sha256, tasks=self.tasks
+            target=asdict(settings.target),
+            train=determining(settings.train),
+            demos=self.dataset.sha256,
+            tasks=self.tasks,
         )
         run = Imitation(target, self.samples, settings.train, torch.device(self.device))
         closed_loop = self.closed_loop if settings.train.closed_loop else None

@@ -80,7 +80,11 @@ class Target(nn.Module):
         if s.observation == "vision":
             self.vision = VisionEncoder(s.image_size, s.grid, s.keypoints, s.channels, s.width)
             self.locate = nn.Sequential(
-                nn.Linear(2 * s.keypoints + 4 + s.width, 256), nn.SiLU(), nn.Linear(256, 128), nn.SiLU(), nn.Linear(128, 6)
+                nn.Linear(2 * s.keypoints + 4 + s.width, 256),
+                nn.SiLU(),
+                nn.Linear(256, 128),
+                nn.SiLU(),
+                nn.Linear(128, 6),
             )
         self.trunk = Trunk(s.width, s.layers, s.heads, s.feed_forward)
         self.head = nn.Linear(s.width, VOCABULARY, bias=False)
