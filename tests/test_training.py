@@ -160,7 +160,7 @@ def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path
     assert "closed_loop_success" in first.stdout
     drafter = ["train.steps=4", "train.batch=4", "train.validate_every=2", "drafter.samples=20", "drafter.noise=0.1"]
     second = subprocess.run(
-        train(results, "drafter", "target=seen", *drafter), capture_output=True, text=True, timeout=300
+        train(results, "drafter", "policy.target=seen", *drafter), capture_output=True, text=True, timeout=300
     )
     assert second.returncode == 0, second.stderr
     assert "acceptance_length_r9" in second.stdout

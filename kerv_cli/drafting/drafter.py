@@ -145,7 +145,7 @@ def load_drafter(folder: Path, target: Target, target_sha256: str) -> tuple[Draf
     if description["target"] != target_sha256:
         raise CheckpointError(
             f"the drafter in {folder} was trained for target {description['target'][:12]}, not for "
-            f"{target_sha256[:12]}: train one with 'kerv train drafter', or name its own target"
+            f"{target_sha256[:12]}: train one with 'kerv train drafter policy.target=…'"
         )
     drafter = Drafter.beside(DrafterSettings(**description["settings"]), target)
     load_state(drafter, folder, "drafter")

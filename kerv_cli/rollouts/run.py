@@ -72,7 +72,7 @@ def load_drafter_error(settings: RolloutSettings, folder: Path, trained_for: str
 
     raise CheckpointError(
         f"the drafter in {_drafter_folder(settings, folder)} was trained for target {trained_for[:12]}, not for "
-        f"{target[:12]}: train one with 'kerv train drafter target={settings.policy.target}'"
+        f"{target[:12]}: train one with 'kerv train drafter policy.target={settings.policy.target}'"
     )
 
 

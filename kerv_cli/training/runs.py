@@ -111,9 +111,9 @@ class DrafterRun:
         self.settings = settings
         if settings.drafter.kind != "eagle":
             raise UnknownName("drafter.kind", settings.drafter.kind, ["eagle"])
-        self.target_folder = find_target(settings.results, settings.target)
-        beside = drafter_beside(self.target_folder)
-        self.folder = artifact(settings.results, "drafter", settings.name) if settings.name else beside
+        self.target_folder = find_target(settings.results, settings.policy.target)
+        name = settings.policy.drafter
+        self.folder = artifact(settings.results, "drafter", name) if name else drafter_beside(self.target_folder)
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
 
     def plan(self) -> str:
