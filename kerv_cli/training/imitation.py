@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.demo_file import DemoEpisode
@@ -106,7 +106,12 @@ def _frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[n
 
 def split(samples: Samples, share: float) -> tuple[Samples, Samples]:
     """(training, held out), by whole episodes: every k-th, so that each task and both kinds are in both."""
-    every = max(2, round(1 / share))
+    episodes = int(samples.episodes.max()) + 1
+    if episodes < 2:
+        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
+    if not 0 < share <= 0.5:
+        raise UsageError(f"train.held_out={share}: more than 0, at most 0.5")
+    every = min(max(2, round(1 / share)), episodes)
     held = samples.episodes % every == every - 1
     return samples.where(~held), samples.where(held)
 
