@@ -87,6 +87,8 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
     """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
     `nodes` of all. A child is never more probable than its parent, so what is kept is a tree.
     """
+    if top_k == 1:
+        return TokenTree.chain(draft_chain(drafter, target, state, min(depth, nodes)))
     scores = torch.log_softmax(target.head(state.hidden).float(), -1)
     values, tokens = scores.topk(min(top_k, nodes))
     level = list(range(len(tokens)))
@@ -117,10 +119,22 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
     return _keep_best(all_tokens, parents, cumulative, nodes)
 
 
-def _level_mask(base: int, seen: Tensor, like: Tensor) -> Tensor | None:
+def draft_chain(drafter: Drafter, target: Target, state: DraftState, depth: int) -> list[int]:
+    """The greedy draft: the tree of one branch, without probabilities, ranks or masks."""
+    base = state.cache.length
+    positions = torch.arange(base, base + depth, device=state.hidden.device).split(1)
+    hidden = state.hidden[None, None]
+    drafted = [target.head(hidden[0]).argmax(-1)]
+    for reached in range(depth - 1):
+        following = target.embedding(drafted[-1])[None]
+        hidden = drafter(following, hidden, positions[reached], state.cache)
+        drafted.append(target.head(hidden[0]).argmax(-1))
+    state.cache.length = base
+    return torch.cat(drafted).tolist()
+
+
+def _level_mask(base: int, seen: Tensor, like: Tensor) -> Tensor:
     """Additive (k, base + drafted so far): the committed part is seen by all, drafted entries by their descendants."""
-    if seen.shape[0] == 1 and bool(seen.all()):
-        return None
     mask = torch.zeros((seen.shape[0], base + seen.shape[1]), dtype=like.dtype, device=like.device)
     mask[:, base:].masked_fill_(~seen, -torch.inf)
     return mask

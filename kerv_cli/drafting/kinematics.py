@@ -1,0 +1,273 @@
+"""Kinematic prediction of the next actions from the last ones (METHODS §3.1, KERV §3).
+
+Every predictor here is linear in its window: for fixed noise and window length its output is a fixed weight per past
+action and step ahead. The weights are computed once, so that predicting is one small dot product in the control loop.
+Actions are normalised to [-1, 1], one control step is the unit of time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kerv_cli.errors import UnknownName, UsageError
+
+WINDOW = 10  # KERV's action context AC, control steps
+MINIMUM = 4  # actions that a prediction needs; longer windows were not measurably better on the demonstrations
+HORIZON = 8  # steps ahead that weights are computed for
+
+
+class ActionHistory:
+    """The last `window` executed actions, normalised and continuous."""
+
+    def __init__(self, dofs: int, window: int = WINDOW) -> None:
+        self.dofs = dofs
+        self._actions: deque[np.ndarray] = deque(maxlen=window)
+
+    def __len__(self) -> int:
+        return len(self._actions)
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self._actions.clear()
+
+    def append(self, action: np.ndarray) -> None:
+        """An action (D,) in [-1, 1] was executed.
+
+        Raises:
+            ValueError: another shape, or a number that is not finite.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self.dofs,) or not np.isfinite(action).all():
+            raise ValueError(f"an executed action must be {self.dofs} finite numbers, not {action}")
+        self._actions.append(action)
+
+    def values(self, pending: np.ndarray | None = None) -> np.ndarray:
+        """(m, D), oldest first, m ≤ window.
+
+        pending: (k, D) steps of the present chunk that are known but not yet executed. They take the newest places, so
+        that what follows them is one step ahead instead of k + 1.
+        """
+        known = [*self._actions, *(() if pending is None else np.asarray(pending, dtype=np.float64))]
+        known = known[-(self._actions.maxlen or 0) :]
+        return np.stack(known) if known else np.zeros((0, self.dofs))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What a Kalman filter assumes of each DoF; the gripper's entries are not used.
+
+    q: variance of the random acceleration (order 2) or change of acceleration (order 3) in one step. r: variance of
+    the observation. Only their ratio matters, because the prior is scaled by r. damping: share of the velocity that is
+    left after one step; 1 is the paper's constant velocity, less is *ours*.
+    """
+
+    q: tuple[float, ...]
+    r: tuple[float, ...]
+    damping: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.q) == len(self.r) == len(self.damping):
+            raise UsageError("kinematics: q, r and damping need one number per DoF")
+        if any(not (np.isfinite(x) and x >= 0) for x in self.q) or any(not (np.isfinite(x) and x > 0) for x in self.r):
+            raise UsageError("kinematics: q must be 0 or more and r above 0")
+        if any(not 0 <= x <= 1 for x in self.damping):
+            raise UsageError("kinematics: damping must lie between 0 and 1")
+
+    @classmethod
+    def uniform(cls, dofs: int, q: float, r: float = 1.0, damping: float = 1.0) -> Noise:
+        return cls((q,) * dofs, (r,) * dofs, (damping,) * dofs)
+
+
+def motion_model(order: int, damping: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """(F, Q / q) of the state [a, ȧ] (order 2) or [a, ȧ, ä] (order 3), discrete white noise, dt = 1.
+
+    Raises:
+        ValueError: another order, or damping with order 3.
+    """
+    if order == 2:
+        return np.array([[1.0, damping], [0.0, damping]]), np.outer([0.5, 1.0], [0.5, 1.0])
+    if order == 3 and damping == 1.0:
+        return np.array([[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), np.outer([0.5, 1, 1], [0.5, 1, 1])
+    raise ValueError(f"no motion model of order {order} with damping {damping}")
+
+
+def kalman_weights(
+    q: float, r: float, window: int, horizon: int, order: int = 2, damping: float = 1.0
+) -> np.ndarray:
+    """(horizon, window): row h − 1 times the window, oldest first, is the filter's prediction h steps ahead.
+
+    The filter begins on the window's first action: state [a₀, 0(, 0)], covariance r · I. It then predicts and updates
+    once per further action, and predicts `horizon` times. Here the state is carried as a linear function of the window.
+    """
+    transition, noise = motion_model(order, damping)
+    state = np.zeros((order, window))  # column i: what action i contributes
+    state[0, 0] = 1.0
+    covariance = np.eye(order)  # in units of r
+    for i in range(1, window):
+        state = transition @ state
+        covariance = transition @ covariance @ transition.T + q / r * noise
+        gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
+        innovation = -state[0]
+        innovation[i] += 1.0
+        state = state + np.outer(gain, innovation)
+        covariance = covariance - np.outer(gain, covariance[0])
+    rows = []
+    for _ in range(horizon):
+        state = transition @ state
+        rows.append(state[0])
+    return np.stack(rows)
+
+
+class Predictor:
+    """Predicts the next actions from the last ones; the gripper is held, never extrapolated."""
+
+    name = ""
+    least = 1  # actions without which the weights are not defined
+
+    def __init__(
+        self, dofs: int, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON, gripper: int = -1
+    ) -> None:
+        """minimum: actions without which predict() gives None. gripper: index of its DoF.
+
+        Raises:
+            UsageError: minimum or window out of range.
+        """
+        if not self.least <= minimum <= window:
+            raise UsageError(f"{self.name}: a minimum history of {minimum} does not lie in {self.least}…{window}")
+        self.dofs, self.minimum, self.window, self.horizon = dofs, minimum, window, horizon
+        self.gripper = gripper % dofs
+        self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
+
+    def weights(self, dof: int, window: int) -> np.ndarray:
+        """(horizon, window) of one DoF."""
+        raise NotImplementedError
+
+    def _table(self, window: int) -> np.ndarray:
+        """(D, horizon, window)."""
+        rows = [
+            hold_weights(window, self.horizon) if dof == self.gripper else self.weights(dof, window)
+            for dof in range(self.dofs)
+        ]
+        return np.stack(rows)
+
+    def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
+        """history (m, D) in [-1, 1], oldest first, its last `window` count -> (steps, D) in [-1, 1].
+
+        None when the history is shorter than `minimum`.
+
+        Raises:
+            ValueError: more steps than `horizon`, or another number of DoFs.
+        """
+        if len(history) < self.minimum:
+            return None
+        return self.predict_many(np.asarray(history, dtype=np.float64)[None], steps)[0]
+
+    def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
+        """(B, m, D) with m ≥ `minimum` -> (B, steps, D)."""
+        if not 0 <= steps <= self.horizon or histories.shape[-1] != self.dofs:
+            raise ValueError(f"{self.name}: {steps} steps of {histories.shape[-1]} DoFs; weights are for "
+                             f"{self.horizon} of {self.dofs}")  # fmt: skip
+        past = histories[:, -self.window :]
+        table = self.tables[past.shape[1]][:, :steps]
+        predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
+        return np.clip(predicted, -1.0, 1.0)
+
+
+def hold_weights(window: int, horizon: int) -> np.ndarray:
+    """(horizon, window): all weight on the newest action."""
+    weights = np.zeros((horizon, window))
+    weights[:, -1] = 1.0
+    return weights
+
+
+class Hold(Predictor):
+    """The last action again: the baseline of every prediction."""
+
+    name = "hold"
+
+    def weights(self, dof: int, window: int) -> np.ndarray:
+        return hold_weights(window, self.horizon)
+
+
+class Linear(Predictor):
+    """The line through the last two actions."""
+
+    name = "linear"
+    least = 2
+
+    def weights(self, dof: int, window: int) -> np.ndarray:
+        ahead = np.arange(1, self.horizon + 1)
+        weights = np.zeros((self.horizon, window))
+        weights[:, -1], weights[:, -2] = 1 + ahead, -ahead
+        return weights
+
+
+class Kalman(Predictor):
+    """A Kalman filter per DoF (METHODS §3.1), run from the window's first action; see `kalman_weights`."""
+
+    name = "kalman"
+    least = 2
+    order = 2
+
+    def __init__(
+        self,
+        noise: Noise,
+        minimum: int = MINIMUM,
+        window: int = WINDOW,
+        horizon: int = HORIZON,
+        gripper: int = -1,
+    ) -> None:
+        self.noise = noise
+        super().__init__(len(noise.q), minimum, window, horizon, gripper)
+
+    def weights(self, dof: int, window: int) -> np.ndarray:
+        q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
+        return kalman_weights(q, r, window, self.horizon, self.order, damping)
+
+
+class Damped(Kalman):
+    """Kalman filter whose velocity fades: actions are bounded, so no slope lasts (*ours*)."""
+
+    name = "damped"
+
+
+class Acceleration(Kalman):
+    """Kalman filter with a constant-acceleration state (ablation)."""
+
+    name = "acceleration"
+    least = 3
+    order = 3
+
+
+FILTERS: dict[str, type[Kalman]] = {kind.name: kind for kind in (Kalman, Damped, Acceleration)}
+PREDICTORS = (Hold.name, Linear.name, *FILTERS)
+
+
+def build_predictor(
+    kind: str,
+    dofs: int,
+    noise: Mapping[str, Noise],
+    minimum: int = MINIMUM,
+    window: int = WINDOW,
+    horizon: int = HORIZON,
+    gripper: int = -1,
+) -> Predictor:
+    """The predictor `kind`; `noise` holds the fitted noise of each kind of filter.
+
+    Raises:
+        UnknownName: no such predictor.
+        UsageError: a filter without its noise, or a number out of range.
+    """
+    if kind == Hold.name:
+        return Hold(dofs, minimum, window, horizon, gripper)
+    if kind == Linear.name:
+        return Linear(dofs, minimum, window, horizon, gripper)
+    if kind not in FILTERS:
+        raise UnknownName("predictor", kind, PREDICTORS)
+    if kind not in noise:
+        raise UsageError(f"predictor '{kind}' has no fitted noise: run 'kerv calibrate'")
+    return FILTERS[kind](noise[kind], minimum, window, horizon, gripper)
