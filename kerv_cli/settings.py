@@ -73,7 +73,12 @@ class RectifierSettings:
 class BoundarySettings:
     """Which proposer drafts now (METHODS §4.4)."""
 
-    kind: str = "always"
+    kind: str = "always"  # always (the method's only proposer) | always_retrieval | always_drafter | fused | random
+    alpha: float = 0.5  # weight of the radius of curvature against the path length
+    window: int = 15  # newest measured positions that are looked at
+    f_star: float = 0.5  # fused metric from which retrieval drafts
+    p: float = 0.5  # random: probability of retrieval
+    seed: int = 0  # random
 
 
 @dataclass
@@ -262,6 +267,19 @@ class ReportSettings:
 class ViewSettings:
     """`kerv view`."""
 
+    results: str = "results"
+
+
+@dataclass
+class BuildDatastoreSettings:
+    """`kerv build datastore` (METHODS §4.1)."""
+
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    name: str | None = None  # default: datastore/ beside the target
+    demos: str = "mt10"
+    task: list[str] = field(default_factory=lambda: ["MT10"])
+    episodes: int = 0  # per task, the first ones by seed; 0: all
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     results: str = "results"
 
 

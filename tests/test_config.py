@@ -16,6 +16,7 @@ SCHEMAS = {
     "demos": s.DemosSettings,
     "train_target": s.TrainTargetSettings,
     "train_drafter": s.TrainDrafterSettings,
+    "build_datastore": s.BuildDatastoreSettings,
     "doctor": s.DoctorSettings,
     "report": s.ReportSettings,
     "view": s.ViewSettings,

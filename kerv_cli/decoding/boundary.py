@@ -1,0 +1,185 @@
+"""Which proposer drafts now: retrieval or the drafter (METHODS §4.4; HeiSD).
+
+R is the radius of curvature of the measured end-effector path, D its length. A straight, fast reach (large R, large D)
+repeats what demonstrations hold; a tight or slow path is precise work, which the drafter does better.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.settings import BoundarySettings
+
+Mode = Literal["retrieval", "drafter"]
+
+LEAST = 3  # positions; fewer have no curvature
+STILL = 1e-3  # metres; a hand whose path is shorter stands still (one control step at full speed is 10 mm)
+COINCIDENT = 1e-7  # metres of spread; below it float32 positions are the same point
+STRAIGHT = 1e-6  # spread across the path by the spread along it; below it the points lie on a line
+KINDS = ("always", "always_retrieval", "always_drafter", "fused", "random")
+
+
+def radius_of_curvature(points: np.ndarray) -> float:
+    """Radius in metres of the circle through points (n, 3); infinite where there is no circle.
+
+    The best-fit plane by singular values, in it Taubin's algebraic circle fit, which is exact on arcs. Centred and
+    scaled to unit mean square, the fit's smallest singular vector (a, b, c) over [(z − 1) / 2, x, y], z = x² + y²,
+    gives R = scale / |a|. Infinite for fewer than three points, a hand that stands still and a straight line.
+
+    Raises:
+        ValueError: points of another shape.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points have shape {points.shape}, not (n, 3)")
+    if len(points) < LEAST:
+        return math.inf
+    centred = points - points.mean(0)
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    if spread[0] <= COINCIDENT or spread[1] <= STRAIGHT * spread[0]:
+        return math.inf
+    planar = centred @ axes[:2].T
+    scale = math.sqrt(float((planar**2).sum(1).mean()))
+    planar /= scale
+    conic = np.column_stack([((planar**2).sum(1) - 1) / 2, planar])
+    quadratic = abs(float(np.linalg.svd(conic, full_matrices=False)[2][-1, 0]))
+    return scale / quadratic if quadratic > 0 else math.inf
+
+
+def path_length(points: np.ndarray) -> float:
+    """Summed distances between successive points (n, 3), metres; 0 for fewer than two."""
+    points = np.asarray(points, dtype=np.float64)
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True)
+class BoundaryRanges:
+    """What R and D of the training demonstrations range over: the minimum and the 95th percentile, in metres.
+
+    Infinite radii (straight lines, a hand at rest) do not enter the ranges: one straight reach would make every other
+    radius zero.
+    """
+
+    radius_low: float
+    radius_high: float
+    length_low: float
+    length_high: float
+
+    def __post_init__(self) -> None:
+        pairs = ((self.radius_low, self.radius_high), (self.length_low, self.length_high))
+        if not all(0 <= low < high < math.inf for low, high in pairs):
+            raise CheckpointError(f"{self} is no range: build it from demonstrations in which the hand moves")
+
+    @classmethod
+    def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
+        """paths: (T, 3) measured positions of whole episodes, metres. Every window that the running system would see
+        counts, the short ones of an episode's beginning included.
+
+        Raises:
+            CheckpointError: no path bends, or none moves.
+        """
+        measured = []
+        for path in paths:
+            for end in range(LEAST, len(path) + 1):
+                points = path[max(0, end - window) : end]
+                measured.append((radius_of_curvature(points), path_length(points)))
+        radii, lengths = np.array(measured).reshape(-1, 2).T
+        radii = radii[np.isfinite(radii)]
+        if not len(radii):
+            raise CheckpointError("the demonstrations hold no curved path: the boundary's ranges cannot be taken")
+        high = (float(np.percentile(x, 95)) for x in (radii, lengths))
+        return cls(float(radii.min()), next(high), float(lengths.min()), next(high))
+
+    def normalise(self, radius: float, length: float) -> tuple[float, float]:
+        """(R̂, D̂) in [0, 1], clipped. An infinite radius is 1 where the hand moves: a straight reach. Where it stands
+        still R̂ is 0: otherwise a hand at rest would count as half a reach and call for retrieval."""
+        scaled = 0.0
+        if length >= STILL:
+            scaled = min(1.0, max(0.0, (radius - self.radius_low) / (self.radius_high - self.radius_low)))
+        return scaled, min(1.0, max(0.0, (length - self.length_low) / (self.length_high - self.length_low)))
+
+    def fused(self, radius: float, length: float, alpha: float) -> float:
+        """F = α·R̂ + (1 − α)·D̂, in [0, 1]."""
+        radius, length = self.normalise(radius, length)
+        return alpha * radius + (1 - alpha) * length
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Who drafts, and the metric F it was decided by; None where no metric was taken."""
+
+    mode: Mode
+    metric: float | None = None
+
+
+class Boundary(Protocol):
+    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        """path (n, 3): the episode's measured positions up to now, metres, oldest first; the newest `window` count."""
+
+
+@dataclass(frozen=True)
+class Always:
+    mode: Mode
+
+    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        return Choice(self.mode)
+
+
+@dataclass(frozen=True)
+class Random:
+    p: float  # probability of retrieval
+
+    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        return Choice("retrieval" if rng.random() < self.p else "drafter")
+
+
+@dataclass(frozen=True)
+class Fused:
+    """F ≥ F* → retrieval; fewer than three positions → drafter."""
+
+    ranges: BoundaryRanges
+    alpha: float
+    window: int
+    f_star: float
+
+    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        points = np.asarray(path)[-self.window :]
+        if len(points) < LEAST:
+            return Choice("drafter")
+        metric = self.ranges.fused(radius_of_curvature(points), path_length(points), self.alpha)
+        return Choice("retrieval" if metric >= self.f_star else "drafter", metric)
+
+
+def build_boundary(settings: BoundarySettings, ranges: BoundaryRanges | None = None) -> Boundary | None:
+    """The boundary of these settings; None for `always`, where the method has one proposer and nothing is chosen.
+
+    Raises:
+        UnknownName: no such kind. UsageError: a number out of range. CheckpointError: `fused` without ranges.
+    """
+    if settings.kind not in KINDS:
+        raise UnknownName("boundary.kind", settings.kind, KINDS)
+    for name in ("alpha", "p"):
+        if not 0 <= getattr(settings, name) <= 1:
+            raise UsageError(f"boundary.{name}={getattr(settings, name)}: from 0 to 1")
+    if settings.window < LEAST:
+        raise UsageError(f"boundary.window={settings.window}: at least {LEAST} positions")
+    if settings.kind == "random":
+        return Random(settings.p)
+    if settings.kind == "fused":
+        if ranges is None:
+            raise CheckpointError("boundary=fused needs the demonstrations' ranges: calibrate the target first")
+        return Fused(ranges, settings.alpha, settings.window, settings.f_star)
+    modes: dict[str, Mode] = {"always_retrieval": "retrieval", "always_drafter": "drafter"}
+    return Always(modes[settings.kind]) if settings.kind in modes else None
+
+
+def episode_generator(settings: BoundarySettings, task: str, seed: int) -> np.random.Generator:
+    """The random boundary's numbers in one episode: the same whatever ran before it and in whichever process."""
+    return np.random.default_rng([settings.seed, zlib.crc32(task.encode()), seed])

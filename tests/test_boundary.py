@@ -1,0 +1,274 @@
+"""The trajectory metric on paths whose curvature is known, and the boundary that is built on it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kerv_cli.decoding.boundary import (
+    STILL,
+    BoundaryRanges,
+    Choice,
+    build_boundary,
+    episode_generator,
+    path_length,
+    radius_of_curvature,
+)
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.settings import BoundarySettings
+
+WINDOW = 15
+RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def rotation(rng: np.random.Generator) -> np.ndarray:
+    """(3, 3), proper, uniformly random."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    return q * np.sign(np.linalg.det(q))
+
+
+def arc(rng: np.random.Generator, radius: float, length: float, n: int = WINDOW) -> np.ndarray:
+    """(n, 3) metres: evenly spaced points of an arc in a random plane of the robot's workspace."""
+    angles = np.linspace(0, length / radius, n) + rng.uniform(0, 2 * np.pi)
+    flat = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n)])
+    return flat @ rotation(rng).T + rng.uniform(-1, 1, 3)
+
+
+def line(rng: np.random.Generator, length: float, n: int = WINDOW) -> np.ndarray:
+    direction = rotation(rng)[0]
+    return np.linspace(0, length, n)[:, None] * direction + rng.uniform(-1, 1, 3)
+
+
+@settings(deadline=None)
+@given(seeds, st.floats(0.005, 5.0), st.floats(0.2, 2 * np.pi), st.integers(3, 30))
+def test_the_radius_is_exact_on_arcs(seed: int, radius: float, angle: float, n: int) -> None:
+    points = arc(np.random.default_rng(seed), radius, radius * angle * (n - 1) / n, n)
+    assert radius_of_curvature(points) == pytest.approx(radius, rel=1e-6)
+
+
+@settings(deadline=None)
+@given(seeds, st.floats(0.01, 1.0), st.floats(0.5, 6.0))
+def test_uneven_speed_along_an_arc_changes_nothing(seed: int, radius: float, angle: float) -> None:
+    rng = np.random.default_rng(seed)
+    angles = np.sort(rng.uniform(0, angle, WINDOW))
+    angles[0], angles[-1] = 0, angle
+    flat = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(WINDOW)])
+    assert radius_of_curvature(flat @ rotation(rng).T) == pytest.approx(radius, rel=1e-6)
+
+
+@settings(deadline=None)
+@given(seeds, st.floats(0.01, 0.5), st.integers(3, 30))
+def test_a_line_has_no_finite_radius(seed: int, length: float, n: int) -> None:
+    points = line(np.random.default_rng(seed), length, n)
+    assert radius_of_curvature(points) == math.inf
+    assert radius_of_curvature(points.astype(np.float32)) > 1e3 * length  # float32 positions bend a line by 0.1 µm
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((0, 3)),
+        np.zeros((2, 3)),
+        np.array([[0, 0, 0], [0.1, 0, 0]]),
+        np.full((WINDOW, 3), 0.6),
+        np.full((WINDOW, 3), 0.6, dtype=np.float32),
+        np.repeat([[0.1, 0.6, 0.2], [0.2, 0.5, 0.2]], 5, 0),  # two places only
+        np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0], [0.1, 0, 0]]),  # to and fro
+    ],
+)
+def test_where_there_is_no_circle_the_radius_is_infinite(points: np.ndarray) -> None:
+    assert radius_of_curvature(points) == math.inf
+
+
+def test_another_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"shape \(15, 2\)"):
+        radius_of_curvature(np.zeros((15, 2)))
+
+
+def deviation_of_curvature(sigma: float, length: float, n: int = WINDOW) -> float:
+    """Standard deviation of a curvature fitted to n evenly spaced points with noise sigma: the least-squares parabola's
+    second derivative, σ √(720 / n) / L². Any fit of a shallow arc has it to first order."""
+    return sigma * math.sqrt(720 / n) / length**2
+
+
+@settings(deadline=None)
+@given(seeds, st.floats(0.03, 0.3), st.floats(0.5, 2.0))
+def test_noise_moves_the_curvature_of_an_arc_as_little_as_a_parabola_fit_allows(
+    seed: int, radius: float, angle: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    length = radius * angle
+    sigma = length * angle / 8 / 20  # a twentieth of the arc's height
+    points = arc(rng, radius, length) + rng.normal(size=(WINDOW, 3)) * sigma
+    assert abs(1 / radius_of_curvature(points) - 1 / radius) < 6 * deviation_of_curvature(sigma, length)
+
+
+@settings(deadline=None)
+@given(seeds, st.floats(0.03, 0.3), st.floats(1e-5, 2e-4))
+def test_a_noisy_line_stays_nearly_straight(seed: int, length: float, sigma: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = line(rng, length) + rng.normal(size=(WINDOW, 3)) * sigma
+    # the plane is free to turn into the noise: both directions across the line bend it
+    assert 1 / radius_of_curvature(points) < 6 * math.sqrt(2) * deviation_of_curvature(sigma, length)
+
+
+@settings(deadline=None)
+@given(seeds)
+def test_both_measures_survive_rigid_motion_and_reversal(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = np.cumsum(rng.normal(size=(WINDOW, 3)) * 0.01, 0)
+    moved = points @ rotation(rng).T + rng.uniform(-1, 1, 3)
+    radius, length = radius_of_curvature(points), path_length(points)
+    for other in (moved, moved[::-1]):
+        assert radius_of_curvature(other) == pytest.approx(radius, rel=1e-6)
+        assert path_length(other) == pytest.approx(length, rel=1e-9)
+    assert radius_of_curvature(3 * points) == pytest.approx(3 * radius, rel=1e-6)
+
+
+def test_the_path_length_is_the_way_travelled() -> None:
+    assert path_length(np.array([[0, 0, 0], [0.3, 0.4, 0], [0, 0, 0]])) == pytest.approx(1.0)
+    assert path_length(np.zeros((1, 3))) == path_length(np.zeros((0, 3))) == 0.0
+
+
+def pseudo_radius(points: np.ndarray) -> float:
+    """What METHODS §4.4 says of the peers' public code: a constant times the mean speed."""
+    return 10.0 * path_length(points) / (len(points) - 1)
+
+
+def test_the_pseudo_radius_cannot_tell_arcs_from_lines_and_ours_can() -> None:
+    rng = np.random.default_rng(0)
+    noise = 1e-4  # metres
+    bent, straight = [], []
+    for speed in np.linspace(0.002, 0.01, 100):  # metres per control step, the same for both
+        length, radius = speed * (WINDOW - 1), rng.uniform(0.01, 0.03)
+        bent.append(arc(rng, radius, length) + rng.normal(size=(WINDOW, 3)) * noise)
+        straight.append(line(rng, length) + rng.normal(size=(WINDOW, 3)) * noise)
+
+    def separated(measure: object) -> float:
+        """Share of (arc, line) pairs in the right order: 0.5 is chance, 1 is perfect (the area under the ROC)."""
+        arcs, lines = (np.array([measure(p) for p in paths]) for paths in (bent, straight))  # type: ignore[operator]
+        return float((arcs[:, None] < lines[None]).mean())
+
+    assert separated(pseudo_radius) == pytest.approx(0.5, abs=0.05)
+    assert separated(radius_of_curvature) == 1.0
+    assert max(map(radius_of_curvature, bent)) < min(map(radius_of_curvature, straight))
+
+
+def test_ranges_are_the_minimum_and_the_95th_percentile_of_finite_values() -> None:
+    rng = np.random.default_rng(1)
+    paths = [np.cumsum(rng.normal(size=(40, 3)) * 0.01, 0) for _ in range(5)]
+    paths += [line(rng, 0.2, 60), np.zeros((2, 3))]  # infinite radii, and too short to count
+    ranges = BoundaryRanges.fit(paths, WINDOW)
+    windows = [p[max(0, e - WINDOW) : e] for p in paths for e in range(3, len(p) + 1)]
+    radii = [radius_of_curvature(w) for w in windows]
+    finite = [r for r in radii if r < math.inf]
+    assert len(finite) < len(radii)
+    assert (ranges.radius_low, ranges.radius_high) == (min(finite), pytest.approx(np.percentile(finite, 95)))
+    lengths = [path_length(w) for w in windows]
+    assert (ranges.length_low, ranges.length_high) == (min(lengths), pytest.approx(np.percentile(lengths, 95)))
+
+
+def test_demonstrations_without_a_curved_path_have_no_ranges() -> None:
+    with pytest.raises(CheckpointError, match="no curved path"):
+        BoundaryRanges.fit([line(np.random.default_rng(0), 0.2), np.zeros((9, 3))], WINDOW)
+    with pytest.raises(CheckpointError, match="is no range"):
+        BoundaryRanges(0.1, 0.1, 0.0, 1.0)
+
+
+def test_normalisation_is_linear_and_clipped() -> None:
+    assert RANGES.normalise(0.01, STILL) == (0.0, pytest.approx(STILL / 0.15))
+    assert RANGES.normalise(0.505, 0.075) == (pytest.approx(0.5), pytest.approx(0.5))
+    assert RANGES.normalise(7.0, 9.0) == (1.0, 1.0)
+    assert RANGES.normalise(0.0, 0.15) == (0.0, 1.0)
+    assert RANGES.fused(0.505, 0.15, 0.25) == pytest.approx(0.25 * 0.5 + 0.75)
+
+
+def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still() -> None:
+    assert RANGES.normalise(math.inf, 0.15) == (1.0, 1.0)
+    assert RANGES.normalise(math.inf, 0.0) == (0.0, 0.0)
+    boundary = build_boundary(BoundarySettings("fused"), RANGES)
+    assert boundary is not None
+    still = boundary.choose(np.full((WINDOW, 3), 0.6), np.random.default_rng(0))
+    assert still == Choice("drafter", 0.0)
+
+
+def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter() -> None:
+    rng = np.random.default_rng(3)
+    boundary = build_boundary(BoundarySettings("fused"), RANGES)
+    assert boundary is not None
+    reach, bend = boundary.choose(line(rng, 0.14), rng), boundary.choose(arc(rng, 0.02, 0.05), rng)
+    assert (reach.mode, bend.mode) == ("retrieval", "drafter")
+    assert reach.metric is not None
+    assert bend.metric is not None
+    assert reach.metric > 0.9 > 0.3 > bend.metric
+    exact = build_boundary(BoundarySettings("fused", f_star=reach.metric), RANGES)
+    assert exact is not None
+    assert exact.choose(line(np.random.default_rng(3), 0.14), rng).mode == "retrieval"  # F ≥ F*
+
+
+def test_only_the_newest_positions_count() -> None:
+    rng = np.random.default_rng(4)
+    boundary = build_boundary(BoundarySettings("fused", window=10), RANGES)
+    assert boundary is not None
+    newest = arc(rng, 0.05, 0.1, 10)
+    path = np.concatenate([line(rng, 0.4, 30), newest])
+    assert boundary.choose(path, rng) == boundary.choose(newest, rng)
+    assert boundary.choose(path, rng) != boundary.choose(path[-15:-5], rng)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_fewer_than_three_positions_go_to_the_drafter(n: int) -> None:
+    boundary = build_boundary(BoundarySettings("fused", f_star=0.0), RANGES)
+    assert boundary is not None
+    path = np.arange(3.0 * n).reshape(n, 3)
+    assert boundary.choose(path, np.random.default_rng(0)) == Choice("drafter", None)
+
+
+@pytest.mark.parametrize("mode", ["retrieval", "drafter"])
+def test_the_fixed_kinds_never_change_their_mind(mode: str) -> None:
+    boundary = build_boundary(BoundarySettings(f"always_{mode}"))
+    assert boundary is not None
+    for n in (0, 2, 20):
+        assert boundary.choose(np.zeros((n, 3)), np.random.default_rng(n)).mode == mode
+
+
+def test_random_keeps_its_share_and_repeats_itself() -> None:
+    thirty = BoundarySettings("random", p=0.3, seed=5)
+    boundary = build_boundary(thirty)
+    assert boundary is not None
+
+    def modes(task: str, seed: int) -> list[str]:
+        rng = episode_generator(thirty, task, seed)
+        return [boundary.choose(np.zeros((0, 3)), rng).mode for _ in range(2000)]
+
+    assert modes("reach-v3", 100_000) == modes("reach-v3", 100_000)
+    assert modes("reach-v3", 100_000) != modes("reach-v3", 100_001)
+    assert modes("reach-v3", 100_000) != modes("push-v3", 100_000)
+    assert np.mean([m == "retrieval" for m in modes("reach-v3", 100_000)]) == pytest.approx(0.3, abs=0.05)
+
+
+def test_always_chooses_nothing() -> None:
+    assert build_boundary(BoundarySettings()) is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "says"),
+    [
+        (BoundarySettings("fusd"), UnknownName, "unknown boundary.kind 'fusd': did you mean fused"),
+        (BoundarySettings("fused"), CheckpointError, "needs the demonstrations' ranges"),
+        (BoundarySettings("fused", window=2), UsageError, "boundary.window=2: at least 3"),
+        (BoundarySettings("fused", alpha=1.5), UsageError, "boundary.alpha=1.5: from 0 to 1"),
+        (BoundarySettings("random", p=-0.1), UsageError, "boundary.p=-0.1: from 0 to 1"),
+    ],
+)
+def test_what_cannot_be_built_gets_one_line(wrong: BoundarySettings, error: type[Exception], says: str) -> None:
+    with pytest.raises(error) as caught:
+        build_boundary(wrong)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
