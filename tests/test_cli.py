@@ -58,7 +58,7 @@ def _python_start() -> float:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("rollout", "task=drawer-opne"), "unknown task 'drawer-opne': did you mean drawer-open"),
+        (("rollout", "task=drawer-opne"), "unknown task or suite 'drawer-opne': did you mean drawer-open"),
         (("rollout", "method=spec-vla"), "unknown method 'spec-vla': did you mean spec_vla"),
         (("rollout", "threshold.radius=3"), "unknown key 'threshold.radius'"),
         (("train", "target", "target=smal"), "unknown target 'smal': did you mean small"),
@@ -147,9 +147,9 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
     told = kerv("report", "study=demo", f"results={results}")
     assert told.returncode == 0, told.stderr
     table = pd.read_csv(results / "tables/demo.csv")
-    assert set(table["averaging"]) == {"micro", "macro"}
+    assert set(table["averaging"]) == {"micro over tasks", "macro over difficulty groups"}
     assert {"ar", "spec_vla r=0", "spec_vla r=20"} <= set(table["label"])
-    assert (results / "plots").glob("demo*.png")
+    assert list((results / "plots").glob("demo*.png"))
 
 
 def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:

@@ -7,6 +7,7 @@ environments live in one process.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import subprocess
 import sys
@@ -153,7 +154,7 @@ class Camera:
         model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)
         model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
         try:
-            self._renderer: Any = mujoco.Renderer(model, height=pixels, width=pixels)
+            self._renderer: Any = _open_renderer(model, pixels)
         except Exception as error:  # each backend raises types of its own
             raise RenderingUnavailable(
                 f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
@@ -190,6 +191,18 @@ class Camera:
         renderer, self._renderer = self._renderer, None
         if renderer is not None:
             renderer.close()
+
+
+def _open_renderer(model: mujoco.MjModel, pixels: int) -> Any:
+    import mujoco
+
+    class Renderer(mujoco.Renderer):
+        def __del__(self) -> None:
+            # one that never opened fails again when it is collected, and would print a traceback of its own
+            with contextlib.suppress(AttributeError):
+                super().__del__()
+
+    return Renderer(model, height=pixels, width=pixels)
 
 
 def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
