@@ -1,0 +1,145 @@
+"""How an episode's recording is laid out on the screen: a pure function of what the recording holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import rerun.blueprint as rrb
+
+STEP, TIME = "step", "time"
+"""The timelines: control steps, and simulated time."""
+
+CELL_WIDTH, CELL_HEIGHT = 60.0, 26.0
+"""A token's cell in the picture of the current chunk, in scene units."""
+KEY_ROWS = 4
+"""At least so many rows has the picture's key."""
+
+SIGNALS = {
+    "variability": "K, kinematic variability",
+    "metric": "F, boundary metric",
+    "similarity": "similarity of the best neighbour",
+    "deviation": "deviation from AR",
+}
+"""Optional numbers of a decode (fields of DecodeRecord) and the names of their series."""
+
+
+@dataclass(frozen=True)
+class EpisodeMeta:
+    """What decides the layout."""
+
+    chunk_steps: int  # H
+    dofs: tuple[str, ...]  # names of the D degrees of freedom
+    frames: bool  # camera frames were kept
+    drafted: bool  # some token was not plainly decoded by the target
+    verified: bool  # some draft was verified
+    threshold: bool  # some acceptance rule had a threshold
+    signals: tuple[str, ...]  # keys of SIGNALS that some decode has
+    most: float  # the most forwards or the longest acceptance length of a decode
+    centre: tuple[float, float, float]  # middle of the end effector's path, metres
+    extent: float  # longest side of the path's bounding box, metres
+
+
+def blueprint(meta: EpisodeMeta) -> rrb.Blueprint:
+    """Camera, path and summary left; tokens and series over time in the middle; the current decode right. Paused."""
+    left: list[rrb.View] = [_path(meta), _document("summary", "Episode")]
+    shares = [4.0, 3.6]
+    if meta.frames:
+        left.insert(0, rrb.Spatial2DView(origin="/camera", name="Camera"))
+        shares.insert(0, 4.0)
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(*left, row_shares=shares),
+            _over_time(meta),
+            _current_decode(meta),
+            column_shares=[3, 5, 4],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _path(meta: EpisodeMeta) -> rrb.Spatial3DView:
+    x, y, z = meta.centre
+    away = max(1.2 * meta.extent, 0.2)
+    until_now = [
+        rrb.VisibleTimeRange(
+            timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+        )
+        for timeline in (STEP, TIME)
+    ]
+    return rrb.Spatial3DView(
+        origin="/world",
+        name="End effector: orange closed, blue open gripper",
+        overrides={"/world/trail": rrb.VisibleTimeRanges(until_now)},
+        eye_controls=rrb.EyeControls3D(position=(x + away, y - away, z + 0.8 * away), look_target=(x, y, z)),
+        line_grid=rrb.LineGrid3D(spacing=0.1),
+    )
+
+
+def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
+    """One column of views that share the time axis; the shares are about hundreds of pixels."""
+    lanes = f"Decode mode, and tokens of each chunk; lanes of a step: {', '.join(meta.dofs)}"
+    views: list[rrb.View] = [_states(lanes, "/mode", "/tokens/**") if meta.drafted else _states("Decode mode", "/mode")]
+    shares = [1.1 + (min(meta.chunk_steps, 5) * (0.3 + 0.25 * len(meta.dofs)) if meta.drafted else 0.0)]
+    counts = ("decode/forwards", "decode/acceptance")
+    views.append(_series("Forwards and acceptance per decode", *counts, top=meta.most + 0.5))
+    shares.append(1.6)
+    if meta.threshold:
+        views.append(_series("Acceptance threshold r, bins", "decode/threshold"))
+        shares.append(1.2)
+    for signal in meta.signals:
+        views.append(_series(SIGNALS[signal], f"signals/{signal}", legend=False))
+        shares.append(1.1)
+    if not meta.drafted:
+        views += _always()
+        shares += [1.7, 1.7]
+    return rrb.Vertical(*views, row_shares=shares)
+
+
+def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
+    wide = (len(meta.dofs) + 3.95) * CELL_WIDTH
+    left, above = -0.75 * CELL_WIDTH, -0.8 * CELL_HEIGHT
+    high = (max(meta.chunk_steps, KEY_ROWS) + 0.9) * CELL_HEIGHT
+    chunk = rrb.Spatial2DView(
+        origin="/chunk",
+        name="Current chunk: draft → verdict",
+        background=[13, 16, 17],
+        visual_bounds=rrb.VisualBounds2D(x_range=[left, left + wide], y_range=[above, above + high]),
+    )
+    views: list[rrb.View] = [chunk, _document("decode/table", "Current decode")]
+    shares = [2.3, 5.2]
+    if meta.drafted:
+        views += _always()
+        shares += [1.6, 1.6]
+    return rrb.Vertical(*views, row_shares=shares)
+
+
+def _always() -> list[rrb.View]:
+    """The series that every method has; they stand where there is room."""
+    return [
+        _series("Time by phase per decode, ms", "decode/phases"),
+        _series("Actions and gripper opening", "actions", "gripper"),
+    ]
+
+
+def _states(name: str, *contents: str) -> rrb.StateTimelineView:
+    axis = rrb.TimeAxis(link="LinkToGlobal")
+    return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)
+
+
+def _series(name: str, *entities: str, legend: bool = True, top: float | None = None) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"/{entity}" for entity in entities],
+        name=name,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+    )
+
+
+def _document(origin: str, name: str) -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(origin=f"/{origin}", name=name)
