@@ -59,7 +59,12 @@ class ThresholdSettings:
     """How far a draft may be from the verdict (METHODS §3.2)."""
 
     kind: str = "fixed"  # fixed | kinematic | change | schedule
-    r: int = 0  # bins
+    r: int = 0  # fixed: bins
+    r_min: int = 5  # others: bins, as r_max
+    r_max: int = 15
+    phi: float = 2.0  # exponent of the level (kinematic), the move (change) or the time (schedule)
+    k_s: float | None = None  # reference level K_S of K; None: the task's, from the calibration
+    tau: float = 20.0  # schedule: decodes
 
 
 @dataclass
@@ -236,8 +241,7 @@ class DrafterSettings:
 class TrainDrafterSettings:
     """`kerv train drafter`."""
 
-    target: str = "mt10-vision"
-    name: str | None = None  # default: drafter/ beside the target
+    policy: PolicySettings = field(default_factory=PolicySettings)  # policy.drafter: where the drafter is put
     demos: str = "mt10"
     drafter: DrafterSettings = field(default_factory=DrafterSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
@@ -279,6 +283,28 @@ class BuildDatastoreSettings:
     demos: str = "mt10"
     task: list[str] = field(default_factory=lambda: ["MT10"])
     episodes: int = 0  # per task, the first ones by seed; 0: all
+    key: list[str] = field(default_factory=lambda: ["scene"])  # pooled parts of the prompt; also vision, proprioception
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    results: str = "results"
+
+
+@dataclass
+class CalibrateSettings:
+    """`kerv calibrate`: noise of the kinematic predictors, and the reference level K_S of each task (METHODS §3)."""
+
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    name: str | None = None  # default: beside the target
+    demos: str = "mt10"
+    task: list[str] = field(default_factory=lambda: ["MT10"])
+    episodes: int = 0  # per task, the first ones by seed; 0: all
+    held_out: float = 0.1  # share of episodes that the errors are measured on
+    history: str = "labels"  # what predictions are made from: labels (clean) | executed (perturbed episodes: noisy)
+    window: int = 10  # control steps of history
+    fit_steps: int = 0  # steps ahead whose mean error is fitted; 0: the target's chunk
+    decodes: int = 60  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
+    proposer: ProposerSettings = field(default_factory=ProposerSettings)
+    acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
+    threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     results: str = "results"
 

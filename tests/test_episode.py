@@ -81,6 +81,7 @@ def test_deviation_is_sampled_and_zero_for_ar_itself(policies: Path) -> None:
 def test_what_cannot_run_is_refused_beforehand(policies: Path) -> None:
     with pytest.raises(UsageError, match="trained on 96 pixels"):
         run.check(settings(policies, "policy.target=nano-vision", "world.camera.size=64"))
+    drafter = f"policy.drafter={policies}/artifacts/drafter/nano-state"
+    mixed = settings(policies, "policy.target=nano-vision", "method=spec_vla", drafter)
     with pytest.raises(CheckpointError, match="was trained for target"):
-        drafter = f"policy.drafter={policies}/artifacts/drafter/nano-state"
-        run.check(settings(policies, "policy.target=nano-vision", "method=spec_vla", drafter))
+        run.check(mixed)
