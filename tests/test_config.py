@@ -16,6 +16,7 @@ SCHEMAS = {
     "demos": s.DemosSettings,
     "train_target": s.TrainTargetSettings,
     "train_drafter": s.TrainDrafterSettings,
+    "calibrate": s.CalibrateSettings,
     "build_datastore": s.BuildDatastoreSettings,
     "doctor": s.DoctorSettings,
     "report": s.ReportSettings,

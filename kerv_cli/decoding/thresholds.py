@@ -1,7 +1,10 @@
-"""How far a draft may be from the verdict (METHODS §3.2)."""
+"""How far a draft may be from the verdict (METHODS §3.2). r is a number of bins; a threshold keeps it as a real number
+and rounds it for use."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Protocol
 
 from kerv_cli.errors import UnknownName, UsageError
@@ -36,7 +39,128 @@ class Fixed:
         pass
 
 
+class Kinematic:
+    """r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ) of the last decode that compared anything (KERV, level form).
+
+    An episode begins at K = K_S, the reference level.
+    """
+
+    def __init__(self, r_min: int, r_max: int, phi: float, k_s: float) -> None:
+        self.r_min, self.r_max, self.phi, self.k_s = r_min, r_max, phi, k_s
+        self.reset()
+
+    def reset(self) -> None:
+        self.r = self.level(self.k_s)
+
+    def level(self, variability: float) -> float:
+        """K in normalised action units -> r, not rounded."""
+        return falling(self.r_min, self.r_max, variability / self.k_s, self.phi)
+
+    def radius(self) -> int:
+        return nearest(self.r)
+
+    def update(self, variability: float | None) -> None:
+        if variability is not None:
+            self.r = self.level(variability)
+
+
+class Change:
+    """r shrinks when K grows and grows when it shrinks (ablation):
+
+    r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max), Δ = K_t − K_{t−1} over decodes
+    that compared something. An episode begins where `Kinematic` does, with K_{t−1} = K_S.
+    """
+
+    def __init__(self, r_min: int, r_max: int, phi: float, k_s: float) -> None:
+        self.r_min, self.r_max, self.phi, self.k_s = r_min, r_max, phi, k_s
+        self.reset()
+
+    def reset(self) -> None:
+        self.r = falling(self.r_min, self.r_max, 1.0, self.phi)
+        self.last = self.k_s
+
+    def radius(self) -> int:
+        return nearest(self.r)
+
+    def update(self, variability: float | None) -> None:
+        if variability is None:
+            return
+        change = (variability - self.last) / self.k_s
+        move = (self.r_max - self.r_min) - falling(0, self.r_max - self.r_min, abs(change), self.phi)
+        self.r = min(self.r_max, max(self.r_min, self.r - math.copysign(move, change)))
+        self.last = variability
+
+
+class Schedule:
+    """r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ), t decodes into the episode: open loop.
+
+    KERV's public code has 3 + 12 · exp(−(t / τ)^3): r_min 3, r_max 15, φ 3, as conf/threshold/schedule.yaml.
+    """
+
+    def __init__(self, r_min: int, r_max: int, phi: float, tau: float) -> None:
+        self.r_min, self.r_max, self.phi, self.tau = r_min, r_max, phi, tau
+        self.reset()
+
+    def reset(self) -> None:
+        self.decodes = 0
+
+    def radius(self) -> int:
+        return nearest(falling(self.r_min, self.r_max, self.decodes / self.tau, self.phi))
+
+    def update(self, variability: float | None) -> None:
+        self.decodes += 1
+
+
+def falling(low: float, high: float, x: float, phi: float) -> float:
+    """From `high` at x = 0 down to `low`: low + (high − low) · exp(−x^φ), x ≥ 0."""
+    if x <= 0:
+        return float(high)
+    power = math.exp(min(700.0, phi * math.log(x)))  # x^φ without overflow; exp(−e^700) is zero
+    return low + (high - low) * math.exp(-power)
+
+
+def nearest(r: float) -> int:
+    """To the nearest bin, halves up."""
+    return math.floor(r + 0.5)
+
+
 def build_threshold(settings: ThresholdSettings) -> Threshold:
-    if settings.kind == "fixed":
-        return Fixed(settings.r)
-    raise UnknownName("threshold.kind", settings.kind, ["fixed"])
+    """The threshold of a method.
+
+    Raises:
+        UnknownName: no such kind.
+        UsageError: a number out of range, or no reference level K_S where the kind needs one.
+    """
+    builders: dict[str, Callable[[ThresholdSettings], Threshold]] = {
+        "fixed": lambda s: Fixed(s.r),
+        "kinematic": lambda s: Kinematic(*_range(s), _reference(s)),
+        "change": lambda s: Change(*_range(s), _reference(s)),
+        "schedule": lambda s: Schedule(*_range(s), _positive("tau", s.tau, 1e9)),
+    }
+    if settings.kind not in builders:
+        raise UnknownName("threshold.kind", settings.kind, builders)
+    return builders[settings.kind](settings)
+
+
+def _range(settings: ThresholdSettings) -> tuple[int, int, float]:
+    low, high = settings.r_min, settings.r_max
+    if not 0 <= low <= high < VOCABULARY:
+        raise UsageError(
+            f"threshold.r_min={low} threshold.r_max={high}: bins from 0 to {VOCABULARY - 1}, r_min not above r_max"
+        )
+    return low, high, _positive("phi", settings.phi, 50)
+
+
+def _reference(settings: ThresholdSettings) -> float:
+    if settings.k_s is None:
+        raise UsageError(
+            f"threshold.kind={settings.kind} needs the reference level K_S of the task: run 'kerv calibrate', or set "
+            "threshold.k_s"
+        )
+    return _positive("k_s", settings.k_s, 1e9)
+
+
+def _positive(name: str, value: float, limit: float) -> float:
+    if not 0 < value <= limit:
+        raise UsageError(f"threshold.{name}={value}: above 0, at most {limit:g}")
+    return value

@@ -7,6 +7,7 @@ Actions are normalised to [-1, 1], one control step is the unit of time.
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -95,31 +96,34 @@ def motion_model(order: int, damping: float = 1.0) -> tuple[np.ndarray, np.ndarr
     raise ValueError(f"no motion model of order {order} with damping {damping}")
 
 
-def kalman_weights(
-    q: float, r: float, window: int, horizon: int, order: int = 2, damping: float = 1.0
-) -> np.ndarray:
-    """(horizon, window): row h − 1 times the window, oldest first, is the filter's prediction h steps ahead.
+@functools.lru_cache(maxsize=64)
+def filter_states(ratio: float, window: int, order: int, damping: float) -> tuple[np.ndarray, ...]:
+    """The filter's state after 1, 2, … `window` actions, each (order, m): column i is what action i contributes.
 
-    The filter begins on the window's first action: state [a₀, 0(, 0)], covariance r · I. It then predicts and updates
-    once per further action, and predicts `horizon` times. Here the state is carried as a linear function of the window.
+    ratio: q / r. The filter begins on the first action with state [a₀, 0(, 0)] and covariance r · I; it then predicts
+    and updates once per further action.
     """
     transition, noise = motion_model(order, damping)
-    state = np.zeros((order, window))  # column i: what action i contributes
-    state[0, 0] = 1.0
+    state = np.eye(order, 1)
     covariance = np.eye(order)  # in units of r
+    states = [state]
     for i in range(1, window):
-        state = transition @ state
-        covariance = transition @ covariance @ transition.T + q / r * noise
+        state = transition @ np.pad(state, ((0, 0), (0, 1)))
+        covariance = transition @ covariance @ transition.T + ratio * noise
         gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
         innovation = -state[0]
         innovation[i] += 1.0
         state = state + np.outer(gain, innovation)
         covariance = covariance - np.outer(gain, covariance[0])
-    rows = []
-    for _ in range(horizon):
-        state = transition @ state
-        rows.append(state[0])
-    return np.stack(rows)
+        states.append(state)
+    return tuple(states)
+
+
+def kalman_weights(q: float, r: float, window: int, horizon: int, order: int = 2, damping: float = 1.0) -> np.ndarray:
+    """(horizon, window): row h − 1 times the window, oldest first, is the filter's prediction h steps ahead."""
+    transition, _ = motion_model(order, damping)
+    state = filter_states(q / r, window, order, damping)[-1]
+    return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 
 class Predictor:

@@ -1,0 +1,227 @@
+"""Kinematic prediction: precomputed weights against filterpy step by step, closed forms, the gripper, the history."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import numpy as np
+import pytest
+from filterpy.common import Q_discrete_white_noise
+from filterpy.kalman import KalmanFilter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from kerv_cli.drafting.kinematics import (
+    FILTERS,
+    HORIZON,
+    PREDICTORS,
+    WINDOW,
+    Acceleration,
+    ActionHistory,
+    Hold,
+    Kalman,
+    Linear,
+    Noise,
+    Predictor,
+    build_predictor,
+    kalman_weights,
+)
+from kerv_cli.errors import UnknownName, UsageError
+
+DOFS = 4
+NOISE = {name: Noise.uniform(DOFS, 5.0, 0.5, 0.8 if name == "damped" else 1.0) for name in FILTERS}
+
+
+@functools.cache
+def predictor(kind: str, **shape: int) -> Predictor:
+    return build_predictor(kind, DOFS, NOISE, **shape)
+
+
+def filterpy_prediction(
+    window: np.ndarray, q: float, r: float, steps: int, order: int, damping: float = 1.0
+) -> np.ndarray:
+    """(steps,): the reference, one predict and one update per action."""
+    run = KalmanFilter(dim_x=order, dim_z=1)
+    run.x = np.zeros((order, 1))
+    run.x[0, 0] = window[0]
+    run.P = r * np.eye(order)
+    run.R = np.array([[r]])
+    run.Q = Q_discrete_white_noise(order, dt=1, var=q)
+    run.H = np.eye(1, order)
+    run.F = {2: np.array([[1, damping], [0, damping]]), 3: np.array([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]])}[order]
+    for value in window[1:]:
+        run.predict()
+        run.update(value)
+    ahead = []
+    for _ in range(steps):
+        run.predict()
+        ahead.append(run.x[0, 0])
+    return np.array(ahead)
+
+
+windows = st.integers(2, WINDOW).flatmap(lambda n: arrays(np.float64, n, elements=st.floats(-1, 1)))
+log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
+
+
+@settings(deadline=None)  # the machine is shared
+@given(windows, log_scale, log_scale, st.integers(1, HORIZON), st.sampled_from([(2, 1.0), (2, 0.7), (3, 1.0)]))
+def test_the_weights_are_filterpys_filter(
+    window: np.ndarray, q: float, r: float, steps: int, model: tuple[int, float]
+) -> None:
+    weights = kalman_weights(q, r, len(window), steps, *model)
+    assert weights.shape == (steps, len(window))
+    expected = filterpy_prediction(window, q, r, steps, *model)
+    np.testing.assert_allclose(weights @ window, expected, rtol=1e-6, atol=1e-6)
+
+
+@settings(deadline=None)  # the machine is shared
+@given(arrays(np.float64, st.tuples(st.integers(3, 14), st.just(DOFS)), elements=st.floats(-1, 1)))
+def test_predict_is_filterpys_filter_on_the_newest_actions_clipped(history: np.ndarray) -> None:
+    for kind, order in (("kalman", 2), ("damped", 2), ("acceleration", 3)):
+        noise = NOISE[kind]
+        ahead = predictor(kind, minimum=3).predict(history, 4)
+        assert ahead is not None
+        for dof in range(DOFS - 1):
+            window = history[-WINDOW:, dof]
+            expected = filterpy_prediction(window, noise.q[dof], noise.r[dof], 4, order, noise.damping[dof])
+            np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), atol=1e-9)
+
+
+@settings(deadline=None)  # the machine is shared
+@given(st.sampled_from(PREDICTORS), st.floats(-1, 1), st.integers(4, WINDOW))
+def test_a_constant_is_held(kind: str, value: float, length: int) -> None:
+    ahead = predictor(kind).predict(np.full((length, DOFS), value), HORIZON)
+    np.testing.assert_allclose(ahead, value, atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_a_line_is_extrapolated_the_better_the_longer_the_window(order: int) -> None:
+    ahead = np.arange(1, 5)
+    errors = []
+    for length in (4, 8, 16, 32, 64):
+        line = 0.3 - 0.02 * np.arange(length)
+        truth = line[-1] - 0.02 * ahead
+        errors.append(np.abs(kalman_weights(1.0, 1.0, length, 4, order) @ line - truth).max())
+    assert all(later < 0.5 * earlier for earlier, later in itertools.pairwise(errors[:4]))
+    assert errors[-1] < 1e-9
+
+
+def test_a_parabola_needs_the_acceleration() -> None:
+    time = np.arange(68)
+    curve = 1e-4 * (time - 30.0) ** 2
+    velocity, acceleration = (kalman_weights(1.0, 1.0, 64, 4, order) @ curve[:64] for order in (2, 3))
+    assert np.abs(acceleration - curve[64:]).max() < 1e-9 < 1e-5 < np.abs(velocity - curve[64:]).max()
+
+
+@pytest.mark.parametrize("ratio", [0.01, 1.0, 30.0])
+def test_the_steady_state_is_the_alpha_beta_filter(ratio: float) -> None:
+    """Kalata's closed form of the gains for the tracking index sqrt(q / r)."""
+    index = math.sqrt(ratio)
+    root = (4 + index - math.sqrt(8 * index + index**2)) / 4
+    alpha = 1 - root**2
+    beta = 2 * (2 - alpha) - 4 * math.sqrt(1 - alpha)
+    newest = kalman_weights(ratio, 1.0, 200, 3)[:, -1]
+    np.testing.assert_allclose(newest, [alpha + h * beta for h in (1, 2, 3)], rtol=1e-6)
+
+
+def test_without_process_noise_it_is_the_line_of_a_ridge_regression() -> None:
+    """q = 0: least squares of a line; the first action is its prior, and one row pulls the slope to zero."""
+    window = np.random.default_rng(0).uniform(-1, 1, 10)
+    time = np.arange(10)
+    rows = np.vstack([np.c_[np.ones(10), time], [0.0, 1.0]])
+    (start, slope), *_ = np.linalg.lstsq(rows, np.append(window, 0.0), rcond=None)
+    np.testing.assert_allclose(kalman_weights(0.0, 1.0, 10, 2) @ window, start + slope * np.array([10, 11]), atol=1e-9)
+
+
+def test_only_the_ratio_of_the_noises_counts() -> None:
+    np.testing.assert_allclose(kalman_weights(3.0, 1.0, 10, 4), kalman_weights(0.06, 0.02, 10, 4), rtol=1e-9)
+
+
+def test_hold_and_linear() -> None:
+    history = np.array([[0.9, 0.0, 0.1, 1.0], [0.2, 0.0, 0.2, 1.0], [0.3, 0.5, 0.1, -1.0]])
+    held = Hold(DOFS, minimum=1).predict(history, 2)
+    np.testing.assert_allclose(held, [history[-1]] * 2)
+    line = Linear(DOFS, minimum=2).predict(history, 3)
+    np.testing.assert_allclose(
+        line, [[0.4, 1.0, 0.0, -1.0], [0.5, 1.0, -0.1, -1.0], [0.6, 1.0, -0.2, -1.0]], atol=1e-12
+    )
+
+
+@settings(deadline=None)  # the machine is shared
+@given(
+    st.sampled_from(PREDICTORS),
+    arrays(np.float64, (7, DOFS), elements=st.floats(-1, 1)),
+    st.integers(0, DOFS - 1),
+    st.integers(0, HORIZON),
+)
+def test_predictions_are_bounded_and_the_gripper_is_held(
+    kind: str, history: np.ndarray, gripper: int, steps: int
+) -> None:
+    ahead = predictor(kind, gripper=gripper).predict(history, steps)
+    assert ahead is not None
+    assert ahead.shape == (steps, DOFS)
+    assert (np.abs(ahead) <= 1).all()
+    assert (ahead[:, gripper] == history[-1, gripper]).all()
+
+
+@pytest.mark.parametrize("kind", PREDICTORS)
+def test_a_short_history_gives_no_prediction(kind: str) -> None:
+    built = predictor(kind, minimum=5)
+    assert built.predict(np.zeros((4, DOFS)), 1) is None
+    assert built.predict(np.zeros((0, DOFS)), 1) is None
+    assert built.predict(np.zeros((5, DOFS)), 1) is not None
+
+
+def test_the_history_keeps_the_newest_and_forgets_at_reset() -> None:
+    history = ActionHistory(DOFS, window=3)
+    assert history.values().shape == (0, DOFS)
+    for i in range(5):
+        history.append(np.full(DOFS, i / 10))
+    assert len(history) == 3
+    np.testing.assert_allclose(history.values()[:, 0], [0.2, 0.3, 0.4])
+    history.reset()
+    assert len(history) == 0
+    assert history.values().shape == (0, DOFS)
+
+
+def test_known_steps_of_the_chunk_take_the_newest_places() -> None:
+    history = ActionHistory(DOFS, window=3)
+    for i in range(3):
+        history.append(np.full(DOFS, i / 10))
+    extended = history.values(np.full((2, DOFS), 0.9))
+    np.testing.assert_allclose(extended[:, 0], [0.2, 0.9, 0.9])
+    np.testing.assert_allclose(history.values()[:, 0], [0.0, 0.1, 0.2])
+    history.reset()
+    np.testing.assert_allclose(history.values(np.full((1, DOFS), 0.9)), np.full((1, DOFS), 0.9))
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.zeros((1, 4)), np.array([0, 0, 0, np.nan])])
+def test_a_damaged_action_is_refused(action: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="4 finite numbers"):
+        ActionHistory(DOFS).append(action)
+
+
+@pytest.mark.parametrize(
+    ("q", "r", "damping"), [(-1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (math.nan, 1.0, 1.0), (1.0, 1.0, 1.1)]
+)
+def test_impossible_noise_is_refused(q: float, r: float, damping: float) -> None:
+    with pytest.raises(UsageError, match="kinematics"):
+        Noise.uniform(DOFS, q, r, damping)
+
+
+def test_wrong_requests() -> None:
+    with pytest.raises(UsageError, match="one number per DoF"):
+        Noise((1.0,), (1.0, 1.0), (1.0,))
+    with pytest.raises(UnknownName, match="did you mean kalman"):
+        predictor("kalmann")
+    with pytest.raises(UsageError, match="kerv calibrate"):
+        build_predictor("kalman", DOFS, {})
+    with pytest.raises(UsageError, match="minimum history"):
+        Acceleration(NOISE["acceleration"], minimum=2)
+    with pytest.raises(UsageError, match="minimum history"):
+        Hold(DOFS, minimum=WINDOW + 1)
+    with pytest.raises(ValueError, match="9 steps of 4"):
+        Kalman(NOISE["kalman"]).predict(np.zeros((5, DOFS)), HORIZON + 1)
