@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import io
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import RrdReader
-from rerun_synthetic import DOFS, episode
+from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, verify
 
-from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
 from kerv_cli.errors import KervError, StorageError, UsageError
 from kerv_cli.rollouts import rerun_log, viewer
-from kerv_cli.rollouts.rerun_log import save_episode
-from kerv_cli.rollouts.viewer import find_recordings, open_recording, read_back, read_summary
+from kerv_cli.rollouts.rerun_log import readable, save_episode
+from kerv_cli.rollouts.token_fates import chunk_size, fates_of
+from kerv_cli.rollouts.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
 
 
 def saved(record: EpisodeRecord, folder: Path, method: str = "spec_vla") -> Path:
@@ -32,6 +39,32 @@ def column(path: Path, entity: str, ending: str) -> list[Any]:
         name = next(f.name for f in batch.schema if f.name.endswith(ending))
         values += batch[name].to_pylist()
     return values
+
+
+def starts(path: Path, entity: str) -> list[int]:
+    return [step for batch in batches(path, entity) for step in batch["step"].to_pylist()]
+
+
+def timelines(path: Path) -> set[str]:
+    return {name for chunk in RrdReader(path).stream() for name in chunk.timeline_names}
+
+
+def named(path: Path, entity: str) -> list[str]:
+    """Names of an entity's series."""
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and "SeriesLines:names" in batch.schema.names:
+            return list(batch["SeriesLines:names"].to_pylist()[0])
+    return []
+
+
+def strings(value: Any) -> Iterator[str]:
+    """Every text inside nested lists and dicts."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from strings(inner)
 
 
 @pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
@@ -74,12 +107,8 @@ def test_values_survive_to_the_last_digit(tmp_path: Path) -> None:
 
 def test_series_have_names(tmp_path: Path) -> None:
     path = saved(episode("ar"), tmp_path)
-    names: list[str] = []
-    for chunk in RrdReader(path).stream():
-        if chunk.entity_path == "/actions" and chunk.is_static:
-            batch = chunk.to_record_batch()
-            names += batch[next(f.name for f in batch.schema if f.name.endswith("names"))].to_pylist()[0]
-    assert names == ["dx", "dy", "dz", "gripper"]
+    assert named(path, "/actions") == ["dx", "dy", "dz", "gripper"]
+    assert named(path, "/decode/phases") == ["total", *PHASES]
 
 
 def test_without_frames_there_is_no_camera_and_one_step_is_enough(tmp_path: Path) -> None:
@@ -126,3 +155,246 @@ def test_finding_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "--serve-web --bind 127.0.0.1" in told
     assert path.name in told
     assert "drawer-open-v3" in read_summary(path)
+
+
+def test_every_place_of_a_chunk_has_its_fate() -> None:
+    verdicts = (60, 70, 80, 90, 100, 110, 120)
+    rounds = (prefill(50), verify(1, (60, 73, 99), verdicts[:3], 2), verify(4, (90, 101), verdicts[3:6], 2))
+    decode = decode_of((50, 60, 73, 80, 90, 101, 110, 128), rounds, 2, compensated=1)
+    fates = fates_of(decode, 12, DOFS)
+    names = ["target", "accepted", "relaxed", "rejected", "accepted", "relaxed", "bonus", "compensated"]
+    assert [f.fate for f in fates] == [*names, *["dropped"] * 4]
+    assert [f.short for f in fates[:4]] == ["50", "60", "73 → 70", "99 → 80"]
+    assert fates[3].token == 80
+    assert [f.round for f in fates[:8]] == [0, 1, 1, 1, 2, 2, 2, None]
+    assert [f.limit for f in fates[1:6]] == [9, 9, 0, 9, 9]
+
+
+def test_a_rejection_stays_visible_whoever_fills_the_place() -> None:
+    refused = Round("verify", "drafter", 1, (60, 99), (60, 70), 1, 1, 20, (9,))
+    filled = decode_of((50, 60, 128, 128), (prefill(50), refused), 1, compensated=2)
+    assert [f.fate for f in fates_of(filled, 8, DOFS)[:4]] == ["target", "accepted", "rejected", "compensated"]
+    retried = decode_of((50, 60, 71, 80), (prefill(50), refused, verify(2, (71,), (70, 80), 1)), 1)
+    assert [f.fate for f in fates_of(retried, 4, DOFS)] == ["target", "accepted", "rejected", "bonus"]
+    # two steps were verified, one was executed: the second is dropped, but the place of the rejection is kept
+    cut = decode_of((50, 60, 70, 80, 90), (prefill(50), verify(1, (60, 70, 80, 90, 9), (60, 70, 80, 90, 99), 4)), 1)
+    assert [f.fate for f in fates_of(cut, 8, DOFS)[4:]] == ["dropped", "rejected", "dropped", "dropped"]
+
+
+def test_decodes_without_rounds_are_told_apart() -> None:
+    held = decode_of((), (), 1, forwards=0, mode="hold")
+    assert {f.fate for f in fates_of(held, DOFS, DOFS)} == {"skipped"}
+    skipped = skipped_decode(np.random.default_rng(0))
+    assert {f.fate for f in fates_of(skipped, 16, DOFS)} == {"skipped"}
+
+
+@pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
+def test_drawn_tokens_add_up_with_the_records(kind: str) -> None:
+    for decode in episode(kind).decodes:
+        fates = [f.fate for f in fates_of(decode, chunk_size([decode], DOFS), DOFS)]
+        rounds = [r for r in decode.rounds if r.tree_size and r.mode != "skip"]
+        assert fates.count("accepted") + fates.count("relaxed") == sum(r.accepted for r in rounds)
+        assert fates.count("rejected") == sum(r.accepted < len(r.drafted) for r in rounds)
+        assert fates.count("compensated") == decode.compensated
+        first = fates.index("rejected") if "rejected" in fates else None
+        assert first is None or decode.first_rejected in (first, len(decode.tokens))
+
+
+def test_token_lanes_and_modes(tmp_path: Path) -> None:
+    record = episode("mixed")
+    path = saved(record, tmp_path)
+    lanes = [column(path, f"/tokens/step_{i}", "state") for i in range(4)]
+    for i, decode in enumerate(record.decodes):
+        drawn = [fate for lane in lanes for fate in lane[i]]
+        assert drawn == [f.fate for f in fates_of(decode, 16, DOFS)]
+    changes = dict(zip(starts(path, "/mode"), (row[0] for row in column(path, "/mode", "state")), strict=True))
+    shown = None
+    for decode, step in zip(record.decodes, record.decode_steps, strict=True):
+        shown = changes.get(step, shown)
+        assert shown == decode.mode
+
+
+def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:
+    record = episode("mixed")
+    path = saved(record, tmp_path)
+    for signal in ("variability", "metric", "similarity"):
+        there = [(s, getattr(d, signal)) for d, s in zip(record.decodes, record.decode_steps, strict=True)]
+        there = [(step, value) for step, value in there if value is not None]
+        assert starts(path, f"/signals/{signal}") == [step for step, _ in there]
+        assert [row[0] for row in column(path, f"/signals/{signal}", "scalars")] == [value for _, value in there]
+    assert "/signals/deviation" not in read_back(path)["entities"]
+    assert named(path, "/decode/threshold") == ["r dx dy dz", "r gripper"]
+    assert column(path, "/decode/threshold", "scalars")[0] == [9.0, 0.0]
+
+
+def test_one_threshold_is_one_series(tmp_path: Path) -> None:
+    record = episode("drafter", horizon=4)
+    rounds = tuple(replace(r, threshold=(9,) * DOFS if r.drafted else ()) for r in record.decodes[0].rounds)
+    record = replace(record, decodes=(replace(record.decodes[0], rounds=rounds), *record.decodes[1:]))
+    only = replace(record, decodes=record.decodes[:1], decode_steps=record.decode_steps[:1])
+    path = saved(only, tmp_path)
+    assert named(path, "/decode/threshold") == ["r"]
+    assert named(path, "/decode/acceptance") == ["AL, tokens per verification", "drafts accepted per verification"]
+    assert column(path, "/decode/threshold", "scalars") == [[9.0]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "frames", "present", "absent"),
+    [
+        ("ar", 0, {"Decode mode"}, {"Camera", "Acceptance threshold r, bins"}),
+        ("drafter", 16, {"Camera", "Acceptance threshold r, bins", "K, kinematic variability"}, {"Decode mode"}),
+        ("mixed", 0, {"similarity of the best neighbour", "F, boundary metric"}, {"deviation from AR"}),
+    ],
+)
+def test_the_layout_shows_what_there_is(
+    kind: str, frames: int, present: set[str], absent: set[str], tmp_path: Path
+) -> None:
+    path = saved(episode(kind, frames=frames), tmp_path)
+    reader = RrdReader(path)
+    (layout,) = reader.blueprints()
+    assert layout.application_id == reader.recordings()[0].application_id == "kerv_spec_vla"
+    views: set[str] = set()
+    states: list[Any] = []
+    for chunk in reader.stream(store=layout):
+        batch = chunk.to_record_batch()
+        for field in batch.schema:
+            if field.name == "ViewBlueprint:display_name":
+                views |= {row[0] for row in batch[field.name].to_pylist()}
+            elif field.name.endswith("play_state"):
+                states += batch[field.name].to_pylist()
+    assert {"Current decode", "Episode"} | present <= views
+    assert not absent & views
+    assert states == [[1]]  # paused
+
+
+def test_an_older_file_stays_when_a_new_one_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(episode("ar"), tmp_path)
+    before = path.read_bytes()
+    monkeypatch.setattr(rerun_log, "summary", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        saved(episode("drafter"), tmp_path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_mistake_in_a_column_raises_instead_of_vanishing(tmp_path: Path) -> None:
+    record = episode("ar")
+    with pytest.raises(ValueError, match="same length"):
+        saved(replace(record, actions=record.actions[:-1]), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_texts_hold_only_what_the_viewers_font_has(tmp_path: Path) -> None:
+    record = replace(episode("mixed", horizon=12), instruction="open the 🟩 抽屉\ndrawer")
+    path = saved(record, tmp_path, method="spéc 🚀")
+    reader = RrdReader(path)
+    assert reader.recordings()[0].application_id == "kerv_sp_c_"
+    texts = [t for c in reader.stream() for t in strings(c.to_record_batch().to_pydict())]
+    assert any("open the ? ???drawer" in t for t in texts)
+    assert all(line == readable(line) for t in texts for line in t.splitlines())
+
+
+def test_frames_are_the_episodes_at_their_steps(tmp_path: Path) -> None:
+    record = episode("ar", horizon=8, frames=32)
+    record = replace(record, frames={step: record.frames[step] for step in (6, 0, 3)})
+    path = saved(record, tmp_path)
+    assert starts(path, "/camera") == [0, 3, 6]
+    for step, row in zip((0, 3, 6), column(path, "/camera", "blob"), strict=True):
+        drawn = np.asarray(Image.open(io.BytesIO(bytes(row[0]))), dtype=np.int64)
+        assert drawn.shape == (32, 32, 3)
+        assert np.abs(drawn - record.frames[step]).mean() < 8
+
+
+def test_time_is_simulated_time(tmp_path: Path) -> None:
+    path = save_episode(episode("ar", horizon=5), tmp_path / "e.rrd", method="ar", tokens_per_step=DOFS, fps=20.0)
+    seconds = [t.total_seconds() for batch in batches(path, "/actions") for t in batch["time"].to_pylist()]
+    assert seconds == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2])
+    assert timelines(path) == {"step", "time"}
+
+
+def test_an_episode_of_the_longest_horizon_is_quick_and_small(tmp_path: Path) -> None:
+    path = saved(episode("mixed", horizon=500, frames=96), tmp_path)
+    assert path.stat().st_size < 2_000_000
+
+
+@pytest.mark.parametrize("rubbish", [b"", b"not a recording at all, but long enough for a header"])
+def test_rubbish_gets_one_line(rubbish: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "x.rrd"
+    path.write_bytes(rubbish)
+    with pytest.raises(KervError, match=r"x\.rrd is damaged") as caught:
+        open_recording([path])
+    assert "\n" not in str(caught.value)
+
+
+def test_bytes_turned_over_inside_are_noticed_by_reading(tmp_path: Path) -> None:
+    path = saved(episode("mixed", frames=32), tmp_path)
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 2000] = bytes(255 - b for b in content[middle : middle + 2000])
+    path.write_bytes(content)
+    with pytest.raises(KervError, match="damaged"):
+        read_back(path)
+
+
+def test_places_that_are_no_recordings(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="does not exist"):
+        find_recordings([tmp_path / "nowhere.rrd"])
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(UsageError, match="is not a recording"):
+        find_recordings([tmp_path / "notes.txt"])
+    with pytest.raises(KervError, match="is missing"):
+        read_back(tmp_path / "gone.rrd")
+
+
+def test_the_newest_recordings_come_first_and_not_all_are_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = saved(episode("ar", horizon=4), tmp_path)
+    for i in range(MOST_OPENED + 3):
+        copy = tmp_path / f"copy{i:02d}.rrd"
+        copy.write_bytes(first.read_bytes())
+        os.utime(copy, (1_000_000 + i, 1_000_000 + i))
+    found = find_recordings([tmp_path, first])
+    assert found[0] == first
+    assert found[1].name == f"copy{MOST_OPENED + 2:02d}.rrd"
+    assert len(found) == MOST_OPENED + 4
+    monkeypatch.setattr(viewer, "has_display", lambda: False)
+    assert f"the newest {MOST_OPENED} of {MOST_OPENED + 4}" in open_recording(found)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
+def test_the_viewer_is_started_and_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(episode("ar", horizon=4), tmp_path)
+    asked = tmp_path / "asked"
+    viewer_stand_in(tmp_path, monkeypatch, f'echo "$@" > {asked}; sleep 0.6')
+    monkeypatch.setattr(viewer, "_START_SECONDS", 0.3)
+    assert open_recording([path]) == "opened episode.rrd in the Rerun viewer"
+    assert asked.read_text().split() == ["--bind", "127.0.0.1", str(path)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the stand-in is a shell script")
+def test_a_viewer_that_cannot_start_gets_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(episode("ar", horizon=4), tmp_path)
+    viewer_stand_in(tmp_path, monkeypatch, "echo starting; echo 'no graphics here' >&2; exit 3")
+    with pytest.raises(KervError, match=r"^the Rerun viewer ended at once: no graphics here$"):
+        open_recording([path])
+    monkeypatch.setattr(viewer, "viewer_command", lambda: [str(tmp_path / "absent")])
+    with pytest.raises(KervError, match="cannot start the Rerun viewer"):
+        open_recording([path])
+
+
+def viewer_stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    program = folder / "rerun"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(viewer, "viewer_command", lambda: [str(program)])
+    monkeypatch.setattr(viewer, "has_display", lambda: True)
+
+
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="these always have a display")
+def test_a_display_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert not viewer.has_display()
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    assert viewer.has_display()

@@ -110,7 +110,7 @@ def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
         visual_bounds=rrb.VisualBounds2D(x_range=[left, left + wide], y_range=[above, above + high]),
     )
     views: list[rrb.View] = [chunk, _document("decode/table", "Current decode")]
-    shares = [2.3, 5.2]
+    shares = [0.9 + 0.35 * max(meta.chunk_steps, KEY_ROWS), 5.2]
     if meta.drafted:
         views += _always()
         shares += [1.6, 1.6]
