@@ -71,7 +71,12 @@ class ThresholdSettings:
 class RectifierSettings:
     """What happens after a rejection (METHODS §3.1)."""
 
-    kind: str = "reinfer"
+    kind: str = "reinfer"  # reinfer | compensate
+    predictor: str = "hold"  # compensate: hold | linear | kalman | …
+    steps: int = 1  # PL: control steps that a prediction may fill
+    use_verdict: bool = True  # the verdict at the rejected position is kept (ours); false: predicted too (KERV)
+    min_verified: int = 1  # DoFs of a step that must be known for it to be filled
+    rest: int = 0  # decodes without compensation after one (KERV: 4)
 
 
 @dataclass
@@ -87,6 +92,14 @@ class BoundarySettings:
 
 
 @dataclass
+class OpeningSettings:
+    """What is drafted before the prefill and verified inside it (METHODS §5, ours)."""
+
+    kind: str = "none"  # none | hold | tail | …
+    nodes: int = 0  # tree nodes at most
+
+
+@dataclass
 class MethodSettings:
     """A method is a composition of parts, never a class of its own."""
 
@@ -96,6 +109,7 @@ class MethodSettings:
     threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
     rectifier: RectifierSettings = field(default_factory=RectifierSettings)
     boundary: BoundarySettings = field(default_factory=BoundarySettings)
+    opening: OpeningSettings = field(default_factory=OpeningSettings)
 
 
 @dataclass
@@ -115,6 +129,7 @@ class RolloutSettings:
     seed: int = EVALUATION_SEED  # first seed; episode i uses seed + i in every setting: that is the pairing
     policy: PolicySettings = field(default_factory=PolicySettings)
     method: str = "ar"  # name of the composition; its parts follow
+    opening: OpeningSettings = field(default_factory=OpeningSettings)
     proposer: ProposerSettings = field(default_factory=ProposerSettings)
     acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
     threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
@@ -130,7 +145,7 @@ class RolloutSettings:
     def parts(self) -> MethodSettings:
         """The method's parts alone: what a decoder is built from."""
         return MethodSettings(
-            self.method, self.proposer, self.acceptance, self.threshold, self.rectifier, self.boundary
+            self.method, self.proposer, self.acceptance, self.threshold, self.rectifier, self.boundary, self.opening
         )
 
 

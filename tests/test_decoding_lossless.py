@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.decoding.decoder import Chunk, Decoder
+from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer
 from kerv_cli.drafting.drafter import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
@@ -16,6 +17,7 @@ from kerv_cli.settings import (
     AcceptanceSettings,
     DrafterSettings,
     MethodSettings,
+    OpeningSettings,
     ProposerSettings,
     TargetSettings,
     ThresholdSettings,
@@ -59,6 +61,7 @@ class RandomTrees:
     """Proposes random trees, seeded, with the true continuation hidden in some of them so that drafts are accepted."""
 
     name = "random"
+    needs_states = False
 
     def __init__(self, truth: list[int], seed: int, nodes: int) -> None:
         self.truth, self.nodes = truth, nodes
@@ -88,7 +91,7 @@ class RandomTrees:
 
 def decode(target: Target, proposer: object, prompt: torch.Tensor, nodes: int) -> Chunk:
     method = MethodSettings("test", ProposerSettings(nodes=nodes), STRICT, ThresholdSettings(r=0))
-    return Decoder(target, method, proposer).decode_prompt(prompt)  # type: ignore[arg-type]
+    return Decoder(target, method, Parts(proposer=proposer)).decode_prompt(prompt)  # type: ignore[arg-type]
 
 
 def assert_adds_up(chunk: Chunk) -> None:
@@ -162,3 +165,47 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None
     result = decode(target, Perfect(truth, 0, 5), prompt, 5)
     assert result.tokens == truth
     assert [r.committed for r in result.rounds] == [1, 6, 6, 3]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    heads=st.integers(1, 3),
+    chunk=st.sampled_from([1, 4, 8]),
+    nodes=st.integers(0, 30),
+    drafting=st.booleans(),
+)
+def test_drafts_verified_inside_the_prefill_are_lossless(
+    seed: int, heads: int, chunk: int, nodes: int, drafting: bool
+) -> None:
+    """METHODS §5: an opening of random trees, then plain decoding or the drafter, still yields AR's tokens."""
+    target = random_target(seed, 2, heads, chunk)
+    prompt = random_prompt(target, seed)
+    truth = plain_greedy(target, prompt)
+    proposer = None
+    if drafting:
+        drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+        proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
+    method = MethodSettings(
+        "test", ProposerSettings(nodes=6), STRICT, ThresholdSettings(), opening=OpeningSettings("random", nodes)
+    )
+    parts = Parts(opening=RandomTrees(truth, seed, nodes), proposer=proposer)
+    result = Decoder(target, method, parts).decode_prompt(prompt)
+    assert result.tokens == truth
+    assert_adds_up(result)
+
+
+def test_a_perfect_opening_takes_one_forward() -> None:
+    target = random_target(5, 2, 2, 4)
+    prompt = random_prompt(target, 5)
+    truth = plain_greedy(target, prompt)
+
+    class Whole(RandomTrees):
+        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+            return TokenTree.chain(self.truth[:depth])
+
+    method = MethodSettings("test", acceptance=STRICT, opening=OpeningSettings("whole", 16))
+    result = Decoder(target, method, Parts(opening=Whole(truth, 0, 16))).decode_prompt(prompt)
+    assert result.tokens == truth
+    assert result.forwards == 1
+    assert [r.committed for r in result.rounds] == [16]

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.decoding.acceptance import accept_by_distance, accept_by_group, acceptance_rule, limits_of
-from kerv_cli.decoding.decoder import Chunk, Decoder
+from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import AcceptanceSettings, MethodSettings, ProposerSettings, TargetSettings
@@ -158,6 +159,7 @@ class Shifted:
     """Drafts AR's own chunk, shifted by a few bins, so that whole groups are accepted and rejected."""
 
     name = "shifted"
+    needs_states = False
 
     def __init__(self, truth: list[int], seed: int) -> None:
         self.truth, self.rng = truth, np.random.default_rng(seed)
@@ -182,7 +184,7 @@ def test_in_the_loop_paths_end_with_groups_and_a_begun_group_has_one_verdict() -
         prompt = torch.randn(1, target.prompt_length, 32, generator=torch.Generator().manual_seed(seed))
         truth = Decoder(target, MethodSettings()).decode_prompt(prompt).tokens
         loose = MethodSettings("x", ProposerSettings("shifted", nodes=16), AcceptanceSettings("sequence"))
-        chunk = Decoder(target, loose, Shifted(truth, seed)).decode_prompt(prompt)
+        chunk = Decoder(target, loose, Parts(proposer=Shifted(truth, seed))).decode_prompt(prompt)
         assert len(chunk.tokens) == 16
         for r in chunk.rounds:
             if r.mode == "verify":

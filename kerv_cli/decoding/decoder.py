@@ -2,83 +2,39 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from kerv_cli.decoding.acceptance import Rule, acceptance_rule, limits_of
-from kerv_cli.decoding.record import PHASES, DecodeRecord, Round
+from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Situation
+from kerv_cli.decoding.record import DecodeRecord, Round
+from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.decoding.thresholds import Threshold, build_threshold
-from kerv_cli.drafting.tree import TokenTree, verify_mask
-from kerv_cli.errors import UnknownName
+from kerv_cli.drafting.kinematics import ActionHistory
+from kerv_cli.drafting.tree import TokenTree, prefill_mask, verify_mask
+from kerv_cli.errors import UsageError
 from kerv_cli.settings import MethodSettings
 from kerv_cli.vla.action_tokens import GRIPPER, values_of
 from kerv_cli.vla.target import Target
-from kerv_cli.vla.trunk import Cache
+
+EMPTY = TokenTree((), (), ())
 
 
-class Clock:
-    """Seconds by phase between two synchronised ends."""
+@dataclass(frozen=True)
+class Parts:
+    """What a method is made of besides its rules.
 
-    def __init__(self, device: torch.device) -> None:
-        self.cuda = device.type == "cuda"
-        self.phases = dict.fromkeys(PHASES, 0.0)
-        self.began = self.last = self._now()
+    opening: drafts before the prefill, which then verifies them (METHODS §5). proposer: drafts behind committed
+    tokens. compensation: ends a chunk after a rejection; without it the target decodes on.
+    """
 
-    def _now(self) -> float:
-        if self.cuda:
-            torch.cuda.synchronize()
-        return time.perf_counter()
-
-    def lap(self, phase: str) -> None:
-        """Everything since the last lap belongs to `phase`."""
-        now = self._now()
-        self.phases[phase] += now - self.last
-        self.last = now
-
-    def stop(self) -> float:
-        self.lap("other")
-        return self.last - self.began
-
-
-@dataclass
-class Chunk:
-    """The chunk being decoded. The cache holds the prompt and every committed token but the last."""
-
-    prompt: Tensor  # (1, P, E)
-    prompt_hidden: Tensor  # (1, P, E)
-    size: int  # N
-    cache: Cache
-    tokens: list[int] = field(default_factory=list)  # committed
-    rounds: list[Round] = field(default_factory=list)
-    forwards: int = 0
-    biases: list[int] = field(default_factory=list)  # (draft − verdict) of compared positions, as bins
-    variability: float = 0.0
-
-    @property
-    def left(self) -> int:
-        return self.size - len(self.tokens)
-
-
-class Proposer(Protocol):
-    """Drafts a tree behind the committed tokens. `name` goes into the record."""
-
-    name: str
-
-    def begin(self, chunk: Chunk) -> None:
-        """The prompt is encoded and token 0 is committed."""
-
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        """A tree of depth ≤ `depth`; an empty one means that nothing is drafted this round."""
-
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
-        """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
-        target's states at chunk indices first … first + T − 1."""
+    opening: Proposer | None = None
+    proposer: Proposer | None = None
+    compensation: Compensation | None = None
 
 
 class Decoder:
@@ -87,16 +43,15 @@ class Decoder:
     decode() times itself: from the observation handed in to the actions handed back, synchronised at both ends.
     """
 
-    def __init__(self, target: Target, method: MethodSettings, proposer: Proposer | None = None) -> None:
-        self.target, self.method, self.proposer = target, method, proposer
-        if method.rectifier.kind != "reinfer":
-            raise UnknownName("rectifier.kind", method.rectifier.kind, ["reinfer"])
-        if method.boundary.kind != "always":
-            raise UnknownName("boundary.kind", method.boundary.kind, ["always"])
+    def __init__(self, target: Target, method: MethodSettings, parts: Parts | None = None) -> None:
+        self.target, self.method, self.parts = target, method, parts or Parts()
+        if self.parts.opening is not None and self.parts.opening.needs_states:
+            raise UsageError(f"opening '{self.parts.opening.name}' needs the target's states, which come after it")
         self.rule: Rule = acceptance_rule(method.acceptance)
         self.threshold: Threshold = build_threshold(method.threshold)
-        capacity = target.prompt_length + target.tokens_per_chunk + method.proposer.nodes + 1
-        self.cache = target.trunk.new_cache(1, capacity)
+        nodes = max(method.proposer.nodes, method.opening.nodes)
+        self.cache = target.trunk.new_cache(1, target.prompt_length + target.tokens_per_chunk + nodes + 1)
+        self.situation = Situation("", ActionHistory(target.settings.dofs))
         self.words: Tensor | None = None
 
     @property
@@ -106,10 +61,14 @@ class Decoder:
     def reset(self, task: str, instruction: str) -> None:
         """A new episode begins."""
         self.words = self.target.words_of(instruction)
+        self.situation = Situation(task, ActionHistory(self.target.settings.dofs))
         self.threshold.reset()
+        if self.parts.compensation is not None:
+            self.parts.compensation.reset()
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """An action (D,) was executed; the end effector is now at (3,) metres."""
+        self.situation.history.append(self.target.actions.normalise(action))
 
     def finish(self, success: bool) -> None:
         """The episode ended."""
@@ -125,62 +84,97 @@ class Decoder:
         prompt, _ = target.encode(inputs)
         clock.lap("vision")
         chunk = self.decode_prompt(prompt, clock)
-        actions = target.actions.decode(np.array(chunk.tokens).reshape(-1, target.settings.dofs)).astype(np.float32)
-        variability = chunk.variability if any(r.drafted for r in chunk.rounds) else None
+        actions, compensated = self.actions_of(chunk)
+        compared = any(r.drafted for r in chunk.rounds)
+        variability = chunk.variability if compared else None
         self.threshold.update(variability)
+        if self.parts.compensation is not None:
+            self.parts.compensation.next_decode()
         seconds = clock.stop()
         return DecodeRecord(
             tokens=tuple(chunk.tokens),
             actions=actions,
+            size=chunk.size,
             forwards=chunk.forwards,
             rounds=tuple(chunk.rounds),
-            mode=self.proposer.name if self.proposer is not None else "ar",
+            mode=next((r.proposer for r in chunk.rounds if r.tree_size), "ar"),
             seconds=seconds,
             phases=clock.phases,
+            compensated=compensated,
             variability=variability,
         )
 
+    def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
+        """(steps, D) float32 in environment units, and how many of its numbers were predicted."""
+        tokenizer = self.target.actions
+        if chunk.closed is None:
+            return tokenizer.decode(np.array(chunk.tokens).reshape(-1, chunk.dofs)).astype(np.float32), 0
+        predicted = max(0, chunk.closed.size - len(chunk.tokens))
+        return tokenizer.unnormalise(chunk.closed).astype(np.float32), predicted
+
     @torch.inference_mode()
     def decode_prompt(self, prompt: Tensor, clock: Clock | None = None) -> Chunk:
-        """prompt (1, P, E) -> a complete chunk."""
+        """prompt (1, P, E) -> a complete chunk, or one that the rectifier closed."""
         clock = clock or Clock(prompt.device)
-        chunk = self.start(prompt)
-        clock.lap("prefill")
-        if self.proposer is not None and chunk.left > 1:
-            self.proposer.begin(chunk)
+        chunk = Chunk(prompt, self.target.tokens_per_chunk, self.target.settings.dofs, self.cache, self.situation)
+        self.open(chunk, clock)
+        if self.parts.proposer is not None and chunk.left > 1:
+            self.parts.proposer.begin(chunk)
             clock.lap("propose")
         while chunk.left:
             self.round(chunk, clock)
         return chunk
 
-    def start(self, prompt: Tensor) -> Chunk:
-        """Prefill: the first forward; it commits token 0."""
-        hidden = self.target.prefill(prompt, self.cache)
-        chunk = Chunk(prompt, hidden, self.target.tokens_per_chunk, self.cache)
-        token = int(self.target.head(hidden[:, -1]).argmax())
-        chunk.tokens.append(token)
+    def open(self, chunk: Chunk, clock: Clock) -> None:
+        """The first forward: encodes the prompt and, with an opening draft, verifies that too."""
+        tree, prompt, target = EMPTY, chunk.prompt, self.target
+        if self.parts.opening is not None:
+            tree = self.parts.opening.propose(chunk, chunk.size)
+            clock.lap("propose")
         chunk.forwards = 1
-        chunk.rounds.append(Round("prefill", "none", 0, (), (token,), 0, 1, 0, ()))
-        return chunk
+        length = prompt.shape[1]
+        if not len(tree):
+            chunk.hidden = target.prefill(prompt, chunk.cache)
+            token = int(target.head(chunk.hidden[:, -1]).argmax())
+            chunk.tokens.append(token)
+            chunk.rounds.append(Round("prefill", "none", 0, (), (token,), 0, 1, 0, ()))
+            clock.lap("prefill")
+            return
+        x = torch.cat([prompt, target.embedding(torch.tensor([tree.tokens], device=prompt.device))], 1)
+        positions = torch.tensor([*range(length), *(length + d for d in tree.depths)], device=prompt.device)
+        chunk.cache.length = 0
+        hidden = target.trunk(x, positions, chunk.cache, prefill_mask(tree, length, prompt))
+        verdicts = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
+        clock.lap("prefill")
+        path = self.accept(chunk, tree, verdicts, self.parts.opening)
+        clock.lap("accept")
+        rows = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
+        chunk.cache.keep(length, rows)
+        chunk.hidden = torch.cat([hidden[:, :length], hidden[:, rows]], 1)
+        clock.lap("prefill")
+        self.rectify(chunk)
+        clock.lap("rectify")
 
     def round(self, chunk: Chunk, clock: Clock) -> None:
         """One draft, one forward, one decision. Without a draft it decodes one token."""
-        tree = EMPTY
-        if self.proposer is not None and chunk.left > 1:
+        tree, proposer = EMPTY, self.parts.proposer
+        if proposer is not None and chunk.left > 1:
             # one token less than is left: the bonus fills the last place whether or not everything is accepted
-            tree = self.proposer.propose(chunk, chunk.left - 1)
+            tree = proposer.propose(chunk, chunk.left - 1)
             clock.lap("propose")
         hidden, verdicts = self.verify(chunk, tree)
         clock.lap("verify")
         first = len(chunk.tokens) - 1
-        path = self.accept(chunk, tree, verdicts)
+        path = self.accept(chunk, tree, verdicts, proposer)
         clock.lap("accept")
         rows = torch.tensor([0, *(i + 1 for i in path)], device=hidden.device)
         if len(tree):
             chunk.cache.keep(self.target.prompt_length + first, self.target.prompt_length + first + rows)
-        if self.proposer is not None and chunk.left > 1:
-            self.proposer.committed(chunk, first, hidden[:, rows])
-        clock.lap("propose")
+            self.rectify(chunk)
+            clock.lap("rectify")
+        if proposer is not None and chunk.left > 1:
+            proposer.committed(chunk, first, hidden[:, rows])
+            clock.lap("propose")
 
     def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:
         """Forward [last committed token, tree] -> hidden (1, 1 + n, E) and the argmax behind each of them."""
@@ -193,37 +187,46 @@ class Decoder:
         chunk.forwards += 1
         return hidden, self.target.head(hidden)[0].argmax(-1).tolist()
 
-    def accept(self, chunk: Chunk, tree: TokenTree, verdicts: Sequence[int]) -> tuple[int, ...]:
-        """Commit the best accepted path and the bonus; record the round -> nodes of the path."""
-        start, dofs = len(chunk.tokens), self.target.settings.dofs
-        if not len(tree):
+    def accept(
+        self, chunk: Chunk, tree: TokenTree, verdicts: Sequence[int], proposer: Proposer | None
+    ) -> tuple[int, ...]:
+        """Commit the best accepted path and, where a place is left, the bonus; record the round -> the path's nodes."""
+        start = len(chunk.tokens)
+        if not len(tree) or proposer is None:
             chunk.tokens.append(verdicts[0])
             chunk.rounds.append(Round("decode", "none", start, (), (verdicts[0],), 0, 1, 0, ()))
             return ()
-        limits = limits_of(self.method.acceptance, self.threshold.radius(), dofs, GRIPPER)
+        limits = limits_of(self.method.acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
         verdict = self.rule(tree, verdicts, start, limits)
         path = verdict.path
         judged = path if verdict.rejected is None else (*path, verdict.rejected)
         seen = [verdicts[tree.parents[i] + 1] for i in judged]
         drafted = [tree.tokens[i] for i in judged]
-        bonus = verdicts[path[-1] + 1 if path else 0]
-        chunk.tokens += [tree.tokens[i] for i in path] + [bonus]
+        bonus = [verdicts[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
+        chunk.tokens += [tree.tokens[i] for i in path] + bonus
         chunk.variability += float(np.abs(values_of(np.array(drafted)) - values_of(np.array(seen))).sum())
-        assert self.proposer is not None
         chunk.rounds.append(
             Round(
                 mode="verify",
-                proposer=self.proposer.name,
+                proposer=proposer.name,
                 start=start,
                 drafted=tuple(drafted),
-                verdicts=(*seen, bonus) if verdict.rejected is None else tuple(seen),
+                verdicts=tuple(seen) if verdict.rejected is not None else (*seen, *bonus),
                 accepted=len(path),
-                committed=len(path) + 1,
+                committed=len(path) + len(bonus),
                 tree_size=len(tree),
                 threshold=limits,
             )
         )
         return path
 
-
-EMPTY = TokenTree((), (), ())
+    def rectify(self, chunk: Chunk) -> None:
+        """After a rejection: let the compensation end the chunk, if there is one and it can."""
+        last, compensation = chunk.rounds[-1], self.parts.compensation
+        if compensation is None or last.accepted == len(last.drafted):
+            return
+        complete = not chunk.left  # the verdict filled the last place: nothing is missing, if it may be used
+        if complete and self.method.rectifier.use_verdict:
+            return
+        if compensation.close(chunk) and not self.method.rectifier.use_verdict:
+            chunk.rounds[-1] = last.without_bonus()

@@ -5,17 +5,40 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kerv_cli.decoding.decoder import Chunk
+from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.drafting.drafter import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.settings import ProposerSettings
+from kerv_cli.vla.action_tokens import bins_of
 from kerv_cli.vla.target import Target
+
+
+class HoldProposer:
+    """The last executed action, repeated. Nothing is drafted before there was one."""
+
+    name = "hold"
+    needs_states = False
+
+    def begin(self, chunk: Chunk) -> None:
+        pass
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        history = chunk.situation.history.values()
+        if not len(history):
+            return TokenTree((), (), ())
+        held = bins_of(history[-1]).tolist()
+        ahead = range(len(chunk.tokens), min(chunk.size, len(chunk.tokens) + depth))
+        return TokenTree.chain([held[i % chunk.dofs] for i in ahead])
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+        pass
 
 
 class DrafterProposer:
     """EAGLE-style drafter with a dynamic tree (METHODS §2.2)."""
 
     name = "drafter"
+    needs_states = True
 
     def __init__(self, drafter: Drafter, target: Target, settings: ProposerSettings) -> None:
         self.drafter, self.target, self.settings = drafter, target, settings
@@ -25,7 +48,7 @@ class DrafterProposer:
 
     def begin(self, chunk: Chunk) -> None:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
-        observe(self.drafter, self.target, self.state, following, chunk.prompt_hidden, 0)
+        observe(self.drafter, self.target, self.state, following, chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         s = self.settings

@@ -6,7 +6,7 @@ Notation (METHODS §0): D degrees of freedom, H control steps in a chunk, N = H�
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,10 @@ class Round:
     tree_size: int  # nodes verified
     threshold: tuple[int, ...]  # r per DoF, in bins; empty where no acceptance rule with a threshold ran
 
+    def without_bonus(self) -> Round:
+        """The same round when the verdict at the rejected position is not used."""
+        return replace(self, committed=self.accepted)
+
 
 @dataclass(frozen=True)
 class DecodeRecord:
@@ -46,6 +50,7 @@ class DecodeRecord:
     seconds: float  # inference time (METHODS §7), device synchronised at both ends
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
+    size: int = 0  # N; 0: as many as `tokens`
     skipped: bool = False  # executed without a verification
     variability: float | None = None  # K of this decode (METHODS §3.2), normalised action units
     similarity: float | None = None  # best retrieval similarity, where one was looked up
@@ -62,7 +67,7 @@ class DecodeRecord:
         """Index in the chunk of the first rejected token of the first verification; N if none; None if no tree."""
         for r in self.rounds:
             if r.tree_size > 0 and r.mode != "skip":
-                return r.start + r.accepted if r.accepted < len(r.drafted) else len(self.tokens)
+                return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
         return None
 
 

@@ -94,6 +94,16 @@ def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
     return TokenTree.build(tokens, parents)
 
 
+def prefill_mask(tree: TokenTree, prompt: int, like: Tensor) -> Tensor:
+    """Additive mask (P + n, P + n) for [prompt, nodes…]: causal in the prompt; a node sees the prompt and its path."""
+    n = len(tree)
+    seen = np.zeros((prompt + n, prompt + n), dtype=bool)
+    seen[:prompt, :prompt] = np.tri(prompt, dtype=bool)
+    seen[prompt:, :prompt] = True
+    seen[prompt:, prompt:] = tree.ancestors()
+    return torch.from_numpy(np.where(seen, 0.0, -np.inf).astype(np.float32)).to(device=like.device, dtype=like.dtype)
+
+
 def verify_mask(tree: TokenTree, cached: int, like: Tensor) -> Tensor | None:
     """Additive mask (1 + n, cached + 1 + n) for [last committed token, nodes…] behind `cached` tokens.
 

@@ -10,10 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from kerv_cli.decoding.decoder import Decoder, Proposer
-from kerv_cli.decoding.proposers import DrafterProposer
+from kerv_cli.decoding.chunk import Proposer
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
+from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.drafting.drafter import Drafter, load_drafter
+from kerv_cli.drafting.kinematics import build_predictor
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.places import drafter_beside, find_target
 from kerv_cli.rollouts.episode import ActionDecoder, Recording, run_episode
@@ -21,6 +24,7 @@ from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, CameraSettings, MethodSettings, RolloutSettings, WorldSettings
 from kerv_cli.sim.camera import CameraConfig
 from kerv_cli.sim.world import World
+from kerv_cli.vla.action_tokens import GRIPPER
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
 
@@ -108,7 +112,31 @@ def load_policy(settings: RolloutSettings) -> Policy:
 
 def build_decoder(policy: Policy, method: MethodSettings) -> Decoder:
     """The method's parts around the policy."""
-    return Decoder(policy.target, method, build_proposer(policy, method))
+    return Decoder(policy.target, method, build_parts(policy, method))
+
+
+def build_parts(policy: Policy, method: MethodSettings) -> Parts:
+    return Parts(build_opening(policy, method), build_proposer(policy, method), build_compensation(policy, method))
+
+
+def build_opening(policy: Policy, method: MethodSettings) -> Proposer | None:
+    kinds = {"none": None, "hold": HoldProposer}
+    if method.opening.kind not in kinds:
+        raise UnknownName("opening.kind", method.opening.kind, kinds)
+    if method.opening.kind == "none":
+        return None
+    return HoldProposer()
+
+
+def build_compensation(policy: Policy, method: MethodSettings) -> Compensation | None:
+    settings = method.rectifier
+    if settings.kind not in ("reinfer", "compensate"):
+        raise UnknownName("rectifier.kind", settings.kind, ["reinfer", "compensate"])
+    if settings.kind == "reinfer":
+        return None
+    chunk = policy.target.settings
+    predictor = build_predictor(settings.predictor, chunk.dofs, {}, horizon=chunk.chunk, minimum=1, gripper=GRIPPER)
+    return Compensation(settings, predictor)
 
 
 def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer
 from kerv_cli.drafting.drafter import Drafter
 from kerv_cli.settings import (
@@ -136,7 +136,7 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
     tree = ProposerSettings(kind="drafter", depth=5, top_k=1, nodes=5)
     acceptance = AcceptanceSettings(kind="relaxed" if r else "strict", strict_gripper=True)
     method = MethodSettings("validation", tree, acceptance, ThresholdSettings(r=r))
-    decoder = Decoder(target, method, DrafterProposer(drafter, target, tree))
+    decoder = Decoder(target, method, Parts(proposer=DrafterProposer(drafter, target, tree)))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     verified = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in verified) / max(1, len(verified))

@@ -1,0 +1,88 @@
+"""The chunk being decoded, what is known before the target runs, and the clock: what the parts of a decode share."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.decoding.record import PHASES, Round
+from kerv_cli.drafting.kinematics import ActionHistory
+from kerv_cli.drafting.tree import TokenTree
+from kerv_cli.vla.trunk import Cache
+
+
+class Clock:
+    """Seconds by phase between two synchronised ends."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.cuda = device.type == "cuda"
+        self.phases = dict.fromkeys(PHASES, 0.0)
+        self.began = self.last = self._now()
+
+    def _now(self) -> float:
+        if self.cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+    def lap(self, phase: str) -> None:
+        """Everything since the last lap belongs to `phase`."""
+        now = self._now()
+        self.phases[phase] += now - self.last
+        self.last = now
+
+    def stop(self) -> float:
+        self.lap("other")
+        return self.last - self.began
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What is known before the target runs. history: executed actions, normalised, oldest first."""
+
+    task: str
+    history: ActionHistory
+
+
+@dataclass
+class Chunk:
+    """The chunk being decoded. The cache holds the prompt and every committed token but the last."""
+
+    prompt: Tensor  # (1, P, E)
+    size: int  # N
+    dofs: int  # D
+    cache: Cache
+    situation: Situation
+    hidden: Tensor = field(default_factory=lambda: torch.empty(0))  # (1, P + c − 1, E) once c tokens are committed
+    tokens: list[int] = field(default_factory=list)  # committed
+    rounds: list[Round] = field(default_factory=list)
+    forwards: int = 0
+    variability: float = 0.0
+    closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
+
+    @property
+    def left(self) -> int:
+        """Tokens still to be decoded; none once the chunk was closed."""
+        return 0 if self.closed is not None else self.size - len(self.tokens)
+
+
+class Proposer(Protocol):
+    """Drafts a tree behind the committed tokens. `name` goes into the record; `needs_states` says whether it reads the
+    target's hidden states: one that does not can also draft before the prefill."""
+
+    name: str
+    needs_states: bool
+
+    def begin(self, chunk: Chunk) -> None:
+        """The prompt is encoded and the first tokens are committed."""
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """A tree of depth ≤ `depth`; an empty one means that nothing is drafted this round."""
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+        """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
+        target's states at chunk indices first … first + T − 1."""

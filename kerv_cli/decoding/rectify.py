@@ -1,0 +1,72 @@
+"""What happens after a rejection (METHODS §3.1): decode on, or fill what is missing with a prediction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.drafting.kinematics import Predictor
+from kerv_cli.errors import UsageError
+from kerv_cli.settings import RectifierSettings
+from kerv_cli.vla.action_tokens import values_of
+
+
+class Compensation:
+    """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
+
+    With `use_verdict` (ours) the verdict at the rejected position is kept too: it is there and free. `steps` (PL) lets
+    the prediction fill further control steps. After a compensation the filter rests for `rest` decodes.
+    """
+
+    def __init__(self, settings: RectifierSettings, predictor: Predictor) -> None:
+        if settings.steps < 1 or settings.rest < 0 or settings.min_verified < 0:
+            raise UsageError("rectifier: steps must be at least 1, rest and min_verified at least 0")
+        self.settings, self.predictor = settings, predictor
+        self.resting = 0
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self.resting = 0
+
+    def next_decode(self) -> None:
+        """A decode ended."""
+        self.resting = max(0, self.resting - 1)
+
+    def close(self, chunk: Chunk) -> bool:
+        """A draft was rejected; end the chunk if a prediction can.
+
+        Sets `chunk.closed`; with `use_verdict` off the bonus token is taken back. False: decode on.
+        """
+        if self.resting:
+            return False
+        tokens = chunk.tokens if self.settings.use_verdict else chunk.tokens[:-1]
+        values = assemble(tokens, chunk, self.predictor, self.settings)
+        if values is None:
+            return False
+        chunk.tokens = tokens[: values.size]
+        chunk.closed = values
+        # one more than the rest, because the decode that compensated ends too
+        self.resting = self.settings.rest + 1
+        return True
+
+
+def assemble(tokens: list[int], chunk: Chunk, predictor: Predictor, settings: RectifierSettings) -> np.ndarray | None:
+    """Known tokens, then the prediction -> (steps, D) normalised actions; None where the history is too short.
+
+    A step of which fewer than `min_verified` DoFs are known is dropped, unless nothing would be left.
+    """
+    dofs, horizon = chunk.dofs, chunk.size // chunk.dofs
+    whole, part = divmod(len(tokens), dofs)
+    filled = 1 if whole == 0 or (part and part >= settings.min_verified) else 0
+    steps = min(horizon, whole + max(filled, settings.steps - 1 + filled))
+    values = values_of(np.array(tokens[: steps * dofs], dtype=np.int64))
+    flat = np.full(steps * dofs, np.nan)
+    flat[: len(values)] = values
+    actions: np.ndarray = flat.reshape(steps, dofs)
+    if steps > whole:
+        predicted = predictor.predict(chunk.situation.history.values(actions[:whole]), steps - whole)
+        if predicted is None:
+            return None
+        gap = np.isnan(actions[whole:])
+        actions[whole:][gap] = predicted[gap]
+    return actions
