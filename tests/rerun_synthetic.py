@@ -64,12 +64,12 @@ def drafted_decode(random: np.random.Generator, chunk: int = 4, compensate: bool
         variability += float(np.abs(off[:judged]).sum()) / 128
         if accepted < depth and compensate:
             compensated = -len(tokens) % DOFS
-            tokens += [128] * compensated
             break
     return decode_of(
         tuple(tokens),
         tuple(rounds),
-        len(tokens) // DOFS,
+        (len(tokens) + compensated) // DOFS,
+        size=size,
         variability=variability,
         compensated=compensated,
         mode="compensate" if compensated else "drafter",

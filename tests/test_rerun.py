@@ -174,11 +174,24 @@ def test_a_rejection_stays_visible_whoever_fills_the_place() -> None:
     refused = Round("verify", "drafter", 1, (60, 99), (60, 70), 1, 1, 20, (9,))
     filled = decode_of((50, 60, 128, 128), (prefill(50), refused), 1, compensated=2)
     assert [f.fate for f in fates_of(filled, 8, DOFS)[:4]] == ["target", "accepted", "rejected", "compensated"]
+    # the papers' preset takes the verdict back: the place is predicted too, and the tokens end before it
+    taken_back = decode_of((50, 60), (prefill(50), refused), 1, compensated=2, size=8)
+    assert [f.fate for f in fates_of(taken_back, 8, DOFS)] == ["target", "accepted", "rejected", "compensated"] + [
+        "dropped"
+    ] * 4
+    assert [f.token for f in fates_of(taken_back, 4, DOFS)] == [50, 60, None, None]
     retried = decode_of((50, 60, 71, 80), (prefill(50), refused, verify(2, (71,), (70, 80), 1)), 1)
     assert [f.fate for f in fates_of(retried, 4, DOFS)] == ["target", "accepted", "rejected", "bonus"]
     # two steps were verified, one was executed: the second is dropped, but the place of the rejection is kept
     cut = decode_of((50, 60, 70, 80, 90), (prefill(50), verify(1, (60, 70, 80, 90, 9), (60, 70, 80, 90, 99), 4)), 1)
     assert [f.fate for f in fates_of(cut, 8, DOFS)[4:]] == ["dropped", "rejected", "dropped", "dropped"]
+
+
+def test_a_chunk_of_which_nothing_was_executed_to_the_end_keeps_its_size(tmp_path: Path) -> None:
+    record = episode("drafter", horizon=1)
+    cut = decode_of((50, 60), (prefill(50), verify(1, (60, 99), (60, 70), 1, (9, 9, 9, 0))), 1, compensated=2, size=16)
+    path = saved(replace(record, decodes=(cut,), decode_steps=(0,)), tmp_path)
+    assert "/tokens/step_3" in read_back(path)["entities"]
 
 
 def test_decodes_without_rounds_are_told_apart() -> None:
@@ -191,13 +204,15 @@ def test_decodes_without_rounds_are_told_apart() -> None:
 @pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
 def test_drawn_tokens_add_up_with_the_records(kind: str) -> None:
     for decode in episode(kind).decodes:
-        fates = [f.fate for f in fates_of(decode, chunk_size([decode], DOFS), DOFS)]
+        size = chunk_size([decode], DOFS)
+        assert size == 16
+        fates = [f.fate for f in fates_of(decode, size, DOFS)]
         rounds = [r for r in decode.rounds if r.tree_size and r.mode != "skip"]
         assert fates.count("accepted") + fates.count("relaxed") == sum(r.accepted for r in rounds)
         assert fates.count("rejected") == sum(r.accepted < len(r.drafted) for r in rounds)
         assert fates.count("compensated") == decode.compensated
         first = fates.index("rejected") if "rejected" in fates else None
-        assert first is None or decode.first_rejected in (first, len(decode.tokens))
+        assert first is None or decode.first_rejected in (first, decode.size)
 
 
 def test_token_lanes_and_modes(tmp_path: Path) -> None:

@@ -56,11 +56,11 @@ def dof_names(dofs: int) -> tuple[str, ...]:
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
-    """N, the tokens of a chunk: the most that any decode judged, committed or executed, in whole control steps."""
+    """N, the tokens of a chunk; at least what any decode judged, committed or executed, in whole control steps."""
     most = 1
     for decode in decodes:
         judged = [r.start + max(len(r.drafted), len(r.verdicts)) for r in decode.rounds]
-        most = max(most, len(decode.tokens), len(decode.actions) * dofs, *judged)
+        most = max(most, decode.size, len(decode.tokens), len(decode.actions) * dofs, *judged)
     return -(-most // dofs) * dofs
 
 
@@ -75,10 +75,11 @@ def fates_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenFate]:
             before = fates[place]
             if before is None or before.fate != "rejected":
                 fates[place] = fate
-    committed = sum(r.committed for r in decode.rounds)
-    for place in range(committed, min(committed + decode.compensated, size)):
-        fates[place] = fates[place] or TokenFate("compensated")
     executed = len(decode.actions) * dofs
+    for place in range(max(0, executed - decode.compensated), executed):  # the prediction fills up the last steps
+        before = fates[place]
+        if before is None or before.fate != "rejected":
+            fates[place] = TokenFate("compensated")
     return [_settled(fate, decode, place, place < executed) for place, fate in enumerate(fates)]
 
 
