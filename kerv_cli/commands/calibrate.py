@@ -1,0 +1,92 @@
+"""`kerv calibrate`: noise of the kinematic predictors and each task's reference level of the kinematic variability."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from kerv_cli.training.calibration import Calibration
+
+
+@edge
+def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+    """Fit the kinematic predictors on demonstrations and pre-sample each task's variability."""
+    from kerv_cli.config import compose, to_yaml
+    from kerv_cli.settings import CalibrateSettings
+
+    settings = compose("calibrate", overrides or [], CalibrateSettings)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        return
+    from kerv_cli.training.calibration import CalibrationRun
+
+    run = CalibrationRun(settings)
+    if plan:
+        typer.echo(run.plan())
+        return
+    with progress_bar("reading demonstrations", len(run.chosen)) as advance:
+        run.load(lambda done, total: advance(done, ""))
+    variability = {}
+    if settings.decodes:
+        with progress_bar("pre-sampling", len(run.tasks)) as advance:
+            variability = run.presample(lambda done, total: advance(done, ""))
+    calibration = run.finish(variability)
+    _tasks(calibration, run.path)
+    _noise(calibration)
+    _errors(calibration)
+
+
+def _tasks(calibration: Calibration, path: Path) -> None:
+    from rich.table import Table
+
+    from kerv_cli.training.prediction import position_errors
+
+    columns = ("task", "fitted on", "tested on", "decodes", "K_S", "K p25", "K p75", "Kalman, h=1", "hold, h=1")
+    table = Table(*columns, title=f"calibration in {path}")
+    kalman, hold = (position_errors(calibration.errors, kind)[:, 0] for kind in ("kalman", "hold"))
+    for number, (name, counts) in enumerate(calibration.demos["tasks"].items()):
+        row = calibration.variability.get(name)
+        levels = [f"{row['decodes']:.0f}", *(f"{row[k]:.3f}" for k in ("k_s", "p25", "p75"))] if row else ["-"] * 4
+        episodes = [str(counts["training"]), str(counts["held_out"])]
+        table.add_row(name, *episodes, *levels, f"{kalman[number]:.4f}", f"{hold[number]:.4f}")
+    console().print(table)
+
+
+def _noise(calibration: Calibration) -> None:
+    from rich.table import Table
+
+    from kerv_cli.vla.action_tokens import DOF_NAMES, GRIPPER
+
+    table = Table("filter", *DOF_NAMES[:GRIPPER], title="fitted q / r (damping)")
+    for kind, noise in calibration.noise.items():
+        cells = zip(noise.q, noise.r, noise.damping, strict=True)
+        table.add_row(kind, *[f"{q / r:.3g} ({d:.2g})" for q, r, d in cells][:GRIPPER])
+    console().print(table)
+
+
+def _errors(calibration: Calibration) -> None:
+    from rich.table import Table
+
+    from kerv_cli.training.prediction import position_errors
+
+    hold = position_errors(calibration.errors, "hold")
+    horizon = hold.shape[1]
+    table = Table(
+        "predictor",
+        *(f"h={h}" for h in range(1, horizon + 1)),
+        "below hold at h=1",
+        f"at h={horizon}",
+        title="held-out error of dx, dy, dz, mean of tasks, normalised action units",
+    )
+    for kind in calibration.errors:
+        error = position_errors(calibration.errors, kind)
+        below = [int((error[:, h] < hold[:, h]).sum()) for h in (0, horizon - 1)]
+        wins = ["-" if kind == "hold" else f"{count}/{len(hold)} tasks" for count in below]
+        table.add_row(kind, *(f"{e:.4f}" for e in error.mean(0)), *wins)
+    console().print(table)

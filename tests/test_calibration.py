@@ -1,0 +1,341 @@
+"""Calibration: windows, fits and errors on data made to order; K by hand; the file and its refusals; the command."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from kerv_cli.commands.calibrate import calibrate
+from kerv_cli.config import compose
+from kerv_cli.decoding.thresholds import build_threshold
+from kerv_cli.drafting.kinematics import PREDICTORS, Noise
+from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.files import read_json, sha256_of, write_json
+from kerv_cli.places import find_target
+from kerv_cli.settings import CalibrateSettings, ThresholdSettings
+from kerv_cli.sim.demo_dataset import DemoDataset, dataset_hash, episode_path
+from kerv_cli.sim.demo_file import FORMAT, DemoEpisode, save_episode
+from kerv_cli.training.calibration import (
+    Calibration,
+    CalibrationRun,
+    calibration_beside,
+    kinematic_variability,
+    load_calibration,
+    reference_level,
+    save_calibration,
+)
+from kerv_cli.training.prediction import (
+    Windows,
+    choose_episodes,
+    episode_windows,
+    fit_noise,
+    position_errors,
+    prediction_errors,
+)
+from kerv_cli.vla.action_tokens import CENTRES, ActionTokenizer
+from kerv_cli.vla.checkpoint import read_description
+
+TASKS = ("reach-v3", "drawer-close-v3")
+UNIT = ActionTokenizer(-np.ones(4), np.ones(4))
+STEPS = 24
+
+
+def made_up_episode(task: str, seed: int, tail: int = 8) -> DemoEpisode:
+    """Ramps of another slope per DoF, saturating now and then; a gripper that closes half way."""
+    time = np.arange(STEPS + tail)
+    slopes = 0.05 * (1 + seed % 3) * np.array([1.0, -0.5, 0.25])
+    labels = np.clip(np.c_[-0.5 + time[:, None] * slopes, np.where(time < STEPS // 2, -1.0, 1.0)], -1, 1)
+    perturbed = seed % 2 == 1
+    executed = labels[:STEPS].copy()
+    if perturbed:
+        executed[:, :3] += np.random.default_rng(seed).normal(0, 0.3, (STEPS, 3))
+    return DemoEpisode(
+        task=task,
+        seed=seed,
+        perturbed=perturbed,
+        steps=STEPS,
+        frames=np.random.default_rng(seed).integers(0, 255, (STEPS // 2, 96, 96, 3), dtype=np.uint8),
+        frame_steps=np.arange(0, STEPS, 2),
+        states=np.random.default_rng(seed).normal(0, 0.1, (STEPS, 39)).astype(np.float32),
+        labels=labels.astype(np.float32),
+        executed=np.clip(executed, -1, 1).astype(np.float32),
+        rand_vec=np.zeros(3),
+    )
+
+
+def write_dataset(folder: Path, episodes: int = 6) -> None:
+    """A complete dataset, without a simulator."""
+    tasks: dict[str, Any] = {}
+    for task in TASKS:
+        entries = []
+        for seed in range(episodes):
+            path = episode_path(folder, task, seed)
+            episode = made_up_episode(task, seed)
+            save_episode(path, episode)
+            entries.append(
+                {
+                    "seed": seed,
+                    "perturbed": episode.perturbed,
+                    "steps": STEPS,
+                    "bytes": path.stat().st_size,
+                    "sha256": sha256_of(path),
+                }
+            )
+        tasks[task] = {"mean_steps": float(STEPS), "failed_seeds": [], "episodes": entries}
+    write_json(folder / "manifest.json", {"format": FORMAT, "sha256": dataset_hash(tasks), "tasks": tasks})
+
+
+@pytest.fixture(scope="module")
+def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small policies and a dataset of two tasks."""
+    folder = tmp_path_factory.mktemp("calibration") / "results"
+    shutil.copytree(policies, folder)
+    write_dataset(folder / "artifacts/demos/few")
+    return folder
+
+
+def settings(results: Path, *overrides: str, target: str = "nano-state") -> CalibrateSettings:
+    words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", f"policy.target={target}"]
+    return compose("calibrate", [*words, f"results={results}", *overrides], CalibrateSettings)
+
+
+def test_windows_lie_where_they_should() -> None:
+    episode = made_up_episode("reach-v3", 0)
+    past, future = episode_windows(episode, UNIT, "labels", 10, 4)
+    assert past.shape == (STEPS - 10, 10, 4)
+    assert future.shape == (STEPS - 10, 4, 4)
+    for i in (0, 7, STEPS - 11):
+        np.testing.assert_allclose(past[i], episode.labels[i : i + 10], atol=1e-6)
+        np.testing.assert_allclose(future[i], episode.labels[i + 10 : i + 14], atol=1e-6)
+
+
+def test_windows_of_what_was_executed_look_forward_to_the_labels() -> None:
+    episode = made_up_episode("reach-v3", 1)
+    past, future = episode_windows(episode, UNIT, "executed", 10, 2)
+    np.testing.assert_allclose(past[3], episode.executed[3:13], atol=1e-6)
+    np.testing.assert_allclose(future[3], episode.labels[13:15], atol=1e-6)
+
+
+def test_windows_are_normalised_as_the_target_does() -> None:
+    episode = made_up_episode("reach-v3", 0)
+    narrow = ActionTokenizer(-0.5 * np.ones(4), 0.5 * np.ones(4))
+    past, _ = episode_windows(episode, narrow, "labels", 10, 4)
+    np.testing.assert_allclose(past[0], np.clip(2 * episode.labels[:10], -1, 1), atol=1e-6)
+
+
+def test_short_episodes_have_no_window_and_short_tails_are_refused() -> None:
+    episode = made_up_episode("reach-v3", 0)
+    past, future = episode_windows(episode, UNIT, "labels", STEPS, 4)
+    assert past.shape == (0, STEPS, 4)
+    assert future.shape == (0, 4, 4)
+    with pytest.raises(CheckpointError, match="8 labels behind an episode's end, predictions of 10 steps need 9"):
+        episode_windows(episode, UNIT, "labels", 10, 10)
+
+
+@pytest.mark.parametrize("ratio", [0.01, 1.0])
+def test_the_fit_finds_the_noise_that_made_the_data(ratio: float) -> None:
+    """A random walk of the velocity, observed with noise: the true ratio predicts best."""
+    random = np.random.default_rng(0)
+    acceleration = random.normal(0, np.sqrt(ratio), (4000, 12))
+    speed = np.cumsum(acceleration, 1)
+    place = np.cumsum(np.c_[np.zeros(len(speed)), speed[:, :-1] + 0.5 * acceleration[:, 1:]], 1)
+    seen = 1e-3 * (place + random.normal(0, 1, place.shape))  # small: nothing is clipped, and only the ratio counts
+    q, damping = fit_noise(seen[:, :10], seen[:, 10:], 2, (1.0,))
+    assert damping == 1.0
+    assert ratio / 4 < q < 4 * ratio
+
+
+def line_windows(slope: float) -> Windows:
+    """One task of lines and one of constants; the gripper ramps in both."""
+    time = np.arange(14)
+    lines = np.stack([np.full((14, 4), 0.3), np.c_[np.repeat(slope * time[:, None], 3, 1), 0.01 * time]])
+    both = np.concatenate([lines, lines])
+    held = np.array([False, False, True, True])
+    return Windows(both[:, :10], both[:, 10:], np.array([0, 1, 0, 1]), held, TASKS, {})
+
+
+def test_errors_of_hold_and_linear_have_closed_forms() -> None:
+    noise = {kind: Noise.uniform(4, 1.0) for kind in PREDICTORS}
+    errors = prediction_errors(line_windows(0.02), noise)
+    assert set(errors) == set(PREDICTORS)
+    np.testing.assert_allclose(position_errors(errors, "hold"), [[0] * 4, 0.02 * np.arange(1, 5)], atol=1e-12)
+    np.testing.assert_allclose(position_errors(errors, "linear"), np.zeros((2, 4)), atol=1e-12)
+    for kind in PREDICTORS:  # the gripper is held by all of them
+        np.testing.assert_allclose(errors[kind][TASKS[1]]["gripper"], 0.01 * np.arange(1, 5), atol=1e-12)
+
+
+def test_both_kinds_of_episodes_are_held_out(results: Path) -> None:
+    dataset = DemoDataset.open(results / "artifacts/demos/few")
+    chosen = choose_episodes(dataset, TASKS, 0, 0.3)
+    assert len(chosen) == 12
+    held = [dataset.episodes[i] for i, out in chosen.items() if out]
+    assert {(e.task, e.perturbed) for e in held} == {(t, p) for t in TASKS for p in (False, True)}
+    assert len(choose_episodes(dataset, TASKS[:1], 4, 0.3)) == 4
+    with pytest.raises(CheckpointError, match="no episode of push-v3"):
+        choose_episodes(dataset, ("push-v3",), 0, 0.3)
+
+
+def test_variability_is_the_summed_difference_of_the_actions() -> None:
+    drafted, verdicts = np.array([[10, 20, 30], [0, 0, 254]]), np.array([[10, 22, 27], [0, 0, 0]])
+    bin_width = 2 / 255
+    np.testing.assert_allclose(kinematic_variability(drafted, verdicts), [5 * bin_width, 254 * bin_width])
+    assert kinematic_variability(np.array([], dtype=int), np.array([], dtype=int)) == 0
+    with pytest.raises(ValueError, match="cannot be compared"):
+        kinematic_variability(drafted, verdicts[:1])
+
+
+def test_the_reference_level_is_the_median_and_can_divide() -> None:
+    assert reference_level([0.1, 5.0, 0.3]) == 0.3
+    assert reference_level([0.0, 0.0]) == pytest.approx(CENTRES[1] - CENTRES[0])
+    with pytest.raises(ValueError, match="no decode"):
+        reference_level([])
+
+
+@pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
+def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) -> None:
+    run = CalibrationRun(settings(results, target=target))
+    assert "8 demonstrations of 2 tasks, tested on 4; 4 decodes per task with drafter drafts" in run.plan()
+    run.load(lambda done, total: None)
+    variability = run.presample(lambda done, total: None)
+    assert {row["decodes"] for row in variability.values()} == {4}
+    made = run.finish(variability)
+    folder = find_target(str(results), target)
+    assert run.path == calibration_beside(folder) == results / f"artifacts/calibration/{target}/calibration.json"
+    described = read_description(folder, "target")
+    loaded = load_calibration(run.path, described["sha256"], 4)
+    assert loaded == made
+    assert loaded.demos["sha256"] == run.dataset.sha256
+    assert loaded.provenance["versions"]["numpy"] == np.__version__
+    assert (loaded.boundary, loaded.skip) == ({}, {})
+    for kind in PREDICTORS:
+        ahead = loaded.predictor(kind).predict(np.full((10, 4), 0.25), 4)
+        np.testing.assert_allclose(ahead, 0.25)
+
+
+def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
+    """The decoder's K is the function of the tokens it records."""
+    run = CalibrationRun(settings(results))
+    decoder, _ = run.decoder()
+    episode = run.dataset.load(0)
+    decoder.reset(episode.task, "reach")
+    record = decoder.decode(None, episode.states[0])
+    pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.verdicts, strict=False)]
+    drafted, verdicts = np.array(pairs).T
+    assert record.variability == pytest.approx(float(kinematic_variability(drafted, verdicts)))
+
+
+def test_the_tasks_reference_level_reaches_the_threshold(results: Path) -> None:
+    made = calibration({"reach-v3": 0.7})
+    wanted = ThresholdSettings("kinematic")
+    assert made.threshold(wanted, "reach-v3").k_s == 0.7
+    build_threshold(made.threshold(wanted, "reach-v3"))
+    assert made.threshold(dataclasses.replace(wanted, k_s=0.2), "push-v3").k_s == 0.2
+    assert made.threshold(ThresholdSettings(), "push-v3") == ThresholdSettings()
+    with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
+        made.threshold(wanted, "push-v3")
+
+
+def calibration(levels: dict[str, float]) -> Calibration:
+    return Calibration(
+        target={"sha256": "a" * 64, "chunk": 4, "dofs": 4},
+        demos={"sha256": "b" * 64, "tasks": {}},
+        window=10,
+        noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped", "acceleration")},
+        errors={},
+        variability={task: {"k_s": level, "decodes": 5} for task, level in levels.items()},
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda v: v.pop("noise"), "damaged"),
+        (lambda v: v["noise"].pop("damped"), "the noise of a filter is missing"),
+        (lambda v: v["noise"]["kalman"].update(q=[1.0]), "one number per DoF"),
+        (lambda v: v["noise"]["kalman"].update(r=[0.0] * 4), "r above 0"),
+        (lambda v: v["noise"]["kalman"].update(r=["x"] * 4), "damaged"),
+        (lambda v: v["variability"]["reach-v3"].update(k_s=0.0), "above 0"),
+        (lambda v: v["variability"]["reach-v3"].pop("k_s"), "damaged"),
+        (lambda v: v["target"].pop("sha256"), "does not name its target"),
+        (lambda v: v.update(window="ten"), "window ten"),
+        (lambda v: v.update(boundary=[]), "must be sections"),
+        (lambda v: v.update(extra=1), "damaged"),
+        (lambda v: v.update(format=99), "not a calibration of format 1"),
+        (lambda v: v.update(kind="target"), "not a calibration of format 1"),
+        (lambda v: v["target"].update(sha256="c" * 64), "was made for target cccccccccccc, not for aaaaaaaaaaaa"),
+        (lambda v: v["target"].update(chunk=8), "was made for chunks of 8 steps, not of 4"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(
+    change: Callable[[dict[str, Any]], Any], says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration({"reach-v3": 0.7}))
+    assert load_calibration(path, "a" * 64, 4) == calibration({"reach-v3": 0.7})
+    value = copy.deepcopy(read_json(path))
+    change(value)
+    path.write_text(json.dumps(value))
+    with pytest.raises(CheckpointError, match=says) as caught:
+        load_calibration(path, "a" * 64, 4)
+    assert "\n" not in str(caught.value)
+    assert "kerv calibrate" in str(caught.value)
+
+
+def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="run 'kerv calibrate'"):
+        load_calibration(tmp_path / "calibration.json", "a", 4)
+    (tmp_path / "list.json").write_text("[1]")
+    with pytest.raises(CheckpointError, match="not a calibration"):
+        load_calibration(tmp_path / "list.json", "a", 4)
+
+
+@pytest.mark.parametrize(
+    ("override", "kind", "says"),
+    [
+        ("history=lables", UnknownName, "did you mean labels"),
+        ("window=3", UsageError, "window=3"),
+        ("decodes=-1", UsageError, "decodes=-1"),
+        ("held_out=0", UsageError, "held_out=0"),
+        ("episodes=-2", UsageError, "episodes=-2"),
+        ("fit_steps=5", UsageError, "the target's chunk of 4"),
+        ("proposer=none", UsageError, "drafts nothing to compare"),
+        ("task=push", CheckpointError, "no episode of push-v3"),
+        ("demos=absent", CheckpointError, "kerv demos"),
+        ("policy.target=absent", CheckpointError, "no target 'absent'"),
+    ],
+)
+def test_wrong_requests_get_one_line(results: Path, override: str, kind: type[KervError], says: str) -> None:
+    with pytest.raises(kind, match=says) as caught:
+        CalibrationRun(settings(results, override))
+    assert "\n" not in str(caught.value)
+
+
+def test_windows_longer_than_every_episode_are_refused(results: Path) -> None:
+    run = CalibrationRun(settings(results, f"window={STEPS}"))
+    with pytest.raises(KervError, match=f"longer than a window of {STEPS}"):
+        run.load(lambda done, total: None)
+
+
+def test_the_command_prints_what_it_found(results: Path) -> None:
+    app = typer.Typer()
+    app.command()(calibrate)
+    common = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state", f"results={results}"]
+    done = CliRunner().invoke(app, [*common, "decodes=0", "name=without"])
+    assert done.exit_code == 0, done.output
+    for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without"):
+        assert word in done.output
+    assert (results / "artifacts/calibration/without/calibration.json").is_file()
+    assert "tested on 4" in CliRunner().invoke(app, [*common, "--plan"]).output
+    assert "history: labels" in CliRunner().invoke(app, [*common, "--cfg"]).output
+    refused = CliRunner().invoke(app, [*common, "history=none"])
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
