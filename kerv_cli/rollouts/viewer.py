@@ -93,7 +93,7 @@ def _instructions(paths: Sequence[Path], more: str) -> str:
     rerun = shlex.join(viewer_command())
     return "\n".join(
         [
-            f"no display here{more}; either copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*'):",
+            f"no display here{more}: copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*'):",
             f"  rerun {' '.join(shlex.quote(p.name) for p in paths)}",
             "or serve them to a browser on this machine",
             f"  {rerun} --serve-web --bind 127.0.0.1 {files}",
