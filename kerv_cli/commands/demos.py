@@ -50,5 +50,5 @@ def _summary(manifest: dict, folder: object) -> None:
 
     table = Table("task", "episodes", "mean steps", "failed seeds", title=f"demonstrations in {folder}")
     for name, row in manifest["tasks"].items():
-        table.add_row(name, str(row["episodes"]), f"{row['mean_steps']:.0f}", str(len(row["failed_seeds"])))
+        table.add_row(name, str(len(row["episodes"])), f"{row['mean_steps']:.0f}", str(len(row["failed_seeds"])))
     console().print(table)
