@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.commands.calibrate import calibrate
 from kerv_cli.config import compose
+from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration, save_calibration
 from kerv_cli.decoding.thresholds import build_threshold
 from kerv_cli.drafting.kinematics import PREDICTORS, Noise
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
@@ -25,15 +26,7 @@ from kerv_cli.places import find_target
 from kerv_cli.settings import CalibrateSettings, ThresholdSettings
 from kerv_cli.sim.demo_dataset import DemoDataset, dataset_hash, episode_path
 from kerv_cli.sim.demo_file import FORMAT, DemoEpisode, save_episode
-from kerv_cli.training.calibration import (
-    Calibration,
-    CalibrationRun,
-    calibration_beside,
-    kinematic_variability,
-    load_calibration,
-    reference_level,
-    save_calibration,
-)
+from kerv_cli.training.calibration import CalibrationRun, kinematic_variability, reference_level
 from kerv_cli.training.prediction import (
     Windows,
     choose_episodes,

@@ -11,7 +11,7 @@ from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, e
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from kerv_cli.training.calibration import Calibration
+    from kerv_cli.decoding.calibration import Calibration
 
 
 @edge

@@ -10,25 +10,29 @@ from pathlib import Path
 
 import numpy as np
 
+from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration
 from kerv_cli.decoding.chunk import Proposer
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
 from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.drafting.drafter import Drafter, load_drafter
-from kerv_cli.drafting.kinematics import build_predictor
+from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, build_predictor
 from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_beside, find_target
 from kerv_cli.rollouts.episode import ActionDecoder, Recording, run_episode
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, CameraSettings, MethodSettings, RolloutSettings, WorldSettings
 from kerv_cli.sim.camera import CameraConfig
+from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.sim.world import World
 from kerv_cli.vla.action_tokens import GRIPPER
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
 
 WARM_UP_DECODES = 3
+PREDICTED_FROM = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: see kinematics
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,7 @@ class Policy:
 
     target: Target
     drafter: Drafter | None
+    calibration: Calibration | None
     identity: dict[str, str]
 
 
@@ -46,7 +51,15 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     identity = {"target": read_description(folder, "target")["sha256"]}
     if settings.proposer.kind == "drafter":
         identity["drafter"] = read_description(_drafter_folder(settings, folder), "drafter")["sha256"]
+    if needs_calibration(settings.parts()):
+        identity["calibration"] = sha256_of(calibration_beside(folder))
     return identity
+
+
+def needs_calibration(method: MethodSettings) -> bool:
+    """Whether a part reads what `kerv calibrate` fitted."""
+    reference = method.threshold.kind in ("kinematic", "change") and method.threshold.k_s is None
+    return reference or (method.rectifier.kind == "compensate" and method.rectifier.predictor in FILTERS)
 
 
 def check(settings: RolloutSettings) -> None:
@@ -69,6 +82,12 @@ def check(settings: RolloutSettings) -> None:
         drafter = read_description(_drafter_folder(settings, folder), "drafter")
         if drafter["target"] != description["sha256"]:
             load_drafter_error(settings, folder, drafter["target"], description["sha256"])
+    if needs_calibration(settings.parts()):
+        calibration = load_calibration(
+            calibration_beside(folder), description["sha256"], description["settings"]["chunk"]
+        )
+        for name in resolve_tasks(settings.task):
+            calibration.threshold(settings.threshold, name)
 
 
 def load_drafter_error(settings: RolloutSettings, folder: Path, trained_for: str, target: str) -> None:
@@ -90,7 +109,7 @@ def _drafter_folder(settings: RolloutSettings, target: Path) -> Path:
 
 
 @functools.lru_cache(maxsize=2)
-def _load(target: Path, drafter: Path | None, device: str, dtype_name: str) -> Policy:
+def _load(target: Path, drafter: Path | None, calibrated: bool, device: str, dtype_name: str) -> Policy:
     from kerv_cli.runtime import DTYPES
 
     loaded, description = load_target(target, device, DTYPES[dtype_name])
@@ -99,7 +118,11 @@ def _load(target: Path, drafter: Path | None, device: str, dtype_name: str) -> P
     if drafter is not None:
         beside, described = load_drafter(drafter, loaded, description["sha256"])
         identity["drafter"] = described["sha256"]
-    return Policy(loaded, beside, identity)
+    calibration = None
+    if calibrated:
+        chunk = loaded.settings.chunk
+        calibration = load_calibration(calibration_beside(target), description["sha256"], chunk)
+    return Policy(loaded, beside, calibration, identity)
 
 
 def load_policy(settings: RolloutSettings) -> Policy:
@@ -107,7 +130,7 @@ def load_policy(settings: RolloutSettings) -> Policy:
     device, _ = set_up(settings.runtime)
     folder = find_target(settings.results, settings.policy.target)
     drafter = _drafter_folder(settings, folder) if settings.proposer.kind == "drafter" else None
-    return _load(folder, drafter, device, settings.runtime.dtype)
+    return _load(folder, drafter, needs_calibration(settings.parts()), device, settings.runtime.dtype)
 
 
 def build_decoder(policy: Policy, method: MethodSettings) -> Decoder:
@@ -135,7 +158,11 @@ def build_compensation(policy: Policy, method: MethodSettings) -> Compensation |
     if settings.kind == "reinfer":
         return None
     chunk = policy.target.settings
-    predictor = build_predictor(settings.predictor, chunk.dofs, {}, horizon=chunk.chunk, minimum=1, gripper=GRIPPER)
+    if policy.calibration is not None and settings.predictor in FILTERS:
+        predictor = policy.calibration.predictor(settings.predictor, horizon=chunk.chunk)
+    else:
+        least = PREDICTED_FROM.get(settings.predictor, MINIMUM)
+        predictor = build_predictor(settings.predictor, chunk.dofs, {}, least, horizon=chunk.chunk, gripper=GRIPPER)
     return Compensation(settings, predictor)
 
 
@@ -183,8 +210,12 @@ class Sampled:
         self.decoder.finish(success)
 
 
-def episode_decoder(policy: Policy, settings: RolloutSettings) -> ActionDecoder:
-    decoder = build_decoder(policy, settings.parts())
+def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> ActionDecoder:
+    """The method's decoder, with the task's own reference level where the threshold follows one."""
+    method = settings.parts()
+    if policy.calibration is not None:
+        method = dataclasses.replace(method, threshold=policy.calibration.threshold(method.threshold, task))
+    decoder = build_decoder(policy, method)
     if settings.deviation_every <= 0:
         return decoder
     return Sampled(decoder, Decoder(policy.target, MethodSettings()), settings.deviation_every)
@@ -235,7 +266,7 @@ def run_task(
 ) -> Iterator[EpisodeRecord]:
     """One method on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
     policy = load_policy(settings)
-    decoder = episode_decoder(policy, settings)
+    decoder = episode_decoder(policy, settings, task)
     warm_up(decoder, settings.world.camera)
     world = open_world(task, settings.world)
     logged = dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)

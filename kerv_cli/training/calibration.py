@@ -5,37 +5,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kerv_cli.drafting.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
+from kerv_cli.decoding.calibration import Calibration, calibration_beside, save_calibration
+from kerv_cli.drafting.kinematics import MINIMUM
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.files import read_json, write_json
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
-from kerv_cli.settings import CalibrateSettings, MethodSettings, RolloutSettings, ThresholdSettings, as_plain
+from kerv_cli.settings import CalibrateSettings, MethodSettings, RolloutSettings, as_plain
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.tasks import resolve_tasks, task
 from kerv_cli.training.prediction import (
     HISTORIES,
-    Errors,
     Windows,
     choose_episodes,
     fit_filters,
     prediction_errors,
     read_windows,
 )
-from kerv_cli.vla.action_tokens import CENTRES, GRIPPER, ActionTokenizer, values_of
+from kerv_cli.vla.action_tokens import CENTRES, ActionTokenizer, values_of
 
 if TYPE_CHECKING:
     from kerv_cli.rollouts.episode import ActionDecoder
     from kerv_cli.sim.demo_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
-FORMAT = 1
 PRESAMPLED = 6  # episodes per task that pre-sampling spreads its decodes over, where there are so many
 
 
@@ -81,108 +77,6 @@ def presample(decoder: ActionDecoder, episode: DemoEpisode, instruction: str, de
         if record.variability is not None:
             levels.append(record.variability)
     return levels
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What `calibration.json` holds. `boundary` and `skip` belong to §4.4 and §4.3 and may be empty."""
-
-    target: dict[str, Any]  # {"sha256", "chunk", "dofs"}
-    demos: dict[str, Any]  # {"sha256", "tasks": {task: {"training": episodes, "held_out": episodes}}}
-    window: int  # control steps of history
-    noise: dict[str, Noise]  # per kind of filter
-    errors: Errors
-    variability: dict[str, dict[str, float]]  # task -> {"k_s", "decodes", "p25", "p75", "p90"}
-    boundary: dict[str, Any] = field(default_factory=dict)
-    skip: dict[str, Any] = field(default_factory=dict)
-    provenance: dict[str, Any] = field(default_factory=dict)
-
-    def k_s(self, task: str) -> float:
-        """The task's reference level K_S, normalised action units.
-
-        Raises:
-            CheckpointError: the task was not pre-sampled.
-        """
-        if task not in self.variability:
-            raise CheckpointError(
-                f"the calibration has no reference level K_S for {task}, only for "
-                f"{', '.join(self.variability) or 'no task'}: run 'kerv calibrate task={task}'"
-            )
-        return float(self.variability[task]["k_s"])
-
-    def threshold(self, settings: ThresholdSettings, task: str) -> ThresholdSettings:
-        """`settings` with the task's K_S, where the kind needs one and none was given."""
-        if settings.kind not in ("kinematic", "change") or settings.k_s is not None:
-            return settings
-        return replace(settings, k_s=self.k_s(task))
-
-    def predictor(self, kind: str, minimum: int = MINIMUM, horizon: int = HORIZON) -> Predictor:
-        """The predictor `kind` with the fitted noise.
-
-        Raises:
-            UnknownName: no such predictor.
-        """
-        return build_predictor(kind, int(self.target["dofs"]), self.noise, minimum, self.window, horizon, GRIPPER)
-
-
-def calibration_beside(target: Path) -> Path:
-    """Shipped: pretrained/<name>/calibration.json; made here: artifacts/calibration/<name>/calibration.json."""
-    if target.name == "target":
-        return target.parent / "calibration.json"
-    if target.parent.name == "target":
-        return target.parent.parent / "calibration" / target.name / "calibration.json"
-    return target / "calibration.json"
-
-
-def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes `calibration` atomically."""
-    write_json(path, {"format": FORMAT, "kind": "calibration", **asdict(calibration)})
-
-
-def load_calibration(path: Path, target_sha256: str, chunk: int) -> Calibration:
-    """The calibration at `path`, which must have been made for this target.
-
-    Raises:
-        CheckpointError: missing, damaged, of another format, target or chunk length.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"no calibration at {path}: run 'kerv calibrate'")
-    value = read_json(path)
-    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, "calibration"):
-        raise CheckpointError(f"{path} is not a calibration of format {FORMAT}: run 'kerv calibrate' again")
-    try:
-        del value["format"], value["kind"]
-        value["noise"] = {
-            k: Noise(**{n: tuple(map(float, x)) for n, x in v.items()}) for k, v in value["noise"].items()
-        }
-        loaded = Calibration(**value)
-        _check(loaded)
-    except (KeyError, TypeError, ValueError, AttributeError, UsageError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}): run 'kerv calibrate' again") from error
-    if loaded.target["chunk"] != chunk:
-        steps = loaded.target["chunk"]
-        raise CheckpointError(f"{path} was made for chunks of {steps} steps, not of {chunk}: run 'kerv calibrate'")
-    if loaded.target["sha256"] != target_sha256:
-        raise CheckpointError(
-            f"{path} was made for target {str(loaded.target['sha256'])[:12]}, not for {target_sha256[:12]}: "
-            "run 'kerv calibrate'"
-        )
-    return loaded
-
-
-def _check(loaded: Calibration) -> None:
-    """Raises ValueError, KeyError or TypeError where a figure is missing or impossible."""
-    dofs = int(loaded.target["dofs"])
-    if not {"sha256", "chunk"} <= set(loaded.target):
-        raise ValueError("it does not name its target")
-    if set(loaded.noise) != set(FILTERS) or any(len(noise.q) != dofs for noise in loaded.noise.values()):
-        raise ValueError("the noise of a filter is missing")
-    if not isinstance(loaded.window, int) or loaded.window < MINIMUM:
-        raise ValueError(f"window {loaded.window}")
-    if any(not (math.isfinite(row["k_s"]) and row["k_s"] > 0) for row in loaded.variability.values()):
-        raise ValueError("a reference level is not a number above 0")
-    if not isinstance(loaded.boundary, dict) or not isinstance(loaded.skip, dict):
-        raise ValueError("boundary and skip must be sections")
 
 
 class CalibrationRun:
