@@ -1,0 +1,290 @@
+"""Retrieval: the demonstrations' action chunks, found by what the target itself sees (METHODS §4.1, §4.2; HeiSD).
+
+The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
+normalised again. The default is the scene segment alone, which holds the vision encoder's object and goal positions
+together with hand and gripper. Measured on MT10, nearest neighbour in another episode, its chunks agree best; pooled
+patch tokens agree worse and lower the agreement of what they are added to. The payload is the expert's next H actions
+as tokens.
+
+On disk: `vectors.npy` (rows, d) float32, `payload.parquet`, `manifest.json`; rows by task, seed, step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.drafting.groups import Groups, segments
+from kerv_cli.drafting.tree import ROOT, TokenTree
+from kerv_cli.errors import CheckpointError, UnknownName
+from kerv_cli.files import read_json, sha256_of
+from kerv_cli.settings import EVALUATION_SEED, TargetSettings
+
+FORMAT = 1
+FILES = ("vectors.npy", "payload.parquet")
+REQUIRED = ("key", "width", "rows", "chunk", "dofs", "actions", "target", "demos", "files", "tasks")
+ROUNDING = 1e-5  # bounds the rounding of a float32 product of unit vectors
+CROSS = 0.1  # probability that a path leaves the neighbours that it has followed
+COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
+
+
+def segments_of(settings: TargetSettings) -> dict[str, slice]:
+    """Where the prompt's parts lie; instructions are left out, they are the same within a task."""
+    vision = settings.grid**2 if settings.observation == "vision" else 0
+    scene = vision + settings.instruction_tokens
+    end = scene + settings.scene_tokens
+    parts = {"scene": slice(scene, end), "proprioception": slice(end, end + 1)}
+    return {"vision": slice(0, vision), **parts} if vision else parts
+
+
+def prompt_key(prompt: Tensor, settings: TargetSettings, segments: Sequence[str]) -> np.ndarray:
+    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
+
+    Raises:
+        UnknownName: a segment that this target's prompt does not have.
+    """
+    known = segments_of(settings)
+    for name in segments:
+        if name not in known:
+            raise UnknownName("part of the prompt", name, known)
+    pooled = [torch.nn.functional.normalize(prompt[:, known[name]].float().mean(1), dim=-1) for name in segments]
+    return torch.nn.functional.normalize(torch.cat(pooled, -1), dim=-1).cpu().numpy()
+
+
+def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
+    """Prove that training and evaluation share no world: seeds per task, all below the first evaluation seed.
+
+    Raises:
+        CheckpointError: one is not.
+    """
+    for task, used in seeds.items():
+        shared = [seed for seed in used if seed >= EVALUATION_SEED]
+        if shared:
+            raise CheckpointError(
+                f"{where} holds seed {shared[0]} of {task}: seeds from {EVALUATION_SEED} on are for evaluation, "
+                "retrieval would know the worlds it is judged on; build it from training demonstrations"
+            )
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The k nearest entries, best first; equal scores in the datastore's order."""
+
+    similarity: np.ndarray  # (k,) float32, cosine
+    chunks: np.ndarray  # (k, N) int64 tokens
+    seeds: np.ndarray  # (k,) int64, the stored episodes
+    steps: np.ndarray  # (k,) int64, control step of the stored episode
+    left: np.ndarray  # (k,) int64, control steps from there to the stored episode's end
+
+    def __len__(self) -> int:
+        return len(self.similarity)
+
+
+@dataclass(frozen=True)
+class Datastore:
+    """An opened datastore. shards: task -> its rows."""
+
+    manifest: dict[str, Any]
+    vectors: np.ndarray  # (rows, d) float32
+    tokens: np.ndarray  # (rows, N) uint8
+    seeds: np.ndarray  # (rows,) int64, as the next two
+    steps: np.ndarray
+    left: np.ndarray
+    shards: dict[str, slice]
+
+    @classmethod
+    def open(cls, folder: Path, description: Mapping[str, Any]) -> Datastore:
+        """description: the target's, as `load_target` returns it.
+
+        Raises:
+            CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
+                statistics or another chunk length, or from evaluation seeds.
+        """
+        manifest = read_manifest(folder)
+        check_target(manifest, description, folder)
+        try:
+            vectors = np.load(folder / FILES[0])
+            payload = _read_payload(folder / FILES[1])
+            shards = {task: slice(*shard["rows"]) for task, shard in manifest["tasks"].items()}
+            rows, size = manifest["rows"], manifest["chunk"] * manifest["dofs"]
+            fits = vectors.shape == (rows, manifest["width"]) and payload["tokens"].shape == (rows, size)
+        except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
+            raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
+        if not fits:
+            raise CheckpointError(f"the datastore in {folder} is damaged: its files differ in length, build it again")
+        return cls(manifest, vectors, shards=shards, **payload)
+
+    def key(self, prompt: Tensor, settings: TargetSettings) -> np.ndarray:
+        """prompt (1, P, E) of the target -> (d,) float32."""
+        return prompt_key(prompt, settings, self.manifest["key"])[0]
+
+    def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
+        """Exact search among the entries of `task`: key (d,) -> its k nearest (all, where there are fewer).
+
+        without: seed of an episode that is passed over, for leave-one-episode-out measurements.
+
+        Raises:
+            UnknownName: a task that the datastore does not hold.
+        """
+        if task not in self.shards:
+            raise UnknownName("task of the datastore", task, self.shards)
+        shard = self.shards[task]
+        key = np.asarray(key, dtype=np.float32)
+        scores = self.vectors[shard] @ key
+        rows = np.arange(len(scores)) if without is None else np.flatnonzero(self.seeds[shard] != without)
+        if k < len(rows):
+            least = np.partition(scores[rows], len(rows) - k)[len(rows) - k]
+            rows = rows[scores[rows] >= least - ROUNDING]
+        # the product's last bit depends on a row's place in the shard: what is near is compared in float64
+        near = self.vectors[shard][rows].astype(np.float64)
+        similarity = np.einsum("ij,j->i", near, key.astype(np.float64)).astype(np.float32)
+        order = np.argsort(-similarity, kind="stable")[:k]
+        at = rows[order] + shard.start
+        chunks = self.tokens[at].astype(np.int64)
+        return Neighbours(similarity[order], chunks, self.seeds[at], self.steps[at], self.left[at])
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a datastore whose files are as they were written and whose seeds are training seeds.
+
+    Raises:
+        CheckpointError: missing, damaged, of another format, or from evaluation seeds.
+    """
+    path = folder / "manifest.json"
+    if not path.is_file():
+        raise CheckpointError(f"no datastore in {folder}: build one with 'kerv build datastore'")
+    manifest = read_json(path)
+    if not isinstance(manifest, dict) or (manifest.get("format"), manifest.get("kind")) != (FORMAT, "datastore"):
+        raise CheckpointError(f"{path} is not a datastore of format {FORMAT}: build it again")
+    missing = [name for name in REQUIRED if name not in manifest]
+    if missing:
+        raise CheckpointError(f"{path} is damaged, it has no {missing[0]}: build the datastore again")
+    try:
+        for name in FILES:
+            if sha256_of(folder / name) != manifest["files"][name]:
+                raise CheckpointError(f"{folder / name} does not match its manifest: build the datastore again")
+        check_seeds({task: shard["seeds"] for task, shard in manifest["tasks"].items()}, folder)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}): build the datastore again") from error
+    return manifest
+
+
+def check_target(manifest: Mapping[str, Any], description: Mapping[str, Any], folder: Path) -> None:
+    """Refuse a datastore whose keys or tokens mean something else to this target.
+
+    Raises:
+        CheckpointError: another chunk length, other action statistics, other weights.
+    """
+    settings, again = description["settings"], "build one with 'kerv build datastore'"
+    if (manifest["chunk"], manifest["dofs"]) != (settings["chunk"], settings["dofs"]):
+        raise CheckpointError(
+            f"the datastore in {folder} holds chunks of {manifest['chunk']} steps of {manifest['dofs']} DoFs, the "
+            f"target decodes {settings['chunk']} of {settings['dofs']}: {again}"
+        )
+    if manifest["actions"] != description["actions"]:
+        raise CheckpointError(
+            f"the datastore in {folder} was made with other action statistics than the target's, the same token is "
+            f"another action there: {again}"
+        )
+    if manifest["target"] != description["sha256"]:
+        raise CheckpointError(
+            f"the datastore in {folder} was built for target {manifest['target'][:12]}, not for "
+            f"{description['sha256'][:12]}: {again}"
+        )
+
+
+def _read_payload(path: Path) -> dict[str, np.ndarray]:
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    columns = {name: table[column].to_numpy() for name, column in COLUMNS.items()}
+    flat = table["tokens"].combine_chunks().flatten().to_numpy()
+    return {"tokens": flat.reshape(len(table), -1), **columns}
+
+
+def neighbour_tree(
+    chunks: np.ndarray,
+    start: int,
+    groups: Groups,
+    nodes: int = 50,
+    depth: int | None = None,
+    cross: float = CROSS,
+) -> TokenTree:
+    """The neighbours' chunks behind `start` committed tokens as one tree, merged by kinematic group (METHODS §4.2).
+
+    chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
+    neighbour's next one, but a gripper's group always comes from a neighbour that gave the group before it, too. The
+    tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
+
+    Which groups are kept is *ours*: the most probable ones, when the i-th neighbour has weight 1 / i and a path leaves
+    the neighbours that it has followed with probability `cross`; 0 keeps to the neighbours' own chunks.
+    """
+    stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
+    cuts = list(segments(start, stop, groups))
+    rows: list[list[int]] = chunks.tolist()
+    tokens: list[int] = []
+    parents: list[int] = []
+    children: dict[tuple[int, int], int] = {}
+    order = count()
+    waiting: list[tuple[float, int, int, int, tuple[int, ...], Followed]] = []
+
+    def offer(parent: int, level: int, behind: Followed, cost: float) -> None:
+        if level < len(cuts):
+            for group, ahead, probability in _next_groups(rows, cuts[level], behind, cross):
+                heappush(waiting, (cost - math.log(probability), next(order), parent, level, group, ahead))
+
+    offer(ROOT, 0, (range(len(rows)), range(len(rows))), 0.0)
+    while waiting and len(tokens) < nodes:
+        cost, _, node, level, group, behind = heappop(waiting)
+        if len(tokens) + len(group) - _shared(children, node, group) > nodes:
+            continue  # a group is in the tree as a whole or not at all
+        for token in group:
+            if (node, token) not in children:
+                children[node, token] = len(tokens)
+                tokens.append(token)
+                parents.append(node)
+            node = children[node, token]
+        offer(node, level + 1, behind, cost)
+    return TokenTree.build(tokens, parents)
+
+
+Followed = tuple[Sequence[int], Sequence[int]]
+"""Behind a path: the neighbours that gave its last group, and those of them that gave the groups before it, too."""
+
+
+def _next_groups(
+    rows: list[list[int]], cut: tuple[int, int, bool], behind: Followed, cross: float
+) -> Iterator[tuple[tuple[int, ...], Followed, float]]:
+    """The groups that a path may go on with: tokens, what then lies behind it, probability."""
+    (first, last, gripper), (gave, followed) = cut, behind
+    pool = gave if gripper else range(len(rows))
+    givers: dict[tuple[int, ...], list[int]] = {}
+    for i in pool:
+        givers.setdefault(tuple(rows[i][first:last]), []).append(i)
+    for group, given in givers.items():
+        staying = [i for i in given if i in followed]
+        probability = (1 - cross) * _weight(staying) / _weight(followed) + cross * _weight(given) / _weight(pool)
+        if probability > 0:
+            yield group, (given, staying or given), probability
+
+
+def _weight(neighbours: Sequence[int]) -> float:
+    return sum(1 / (1 + i) for i in neighbours)
+
+
+def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
+    """How many of the group's first tokens are in the tree already."""
+    for depth, token in enumerate(group):
+        if (node, token) not in children:
+            return depth
+        node = children[node, token]
+    return len(group)

@@ -1,0 +1,471 @@
+"""The datastore: search against brute force, what an entry holds, what is refused, and the tree of the neighbours."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from kerv_cli.commands import build as command
+from kerv_cli.drafting import datastore_build
+from kerv_cli.drafting.datastore import Datastore, check_seeds, neighbour_tree, prompt_key, segments_of
+from kerv_cli.drafting.datastore_build import DatastoreBuild, leave_one_out
+from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
+from kerv_cli.drafting.tree import TokenTree, merge
+from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
+from kerv_cli.files import read_json, sha256_of, write_json
+from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
+from kerv_cli.sim.demo_dataset import dataset_hash, episode_path
+from kerv_cli.sim.demo_file import FORMAT, DemoEpisode, save_episode
+from kerv_cli.vla.checkpoint import load_target
+
+TASKS = ("drawer-close-v3", "reach-v3")
+LENGTHS = {0: 9, 1: 6, 7: 11}  # seed -> control steps
+TAIL = 8
+
+
+def label_of(task: str, seed: int, step: int) -> np.ndarray:
+    """An action that tells which episode and step it belongs to."""
+    return np.array([seed / 10, step / 25, TASKS.index(task) / 2, -1 if step < 5 else 1], dtype=np.float32)
+
+
+def episode(task: str, seed: int, steps: int, tail: int = TAIL, size: int = 96) -> DemoEpisode:
+    rng = np.random.default_rng([seed, TASKS.index(task)])
+    labels = np.stack([label_of(task, seed, t) for t in range(steps + tail)])
+    frame_steps = np.arange(0, steps, 2)
+    frames = rng.integers(0, 255, (len(frame_steps), size, size, 3), dtype=np.uint8)
+    states = rng.uniform(0, 0.5, (steps, 39)).astype(np.float32)
+    executed = labels[:steps].copy()
+    return DemoEpisode(task, seed, False, steps, frames, frame_steps, states, labels, executed, np.zeros(3))
+
+
+def write_demos(folder: Path, lengths: dict[int, int], tail: int = TAIL, size: int = 96) -> dict[str, Any]:
+    """A recorded dataset of both tasks, as `kerv demos` leaves it."""
+    tasks: dict[str, Any] = {}
+    for task in reversed(TASKS):
+        tasks[task] = {"episodes": []}
+        for seed, steps in lengths.items():
+            path = episode_path(folder, task, seed)
+            save_episode(path, episode(task, seed, steps, tail, size))
+            described: dict[str, Any] = {"seed": seed, "perturbed": False, "steps": steps}
+            described |= {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+            tasks[task]["episodes"].append(described)
+    manifest = {"format": FORMAT, "config": {}, "tasks": tasks, "sha256": dataset_hash(tasks)}
+    write_json(folder / "manifest.json", manifest)
+    return manifest
+
+
+@pytest.fixture(scope="module")
+def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Policies, demonstrations and a datastore of each policy."""
+    results = tmp_path_factory.mktemp("datastore") / "results"
+    shutil.copytree(policies, results)
+    write_demos(results / "artifacts/demos/few", LENGTHS)
+    for name in ("nano-state", "nano-vision"):
+        DatastoreBuild(asked(results, name)).build()
+    return results
+
+
+@pytest.fixture
+def copy(results: Path, tmp_path: Path) -> Path:
+    """A copy that a test may change."""
+    return Path(shutil.copytree(results, tmp_path / "results"))
+
+
+def asked(results: Path, target: str = "nano-state", **changes: Any) -> BuildDatastoreSettings:
+    chosen = BuildDatastoreSettings(PolicySettings(target), demos="few", task=list(TASKS), results=str(results))
+    return replace(chosen, **changes)
+
+
+def folder_of(results: Path, name: str = "nano-state") -> Path:
+    return results / "artifacts/datastore" / name
+
+
+def opened(results: Path, name: str = "nano-state") -> tuple[Datastore, Any, dict[str, Any]]:
+    target, description = load_target(results / "artifacts/target" / name)
+    return Datastore.open(folder_of(results, name), description), target, description
+
+
+def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | None = None) -> Datastore:
+    rows = np.arange(len(vectors))
+    tokens = np.stack([rows % 251, rows // 251], 1).astype(np.uint8)  # tell the row
+    return Datastore({}, vectors, tokens, rows if seeds is None else seeds, rows, rows, shards)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(0, 20), st.integers(1, 12), st.integers(1, 4))
+def test_the_search_is_brute_force_with_ties_in_stored_order(seed: int, n: int, before: int, k: int, span: int) -> None:
+    """Small whole numbers, so that scores are exact and ties are many."""
+    rng = np.random.default_rng(seed)
+    vectors = rng.integers(-span, span + 1, (before + n, 3)).astype(np.float32)
+    seeds = rng.integers(0, 3, before + n)
+    store = store_of(vectors, {"a": slice(0, before), "b": slice(before, before + n)}, seeds)
+    key = rng.integers(-span, span + 1, 3).astype(np.float32)
+    for without in (None, 1):
+        ranked = [row for row in range(before, before + n) if without is None or seeds[row] != without]
+        ranked = sorted(ranked, key=lambda row: -sum(int(a) * int(b) for a, b in zip(vectors[row], key, strict=True)))
+        ranked = ranked[:k]
+        found = store.query(key, "b", k, without)
+        assert found.steps.tolist() == ranked
+        assert found.similarity.dtype == np.float32
+        assert found.similarity.tolist() == [float(vectors[row] @ key) for row in ranked]
+        assert found.chunks.tolist() == [[row % 251, row // 251] for row in ranked]
+
+
+def test_the_search_is_exact_at_real_size_and_duplicates_keep_their_order() -> None:
+    rng = np.random.default_rng(0)
+    for rows, width in ((9001, 192), (6, 1024), (1999, 128), (10, 32)):
+        vectors = rng.normal(size=(rows, width)).astype(np.float32)
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        copies = [1, 2, rows // 2, rows - 2, rows - 1]
+        vectors[copies] = vectors[1]
+        store = store_of(vectors, {"a": slice(0, rows)})
+        for key in vectors[[1, 3, rows // 3]]:
+            twins = [row for row in store.query(key, "a", rows).steps.tolist() if row in copies]
+            assert twins == copies
+            found = store.query(key, "a", 5)
+            exact = (vectors.astype(np.float64) @ key.astype(np.float64)).astype(np.float32)
+            assert found.steps.tolist() == np.argsort(-exact, kind="stable")[:5].tolist()
+            assert found.similarity == pytest.approx(exact[found.steps], abs=1e-6)
+
+
+def test_a_task_that_is_not_there_gets_one_line(results: Path) -> None:
+    store, _, _ = opened(results)
+    with pytest.raises(UnknownName, match="unknown task of the datastore 'reach': did you mean reach-v3") as caught:
+        store.query(store.vectors[0], "reach", 1)
+    assert isinstance(caught.value, KervError)
+
+
+def entries(store: Datastore) -> list[tuple[str, int, int]]:
+    tasks = [task for task, shard in store.shards.items() for _ in range(shard.start, shard.stop)]
+    return list(zip(tasks, store.seeds.tolist(), store.steps.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(("name", "stride"), [("nano-state", 1), ("nano-vision", 2)])
+def test_every_observed_step_is_one_entry_by_task_seed_and_step(results: Path, name: str, stride: int) -> None:
+    store, _, _ = opened(results, name)
+    expected = [(task, s, t) for task in TASKS for s, steps in LENGTHS.items() for t in range(0, steps, stride)]
+    assert entries(store) == sorted(expected) == expected
+    assert store.left.tolist() == [LENGTHS[seed] - step for _, seed, step in expected]
+    assert np.linalg.norm(store.vectors, axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_chunk_is_what_follows_in_its_own_episode(results: Path) -> None:
+    """The last entries' chunks run into the labels recorded beyond the success, never into the next episode."""
+    store, target, _ = opened(results)
+    for row, (task, seed, step) in enumerate(entries(store)):
+        expected = np.stack([label_of(task, seed, t) for t in range(step, step + 4)])
+        assert store.tokens[row].tolist() == target.actions.encode(expected).ravel().tolist()
+
+
+@pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
+def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> None:
+    from kerv_cli.sim.tasks import task as task_of
+
+    store, target, _ = opened(results, name)
+    shown = episode("reach-v3", 1, LENGTHS[1])
+    with torch.inference_mode():
+        for step in (0, 4):
+            inputs = target.inputs(
+                shown.frames[step // 2], shown.states[step], target.words_of(task_of("reach").instruction)
+            )
+            prompt, _ = target.encode(inputs)
+            found = store.query(store.key(prompt, target.settings), "reach-v3", 3)
+            assert (found.seeds[0], found.steps[0], found.left[0]) == (1, step, LENGTHS[1] - step)
+            assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
+            assert (np.diff(found.similarity) <= 0).all()
+            assert (found.chunks.shape, found.chunks.dtype) == ((3, 16), np.int64)
+
+
+def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
+    _, target, _ = opened(results, "nano-vision")
+    shape = target.settings
+    prompt = torch.randn(2, target.prompt_length, shape.width)
+    vision, scene, hand = prompt[:, :4].mean(1), prompt[:, 14:16].mean(1), prompt[:, 16]
+    unit = [x / x.norm(dim=-1, keepdim=True) for x in (vision, scene, hand)]
+    assert np.allclose(prompt_key(prompt, shape, ["scene"]), unit[1], atol=1e-6)
+    whole = prompt_key(prompt, shape, ["vision", "scene", "proprioception"])
+    assert np.allclose(whole, torch.cat(unit, -1) / 3**0.5, atol=1e-6)
+    assert whole.dtype == np.float32
+    assert list(segments_of(replace(shape, observation="state"))) == ["scene", "proprioception"]
+    assert segments_of(shape)["proprioception"].stop == target.prompt_length
+
+
+def test_fewer_entries_than_asked_for_are_all_given(results: Path) -> None:
+    store, _, _ = opened(results)
+    rows = sum(LENGTHS.values())
+    assert len(store.query(store.vectors[0], TASKS[0], 1000)) == rows
+    assert len(store.query(store.vectors[0], TASKS[0], 1000, without=7)) == rows - LENGTHS[7]
+
+
+def test_the_first_episodes_and_tasks_can_be_asked_for(copy: Path) -> None:
+    store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, name="small", key=["proprioception"])).build()
+    assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
+    assert store.manifest["tasks"] == {"reach-v3": {"rows": [0, 15], "seeds": [0, 1]}}
+    figures = leave_one_out(store)
+    assert 0 < figures["token_agreement"] <= figures["within_9"] <= 1
+
+
+def test_the_manifest_says_where_everything_comes_from(results: Path) -> None:
+    store, _, description = opened(results)
+    demos = read_json(results / "artifacts/demos/few/manifest.json")
+    manifest = store.manifest
+    assert (manifest["target"], manifest["demos"]) == (description["sha256"], demos["sha256"])
+    assert (manifest["chunk"], manifest["dofs"], manifest["rows"]) == (4, 4, 52)
+    assert {tuple(shard["seeds"]) for shard in manifest["tasks"].values()} == {tuple(LENGTHS)}
+    assert manifest["first_evaluation_seed"] == EVALUATION_SEED
+    assert {"versions", "git_commit", "settings"} <= set(manifest["provenance"])
+    assert sorted(p.name for p in folder_of(results).iterdir()) == ["manifest.json", "payload.parquet", "vectors.npy"]
+
+
+def test_training_and_evaluation_seeds_are_proved_disjoint(results: Path, tmp_path: Path) -> None:
+    check_seeds({"reach-v3": [0, EVALUATION_SEED - 1]}, "here")
+    with pytest.raises(CheckpointError, match="here holds seed 100000 of reach-v3"):
+        check_seeds({"push-v3": [1], "reach-v3": [0, EVALUATION_SEED]}, "here")
+    shutil.copytree(results / "artifacts/target", tmp_path / "artifacts/target")
+    write_demos(tmp_path / "artifacts/demos/few", {0: 5, EVALUATION_SEED + 3: 5})
+    with pytest.raises(CheckpointError, match="seed 100003 of drawer-close-v3: seeds from 100000 on"):
+        DatastoreBuild(asked(tmp_path))
+
+
+Change = Callable[[dict[str, Any]], None]
+
+
+def rewrite(folder: Path, change: Change) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda m: m.update(target="f" * 64), "was built for target ffffffffffff, not for"),
+        (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "other action statistics"),
+        (lambda m: m.update(chunk=8), "holds chunks of 8 steps of 4 DoFs, the target decodes 4 of 4"),
+        (lambda m: m.update(dofs=7), "4 steps of 7 DoFs"),
+        (lambda m: m["tasks"]["reach-v3"]["seeds"].append(EVALUATION_SEED), "holds seed 100000 of reach-v3"),
+        (lambda m: m.update(format=99), "is not a datastore of format 1"),
+        (lambda m: m.update(kind="drafter"), "is not a datastore of format 1"),
+        (lambda m: m.update(rows=3), "files differ in length"),
+        (lambda m: m.pop("files"), "is damaged, it has no files"),
+        (lambda m: m.pop("tasks"), "it has no tasks"),
+        (lambda m: m.update(tasks=[]), "is damaged ("),
+        (lambda m: m["tasks"]["reach-v3"].pop("rows"), "is damaged ('rows')"),
+        (lambda m: m.pop("actions"), "it has no actions"),
+    ],
+)
+def test_a_datastore_that_does_not_belong_here_is_refused(copy: Path, change: Change, says: str) -> None:
+    rewrite(folder_of(copy), change)
+    with pytest.raises(CheckpointError) as caught:
+        opened(copy)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda f: cut(f / "vectors.npy"), "vectors.npy does not match its manifest"),
+        (lambda f: cut(f / "payload.parquet"), "payload.parquet does not match its manifest"),
+        (lambda f: (f / "payload.parquet").unlink(), "payload.parquet cannot be read"),
+        (lambda f: cut(f / "manifest.json"), "cannot be read as JSON"),
+        (lambda f: (f / "manifest.json").write_text("[]"), "is not a datastore of format 1"),
+        (lambda f: shutil.rmtree(f), "no datastore in"),
+    ],
+)
+def test_a_damaged_datastore_is_refused(copy: Path, damage: Callable[[Path], None], says: str) -> None:
+    damage(folder_of(copy))
+    with pytest.raises(CheckpointError) as caught:
+        opened(copy)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "says"),
+    [
+        ({"key": ["scen"]}, UnknownName, "unknown key 'scen': did you mean scene"),
+        ({"key": ["vision"]}, UnknownName, "unknown key 'vision'"),  # a state policy has none
+        ({"key": []}, UsageError, "name a key"),
+        ({"episodes": -1}, UsageError, "episodes from 0 on"),
+        ({"task": ["push"]}, CheckpointError, "hold no episode of push-v3"),
+        ({"demos": "none"}, CheckpointError, "no demonstrations in"),
+        ({"policy": PolicySettings("none")}, CheckpointError, "no target 'none'"),
+    ],
+)
+def test_what_cannot_be_built_is_refused_at_once(
+    results: Path, changes: dict[str, Any], error: type[Exception], says: str
+) -> None:
+    with pytest.raises(error) as caught:
+        DatastoreBuild(asked(results, **changes))
+    assert says in str(caught.value)
+
+
+def test_demonstrations_that_do_not_fit_the_target_are_refused(copy: Path) -> None:
+    write_demos(copy / "artifacts/demos/few", LENGTHS, tail=2)
+    with pytest.raises(CheckpointError, match="2 labels behind an episode's end, chunks of 4 need 3"):
+        DatastoreBuild(asked(copy)).build()
+    write_demos(copy / "artifacts/demos/few", LENGTHS, size=32)
+    with pytest.raises(CheckpointError, match="frames have 32 pixels, the policy takes 96"):
+        DatastoreBuild(asked(copy, "nano-vision")).build()
+    assert opened(copy)[0].manifest["rows"] == 52  # what was there still is
+
+
+def test_only_a_datastore_is_ever_replaced(copy: Path) -> None:
+    other = copy / "artifacts/datastore/other"
+    other.mkdir()
+    assert DatastoreBuild(asked(copy, name="other")).folder == other
+    (other / "thesis.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="exists and is no datastore"):
+        DatastoreBuild(asked(copy, name="other"))
+    with pytest.raises(UsageError, match="exists and is no datastore"):
+        DatastoreBuild(asked(copy, name=str(copy / "artifacts/target/nano-state")))
+
+
+def refuse_second(stage: str) -> Callable[..., Any]:
+    real = getattr(datastore_build, stage)
+
+    def failing(*arguments: Any, **options: Any) -> Any:
+        real(*arguments, **options)
+        raise OSError(28, "No space left on device")
+
+    return failing
+
+
+@pytest.mark.parametrize("stage", ["_write", "write_json", "sha256_of"])
+@pytest.mark.parametrize("before", [True, False])
+def test_a_build_that_fails_leaves_what_was_there(
+    copy: Path, monkeypatch: pytest.MonkeyPatch, stage: str, before: bool
+) -> None:
+    if not before:
+        shutil.rmtree(folder_of(copy))
+    parent = folder_of(copy).parent
+    names = sorted(p.name for p in parent.iterdir())
+    monkeypatch.setattr(datastore_build, stage, refuse_second(stage))
+    with pytest.raises(StorageError, match="the disk is full"):
+        DatastoreBuild(asked(copy, episodes=1)).build()
+    assert sorted(p.name for p in parent.iterdir()) == names
+    if before:
+        assert opened(copy)[0].manifest["rows"] == 52
+
+
+def test_a_failed_exchange_puts_the_old_one_back(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Path.rename
+
+    def rename(self: Path, target: Path) -> Path:
+        if ".new." in self.name:
+            raise OSError(13, "Permission denied")
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    with pytest.raises(StorageError, match="permission denied"):
+        DatastoreBuild(asked(copy, episodes=1)).build()
+    assert opened(copy)[0].manifest["rows"] == 52
+    assert sorted(p.name for p in folder_of(copy).parent.iterdir()) == ["nano-state", "nano-vision"]
+
+
+def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:
+    first = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
+    DatastoreBuild(asked(copy, episodes=1)).build()
+    assert opened(copy)[0].manifest["rows"] == 2 * LENGTHS[0]
+    DatastoreBuild(asked(copy)).build()
+    again = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
+    assert again["vectors.npy"] == first["vectors.npy"]
+    assert again["payload.parquet"] == first["payload.parquet"]
+
+
+def test_the_command_builds_and_reports(copy: Path) -> None:
+    words = ["datastore", "policy.target=nano-state", "demos=few", "task=reach,drawer-close", f"results={copy}"]
+    run = CliRunner().invoke(command.app, [*words, "--cfg"])
+    assert run.exit_code == 0, run.output
+    assert "key:\n- scene" in run.output
+    run = CliRunner().invoke(command.app, [*words, "--plan"])
+    assert "6 demonstrations of 2 tasks, 52 control steps" in run.output
+    shutil.rmtree(folder_of(copy))
+    run = CliRunner().invoke(command.app, words)
+    assert run.exit_code == 0, run.output
+    assert "token_agreement" in run.output
+    assert opened(copy)[0].manifest["rows"] == 52
+    run = CliRunner().invoke(command.app, [*words, "key=[smell]"])
+    assert run.exit_code == 2
+    assert run.output.startswith("kerv: unknown key 'smell'")
+
+
+@st.composite
+def neighbours(draw: st.DrawFn) -> tuple[np.ndarray, Groups]:
+    groups = draw(st.sampled_from([kinematic_groups(4), kinematic_groups(7)]))
+    dofs = sum(map(len, groups))
+    k, steps = draw(st.integers(1, 4)), draw(st.integers(1, 2))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return rng.integers(0, draw(st.integers(1, 3)), (k, steps * dofs)), groups
+
+
+def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
+    inner = set(tree.parents)
+    return [tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree)) if n not in inner]
+
+
+def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[tuple[int, ...]]:
+    """METHODS §4.2 read aloud: one neighbour per group; a gripper's group from one that gave the group before it."""
+    found = set()
+    for owners in product(range(len(chunks)), repeat=len(cuts)):
+        parts = [tuple(chunks[i, a:b].tolist()) for i, (a, b, _) in zip(owners, cuts, strict=True)]
+        if all(
+            not gripper or n == 0 or tuple(chunks[owners[n], slice(*cuts[n - 1][:2])].tolist()) == parts[n - 1]
+            for n, (_, _, gripper) in enumerate(cuts)
+        ):
+            found.add(tuple(token for part in parts for token in part))
+    return found
+
+
+@settings(deadline=None)
+@given(neighbours(), st.integers(0, 13), st.integers(1, 14))
+def test_with_room_the_tree_holds_every_combination_of_groups(
+    given_: tuple[np.ndarray, Groups], start: int, depth: int
+) -> None:
+    chunks, groups = given_
+    cuts = list(segments(start, min(chunks.shape[1], start + depth), groups))
+    tree = neighbour_tree(chunks, start, groups, nodes=100_000, depth=depth)
+    assert set(leaves(tree)) == (combinations(chunks, cuts) if cuts else set())
+    assert len(set(zip(tree.parents, tree.tokens, strict=True))) == len(tree)  # no twins
+    own = neighbour_tree(chunks, start, groups, nodes=100_000, depth=depth, cross=0.0)
+    assert set(leaves(own)) == set(leaves(merge(chunks[:, start : start + depth].tolist())))
+
+
+@settings(deadline=None)
+@given(neighbours(), st.integers(0, 7), st.integers(0, 30), st.sampled_from([0.0, 0.1, 1.0]))
+def test_under_the_cap_every_path_is_made_of_whole_groups_of_the_neighbours(
+    given_: tuple[np.ndarray, Groups], start: int, nodes: int, cross: float
+) -> None:
+    chunks, groups = given_
+    cuts = list(segments(start, chunks.shape[1], groups))
+    tree = neighbour_tree(chunks, start, groups, nodes=nodes, cross=cross)
+    assert len(tree) <= nodes
+    whole = {last - start: n + 1 for n, (_, last, _) in enumerate(cuts)}
+    for path in leaves(tree):
+        assert path in combinations(chunks, cuts[: whole[len(path)]])
+
+
+def test_the_nearest_neighbours_chunk_comes_first() -> None:
+    chunks = np.random.default_rng(0).integers(0, 255, (5, 16))
+    assert leaves(neighbour_tree(chunks, 1, kinematic_groups(4), nodes=15)) == [tuple(chunks[0, 1:])]
+    more = leaves(neighbour_tree(chunks, 1, kinematic_groups(4), nodes=30))
+    assert {tuple(chunks[0, 1:]), tuple(chunks[1, 1:])} <= set(more)
+    assert len(neighbour_tree(chunks, 16, kinematic_groups(4))) == 0
+    assert len(neighbour_tree(chunks[:0], 0, kinematic_groups(4))) == 0
