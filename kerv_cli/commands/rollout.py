@@ -79,7 +79,11 @@ def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[Ep
     from rich.table import Table
 
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
-    table = Table(*headers, title=f"{settings.method}, seeds {settings.seed}…{settings.seed + settings.episodes - 1}")
+    from kerv_cli.rollouts.run import identity_of
+
+    seen = identity_of(settings)["observation"]
+    last = settings.seed + settings.episodes - 1
+    table = Table(*headers, title=f"{settings.method}, observation {seen}, seeds {settings.seed}…{last}")
     phases = Table("phase", "ms per decode", "share", title="time by phase")
     for name in (*tasks, "all") if len(tasks) > 1 else tasks:
         table.add_row(name, *_figures([r for r in records if name in ("all", r.task)]))

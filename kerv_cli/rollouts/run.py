@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,12 +49,19 @@ class Policy:
 def identity_of(settings: RolloutSettings) -> dict[str, str]:
     """Hashes of the weights that determine a result, without loading them."""
     folder = find_target(settings.results, settings.policy.target)
-    identity = {"target": read_description(folder, "target")["sha256"]}
+    description = read_description(folder, "target")
+    identity = {"target": description["sha256"], "observation": observation_of(description)}
     if settings.proposer.kind == "drafter":
         identity["drafter"] = read_description(_drafter_folder(settings, folder), "drafter")["sha256"]
     if needs_calibration(settings.parts()):
         identity["calibration"] = sha256_of(calibration_beside(folder))
     return identity
+
+
+def observation_of(description: Mapping[str, Any]) -> str:
+    """What the target is shown, for every row: one that is given the scene must not pass for one that sees it."""
+    kind = description["settings"]["observation"]
+    return "state (privileged)" if kind == "state" else str(kind)
 
 
 def needs_calibration(method: MethodSettings) -> bool:

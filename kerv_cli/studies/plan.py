@@ -15,6 +15,9 @@ from kerv_cli.settings import RolloutSettings
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
 
+OBSERVATION = "observation"
+"""The identity's one entry that is no hash: what the target is shown. The target's hash implies it."""
+
 # Of RolloutSettings, what leaves an episode's result as it is: where it is written, what is recorded of it, how it is
 # called. Task and seeds enter the id as the cell's own, the policy through its hashes. A field that is not named here
 # counts, so a setting that is added later makes new cells instead of being overlooked.
@@ -59,7 +62,7 @@ def determinants(
     policy = _without(settings["policy"], _NOT_DETERMINING_POLICY)
     return {
         "settings": kept,
-        "policy": {**policy, **{f"{name}_sha256": value for name, value in identity.items()}},
+        "policy": {**policy, **{f"{name}_sha256": value for name, value in identity.items() if name != OBSERVATION}},
         "task": task,
         "seeds": list(seeds),
         "kerv": version,

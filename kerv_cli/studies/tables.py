@@ -13,7 +13,7 @@ import pandas as pd
 from kerv_cli.files import atomic_path
 from kerv_cli.sim.tasks import TASKS
 from kerv_cli.studies.measures import MACRO, MICRO, Measured, measure
-from kerv_cli.studies.plan import Cell, seeds_text
+from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.provenance import PACKAGES
 from kerv_cli.studies.store import StoredCell, StudyStore
@@ -147,7 +147,8 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> dict[str, Any]:
         **flatten(parts),
         "target": policy["target"],
         "drafter": policy.get("drafter"),
-        **{f"{name}_sha256": value for name, value in sorted(cells[0].identity.items())},
+        OBSERVATION: cells[0].identity.get(OBSERVATION, ""),
+        **{f"{name}_sha256": value for name, value in sorted(cells[0].identity.items()) if name != OBSERVATION},
         "horizon": world["horizon"],
         "camera": world["camera"]["name"],
         **flatten({"camera": {k: v for k, v in world["camera"].items() if k != "name"}}),
