@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from kerv_cli.commands import calibrate, demos, doctor, report, rollout, sweep, train, view
+from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, sweep, train, view
 
 app = typer.Typer(
     name="kerv",
@@ -19,6 +19,7 @@ app = typer.Typer(
 )
 app.command("demos")(demos.demos)
 app.add_typer(train.app, name="train")
+app.add_typer(build.app, name="build")
 app.command("calibrate")(calibrate.calibrate)
 app.command("rollout")(rollout.rollout)
 app.command("sweep")(sweep.sweep)

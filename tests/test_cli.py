@@ -34,7 +34,7 @@ def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
     run = kerv("--help")
     assert run.returncode == 0
-    for command in ("demos", "train", "calibrate", "rollout", "sweep", "report", "view", "doctor"):
+    for command in ("demos", "train", "build", "calibrate", "rollout", "sweep", "report", "view", "doctor"):
         assert f"  {command} " in run.stdout
 
 
