@@ -38,9 +38,9 @@ class RuntimeSettings:
 class ProposerSettings:
     """Who drafts (METHODS §2.2, §4, §5)."""
 
-    kind: str = "none"  # none | drafter | hold | jacobi | ...
+    kind: str = "none"  # none | drafter | retrieval | hold
     depth: int = 5  # draft depth, tokens
-    top_k: int = 8  # children expanded per level
+    top_k: int = 8  # drafter: children expanded per level; retrieval: neighbours
     nodes: int = 50  # tree nodes kept after reranking
 
 
@@ -95,8 +95,9 @@ class BoundarySettings:
 class OpeningSettings:
     """What is drafted before the prefill and verified inside it (METHODS §5, ours)."""
 
-    kind: str = "none"  # none | hold | tail | …
+    kind: str = "none"  # none | hold | retrieval | merged
     nodes: int = 0  # tree nodes at most
+    neighbours: int = 5  # retrieval, merged: stored chunks
 
 
 @dataclass

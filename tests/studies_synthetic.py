@@ -98,9 +98,7 @@ def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
         accepted = min(depth, int(rng.binomial(5, 0.45 + 0.03 * min(r, 15))))
         gain = min(accepted + 1, TOKENS - committed)
         drafted = tuple(range(min(depth, accepted + 1)))
-        rounds.append(
-            Round("verify", "drafter", committed, drafted, drafted, accepted, gain, 24, (r, r, r, 0))
-        )
+        rounds.append(Round("verify", "drafter", committed, drafted, drafted, accepted, gain, 24, (r, r, r, 0)))
         committed += gain
     noise, cycles = rng.lognormal(0, 0.1), len(rounds) - 1
     phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}

@@ -62,6 +62,7 @@ class Chunk:
     rounds: list[Round] = field(default_factory=list)
     forwards: int = 0
     variability: float = 0.0
+    similarity: float | None = None  # of the best stored chunk, where one was looked up
     closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property

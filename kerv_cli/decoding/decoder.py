@@ -102,6 +102,7 @@ class Decoder:
             phases=clock.phases,
             compensated=compensated,
             variability=variability,
+            similarity=chunk.similarity,
         )
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:

@@ -14,9 +14,11 @@ import numpy as np
 from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration
 from kerv_cli.decoding.chunk import Proposer
 from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer
+from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer, MergedProposer, RetrievalProposer
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
 from kerv_cli.decoding.rectify import Compensation
+from kerv_cli.drafting.datastore import Datastore, check_target, read_manifest
+from kerv_cli.drafting.datastore_build import datastore_beside
 from kerv_cli.drafting.drafter import Drafter, load_drafter
 from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, build_predictor
 from kerv_cli.errors import UnknownName, UsageError
@@ -43,6 +45,7 @@ class Policy:
     target: Target
     drafter: Drafter | None
     calibration: Calibration | None
+    datastore: Datastore | None
     identity: dict[str, str]
 
 
@@ -55,7 +58,14 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
         identity["drafter"] = read_description(_drafter_folder(settings, folder), "drafter")["sha256"]
     if needs_calibration(settings.parts()):
         identity["calibration"] = sha256_of(calibration_beside(folder))
+    if needs_datastore(settings.parts()):
+        identity["datastore"] = sha256_of(datastore_beside(folder) / "manifest.json")
     return identity
+
+
+def needs_datastore(method: MethodSettings) -> bool:
+    """Whether a part retrieves stored chunks."""
+    return method.proposer.kind == "retrieval" or method.opening.kind in ("retrieval", "merged")
 
 
 def observation_of(description: Mapping[str, Any]) -> str:
@@ -90,6 +100,8 @@ def check(settings: RolloutSettings) -> None:
         drafter = read_description(_drafter_folder(settings, folder), "drafter")
         if drafter["target"] != description["sha256"]:
             load_drafter_error(settings, folder, drafter["target"], description["sha256"])
+    if needs_datastore(settings.parts()):
+        check_target(read_manifest(datastore_beside(folder)), description, datastore_beside(folder))
     if needs_calibration(settings.parts()):
         calibration = load_calibration(
             calibration_beside(folder), description["sha256"], description["settings"]["chunk"]
@@ -117,7 +129,7 @@ def _drafter_folder(settings: RolloutSettings, target: Path) -> Path:
 
 
 @functools.lru_cache(maxsize=2)
-def _load(target: Path, drafter: Path | None, calibrated: bool, device: str, dtype_name: str) -> Policy:
+def _load(target: Path, drafter: Path | None, calibrated: bool, stored: bool, device: str, dtype_name: str) -> Policy:
     from kerv_cli.runtime import DTYPES
 
     loaded, description = load_target(target, device, DTYPES[dtype_name])
@@ -130,7 +142,8 @@ def _load(target: Path, drafter: Path | None, calibrated: bool, device: str, dty
     if calibrated:
         chunk = loaded.settings.chunk
         calibration = load_calibration(calibration_beside(target), description["sha256"], chunk)
-    return Policy(loaded, beside, calibration, identity)
+    datastore = Datastore.open(datastore_beside(target), description) if stored else None
+    return Policy(loaded, beside, calibration, datastore, identity)
 
 
 def load_policy(settings: RolloutSettings) -> Policy:
@@ -138,7 +151,8 @@ def load_policy(settings: RolloutSettings) -> Policy:
     device, _ = set_up(settings.runtime)
     folder = find_target(settings.results, settings.policy.target)
     drafter = _drafter_folder(settings, folder) if settings.proposer.kind == "drafter" else None
-    return _load(folder, drafter, needs_calibration(settings.parts()), device, settings.runtime.dtype)
+    method = settings.parts()
+    return _load(folder, drafter, needs_calibration(method), needs_datastore(method), device, settings.runtime.dtype)
 
 
 def build_decoder(policy: Policy, method: MethodSettings) -> Decoder:
@@ -151,12 +165,22 @@ def build_parts(policy: Policy, method: MethodSettings) -> Parts:
 
 
 def build_opening(policy: Policy, method: MethodSettings) -> Proposer | None:
-    kinds = {"none": None, "hold": HoldProposer}
-    if method.opening.kind not in kinds:
-        raise UnknownName("opening.kind", method.opening.kind, kinds)
-    if method.opening.kind == "none":
+    settings = method.opening
+    if settings.kind == "none":
         return None
-    return HoldProposer()
+    if settings.kind == "hold":
+        return HoldProposer()
+    if settings.kind in ("retrieval", "merged"):
+        retrieval = build_retrieval(policy, settings.neighbours, settings.nodes)
+        return retrieval if settings.kind == "retrieval" else MergedProposer(retrieval, HoldProposer(), settings.nodes)
+    raise UnknownName("opening.kind", settings.kind, ["none", "hold", "retrieval", "merged"])
+
+
+def build_retrieval(policy: Policy, neighbours: int, nodes: int) -> RetrievalProposer:
+    assert policy.datastore is not None
+    if min(neighbours, nodes) < 1:
+        raise UsageError("retrieval needs at least one neighbour and one node")
+    return RetrievalProposer(policy.datastore, policy.target, neighbours, nodes)
 
 
 def build_compensation(policy: Policy, method: MethodSettings) -> Compensation | None:
@@ -183,7 +207,11 @@ def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:
         if min(settings.depth, settings.top_k, settings.nodes) < 1:
             raise UsageError("proposer.depth, proposer.top_k and proposer.nodes must be at least 1")
         return DrafterProposer(policy.drafter, policy.target, settings)
-    raise UnknownName("proposer.kind", settings.kind, ["none", "drafter"])
+    if settings.kind == "retrieval":
+        return build_retrieval(policy, settings.top_k, settings.nodes)
+    if settings.kind == "hold":
+        return HoldProposer()
+    raise UnknownName("proposer.kind", settings.kind, ["none", "drafter", "retrieval", "hold"])
 
 
 class Sampled:
