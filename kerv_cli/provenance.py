@@ -1,15 +1,35 @@
-"""Where a number or a file comes from: versions, device, git commit."""
+"""Where a number or a file comes from: machine, versions, git commit."""
 
 from __future__ import annotations
 
 import functools
 import platform
+import shutil
+import socket
 import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("torch", "metaworld", "mujoco", "numpy")
+PACKAGES = ("kerv", "torch", "metaworld", "mujoco", "numpy")
+_HERE = Path(__file__).resolve().parent
+
+
+def provenance(device: str = "cpu") -> dict[str, Any]:
+    """For a checkpoint or a calibration: versions, commit, device."""
+    return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
+
+
+def stamp(device: str) -> dict[str, str]:
+    """The same for a table's row, flat, every value a string; with the host's name."""
+    known = {f"{name}_version": number for name, number in versions().items()}
+    return {"host": socket.gethostname(), "device_name": device_name(device), **known, "git_commit": git_commit()}
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """python and PACKAGES; `absent` where one is not installed."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
 def _version(package: str) -> str:
@@ -20,41 +40,29 @@ def _version(package: str) -> str:
 
 
 @functools.cache
-def versions() -> dict[str, str]:
-    return {"kerv": _version("kerv"), "python": platform.python_version(), **{p: _version(p) for p in PACKAGES}}
-
-
-@functools.cache
-def git_commit() -> str:
-    """The checkout's commit, with `+` where tracked files differ from it; empty outside a checkout."""
-    root = Path(__file__).resolve().parent.parent
-    try:
-        commit = _git(root, "rev-parse", "--short=12", "HEAD")
-        return commit + ("+" if _git(root, "status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.SubprocessError):
-        return ""
-
-
-def _git(root: Path, *arguments: str) -> str:
-    run = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True, timeout=10)
-    return run.stdout.strip()
-
-
-@functools.cache
 def device_name(device: str) -> str:
-    """The processor's or the GPU's own name."""
+    """The product's name: of the GPU for a CUDA device, of the processor otherwise."""
     if device.startswith("cuda"):
         import torch
 
         return torch.cuda.get_device_name(device)
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
+                return " ".join(line.partition(":")[2].split())
     return platform.processor() or platform.machine()
 
 
-def provenance(device: str = "cpu") -> dict[str, Any]:
-    return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
+@functools.cache
+def git_commit() -> str:
+    """The checkout's commit, with `+changes` where tracked files differ from it; `none` outside a checkout of kerv."""
+    if shutil.which("git") is None or not _git("ls-files", "--error-unmatch", "__init__.py"):
+        return "none"  # an installed copy may lie inside somebody else's repository
+    changes = _git("status", "--porcelain", "--untracked-files=no", "--", ".")
+    return _git("rev-parse", "HEAD") + ("+changes" if changes else "")
+
+
+def _git(*arguments: str) -> str:
+    done = subprocess.run(["git", "-C", str(_HERE), *arguments], capture_output=True, text=True, check=False)
+    return done.stdout.strip() if done.returncode == 0 else ""

@@ -171,6 +171,7 @@ class Decoder:
         rows = torch.tensor([0, *(i + 1 for i in path)], device=hidden.device)
         if len(tree):
             chunk.cache.keep(self.target.prompt_length + first, self.target.prompt_length + first + rows)
+            clock.lap("accept")
             self.rectify(chunk)
             clock.lap("rectify")
         if proposer is not None and chunk.left > 1:

@@ -22,6 +22,7 @@ from typing import Any
 
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import CheckpointError, KervError, StorageError
+from kerv_cli.provenance import git_commit, stamp
 from kerv_cli.studies.events import (
     CellDone,
     CellFailed,
@@ -34,7 +35,6 @@ from kerv_cli.studies.events import (
     SweepStarted,
 )
 from kerv_cli.studies.plan import Cell, unique_cells
-from kerv_cli.studies.provenance import git_commit, provenance
 from kerv_cli.studies.store import StudyStore
 
 RunCell = Callable[[Cell], list[EpisodeRecord]]
@@ -73,7 +73,7 @@ class _Job:
                 return _Result(reused=True)
             records = self.run_cell(cell)
             seconds = time.perf_counter() - clock
-            status = {**provenance(cell.settings["runtime"]["device"]), **self.status, "pid": os.getpid()}
+            status = {**stamp(cell.settings["runtime"]["device"]), **self.status, "pid": os.getpid()}
             self.store.write_cell(cell, records, {**status, "seconds": seconds}, started)
         except Exception as error:  # noqa: BLE001 - one cell's failure of any kind must not end the others
             storage = isinstance(error, StorageError)

@@ -211,7 +211,7 @@ def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale:
     if is_number(low):
         panel.plot([low * scale, high * scale], [place, place], color=colour, linewidth=2.2, alpha=0.45)
     panel.plot(value, place, "o", color=colour, markersize=7)
-    text = f"{value:.0f}" if measure == "success" else f"{value:.2f}"
+    text = f"{value:.1f}".removesuffix(".0") if measure == "success" else f"{value:.2f}"
     panel.annotate(
         text,
         (value, place),

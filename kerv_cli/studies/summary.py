@@ -76,7 +76,9 @@ def _p(value: float) -> str:
 def _interval(row: Mapping[str, Any], name: str, scale: float, digits: int) -> str:
     if not is_number(row[name]):
         return "–"
-    text = f"{row[name] * scale:.{digits}f}"
+    value = row[name] * scale
+    # 99.5 % of success must not read as 100 %
+    text = f"{value:.1f}".removesuffix(".0") if name == "success" else f"{value:.{digits}f}"
     low, high = row[f"{name}_low"], row[f"{name}_high"]
     return f"{text} ({low * scale:.{digits}f}–{high * scale:.{digits}f})" if is_number(low) else text
 

@@ -11,11 +11,11 @@ from typing import Any
 import pandas as pd
 
 from kerv_cli.files import atomic_path
+from kerv_cli.provenance import PACKAGES
 from kerv_cli.sim.tasks import TASKS
 from kerv_cli.studies.measures import MACRO, MICRO, Measured, measure
 from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
 from kerv_cli.studies.plan_file import StudyPlan
-from kerv_cli.studies.provenance import PACKAGES
 from kerv_cli.studies.store import StoredCell, StudyStore
 
 _STATUS_COLUMNS = (
