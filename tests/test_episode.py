@@ -10,6 +10,7 @@ import pytest
 from kerv_cli.config import compose
 from kerv_cli.decoding.record import PHASES, EpisodeRecord
 from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.rollouts import policy as policies_of
 from kerv_cli.rollouts import run
 from kerv_cli.settings import EVALUATION_SEED, RolloutSettings
 from kerv_cli.sim.world import World
@@ -80,8 +81,8 @@ def test_deviation_is_sampled_and_zero_for_ar_itself(policies: Path) -> None:
 
 def test_what_cannot_run_is_refused_beforehand(policies: Path) -> None:
     with pytest.raises(UsageError, match="trained on 96 pixels"):
-        run.check(settings(policies, "policy.target=nano-vision", "world.camera.size=64"))
+        policies_of.check(settings(policies, "policy.target=nano-vision", "world.camera.size=64"))
     drafter = f"policy.drafter={policies}/artifacts/drafter/nano-state"
     mixed = settings(policies, "policy.target=nano-vision", "method=spec_vla", drafter)
     with pytest.raises(CheckpointError, match="was trained for target"):
-        run.check(mixed)
+        policies_of.check(mixed)

@@ -40,7 +40,8 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
     from kerv_cli.sim.tasks import resolve_tasks
 
     tasks = resolve_tasks(settings.task)
-    from kerv_cli.rollouts.run import check, close_worlds, run_task
+    from kerv_cli.rollouts.policy import check
+    from kerv_cli.rollouts.run import close_worlds, run_task
 
     check(settings)
     total = len(tasks) * settings.episodes
@@ -79,7 +80,7 @@ def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[Ep
     from rich.table import Table
 
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
-    from kerv_cli.rollouts.run import identity_of
+    from kerv_cli.rollouts.policy import identity_of
 
     seen = identity_of(settings)["observation"]
     last = settings.seed + settings.episodes - 1

@@ -31,7 +31,7 @@ def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         for label, settings in resolved.settings.items():
             typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
         return
-    from kerv_cli.rollouts.run import check, identity_of
+    from kerv_cli.rollouts.policy import check, identity_of
     from kerv_cli.studies.plan import plan as plan_cells
     from kerv_cli.studies.store import StudyStore
 

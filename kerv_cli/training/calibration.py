@@ -145,7 +145,8 @@ class CalibrationRun:
 
     def decoder(self) -> tuple[ActionDecoder, int]:
         """The decoder that pre-samples, and the pixels of the frames it takes."""
-        from kerv_cli.rollouts.run import build_decoder, load_policy
+        from kerv_cli.rollouts.assemble import build_decoder
+        from kerv_cli.rollouts.policy import load_policy
 
         s = self.settings
         policy = load_policy(
