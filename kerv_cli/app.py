@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import typer
 
 from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, sweep, train, view
+
+# Before numpy loads: its products run on as many threads as the settings give torch, one; see runtime.threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="kerv",
