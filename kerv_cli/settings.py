@@ -38,7 +38,7 @@ class RuntimeSettings:
 class ProposerSettings:
     """Who drafts (METHODS §2.2, §4, §5)."""
 
-    kind: str = "none"  # none | drafter | retrieval | hold
+    kind: str = "none"  # none | drafter | retrieval | hold | jacobi
     depth: int = 5  # draft depth, tokens
     top_k: int = 8  # drafter: children expanded per level; retrieval: neighbours
     nodes: int = 50  # tree nodes kept after reranking

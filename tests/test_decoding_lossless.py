@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer
+from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
 from kerv_cli.drafting.drafter import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import (
@@ -70,7 +70,7 @@ class RandomTrees:
     def begin(self, chunk: Chunk) -> None:
         pass
 
-    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, verdicts: list[int]) -> None:
         assert hidden.shape[1] == len(chunk.tokens) - first - 1
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
@@ -140,6 +140,17 @@ def test_strict_decoding_with_a_drafter_equals_ar(
     prompt = random_prompt(target, seed)
     result = decode(target, proposer, prompt, nodes)
     assert result.tokens == plain_greedy(target, prompt)
+    assert_adds_up(result)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]))
+def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None:
+    target = random_target(seed, 2, 2, chunk)
+    prompt = random_prompt(target, seed)
+    result = decode(target, JacobiProposer(), prompt, 0)
+    assert result.tokens == plain_greedy(target, prompt)
+    assert result.forwards <= target.tokens_per_chunk
     assert_adds_up(result)
 
 

@@ -167,7 +167,7 @@ class Shifted:
     def begin(self, chunk: Chunk) -> None:
         pass
 
-    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, verdicts: list[int]) -> None:
         pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:

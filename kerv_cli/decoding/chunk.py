@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -84,6 +85,7 @@ class Proposer(Protocol):
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         """A tree of depth ≤ `depth`; an empty one means that nothing is drafted this round."""
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
-        target's states at chunk indices first … first + T − 1."""
+        target's states at chunk indices first … first + T − 1. verdicts: the round's 1 + n argmax tokens, those behind
+        rejected nodes included."""

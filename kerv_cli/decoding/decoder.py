@@ -175,7 +175,7 @@ class Decoder:
             self.rectify(chunk)
             clock.lap("rectify")
         if proposer is not None and chunk.left > 1:
-            proposer.committed(chunk, first, hidden[:, rows])
+            proposer.committed(chunk, first, hidden[:, rows], verdicts)
             clock.lap("propose")
 
     def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:

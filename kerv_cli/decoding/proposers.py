@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,7 @@ from kerv_cli.drafting.drafter import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.groups import kinematic_groups
 from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.settings import ProposerSettings
-from kerv_cli.vla.action_tokens import bins_of
+from kerv_cli.vla.action_tokens import VOCABULARY, bins_of
 from kerv_cli.vla.target import Target
 
 
@@ -32,7 +34,7 @@ class HoldProposer:
         ahead = range(len(chunk.tokens), min(chunk.size, len(chunk.tokens) + depth))
         return TokenTree.chain([held[i % chunk.dofs] for i in ahead])
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
 
 
@@ -61,7 +63,7 @@ class RetrievalProposer:
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         return neighbour_tree(self.neighbours(chunk).chunks, len(chunk.tokens), self.groups, self.nodes, depth)
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
 
 
@@ -87,8 +89,31 @@ class MergedProposer:
             tree = merge(chains)
         return tree
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
+
+
+class JacobiProposer:
+    """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
+
+    With strict acceptance the fixed point is AR's chunk. The first guess is the zero action.
+    """
+
+    name = "jacobi"
+    needs_states = False
+
+    def __init__(self) -> None:
+        self.guess: list[int] = []
+
+    def begin(self, chunk: Chunk) -> None:
+        self.guess = [VOCABULARY // 2] * chunk.left
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        return TokenTree.chain(self.guess[:depth])
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+        accepted = len(chunk.tokens) - first - 2
+        self.guess = list(verdicts[accepted + 1 :])
 
 
 class DrafterProposer:
@@ -111,7 +136,7 @@ class DrafterProposer:
         s = self.settings
         return grow_tree(self.drafter, self.target, self.state, min(s.depth, depth), s.top_k, s.nodes)
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         following = self.embed(chunk.tokens[first + 1 :])
         observe(self.drafter, self.target, self.state, following, hidden, self.target.prompt_length + first)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from kerv_cli.decoding.chunk import Proposer
 from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer, MergedProposer, RetrievalProposer
+from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer, JacobiProposer, MergedProposer, RetrievalProposer
 from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, build_predictor
@@ -78,7 +78,9 @@ def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:
         return build_retrieval(policy, settings.top_k, settings.nodes)
     if settings.kind == "hold":
         return HoldProposer()
-    raise UnknownName("proposer.kind", settings.kind, ["none", "drafter", "retrieval", "hold"])
+    if settings.kind == "jacobi":
+        return JacobiProposer()
+    raise UnknownName("proposer.kind", settings.kind, ["none", "drafter", "retrieval", "hold", "jacobi"])
 
 
 class Sampled:
