@@ -122,6 +122,13 @@ def _plain_lines(title: str, total: int) -> Callable[[int, str], None]:
     return advance
 
 
+def called() -> str:
+    """How to call kerv from here: by name where the shell finds it, else as it was called now."""
+    import shutil
+
+    return "kerv" if shutil.which("kerv") or not sys.argv[0].endswith("kerv") else os.path.relpath(sys.argv[0])
+
+
 def console(stderr: bool = False) -> Any:
     from rich.console import Console
 

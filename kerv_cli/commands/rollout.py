@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge, progress_bar
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,7 +66,7 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
     close_worlds()
     _summary(settings, tasks, records)
     if files:
-        typer.echo(f"{len(files)} rollouts in {folder}; open one with: kerv view {files[0]}")
+        typer.echo(f"{len(files)} rollouts in {folder}; open one with: {called()} view {files[0]}")
 
 
 def _save(record: EpisodeRecord, folder: Path, settings: RolloutSettings) -> Path:

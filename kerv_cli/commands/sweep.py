@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge
 
 if TYPE_CHECKING:
     from kerv_cli.studies.plan import Cell
@@ -77,11 +77,11 @@ def _run(resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, workers:
         console().print(summary_table(study_table(load_study(store, cells))))
     typer.echo(
         f"{len(outcome.done)} cells run, {len(outcome.reused)} reused, {len(outcome.failed)} failed; "
-        f"tables and plots: kerv report study={study.name}"
+        f"tables and plots: {called()} report study={study.name}"
     )
     recordings = sorted(store.rollouts.glob("*.rrd"))
     if recordings:
-        typer.echo(f"{len(recordings)} rollouts in {store.rollouts}; open one with: kerv view {recordings[0]}")
+        typer.echo(f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}")
     for failure in outcome.failed:
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {failure.reason}", err=True)
     if outcome.failed:
