@@ -51,6 +51,11 @@ def find_target(results: str, name: str) -> Path:
     )
 
 
+def drafter_folder(results: str, name: str | None, target: Path) -> Path:
+    """The drafter that is named, else the one beside the target."""
+    return artifact(results, "drafter", name) if name else drafter_beside(target)
+
+
 def drafter_beside(target: Path) -> Path:
     """Shipped: pretrained/<name>/{target,drafter}; trained: artifacts/target/<name> and artifacts/drafter/<name>."""
     if target.name == "target":

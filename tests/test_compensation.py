@@ -13,7 +13,7 @@ from kerv_cli.decoding.rectify import Compensation, assemble
 from kerv_cli.drafting.kinematics import ActionHistory, Hold, Linear
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import AcceptanceSettings, MethodSettings, OpeningSettings, RectifierSettings
+from kerv_cli.settings import AcceptanceSettings, BoundarySettings, MethodSettings, OpeningSettings, RectifierSettings
 from kerv_cli.vla.action_tokens import values_of
 
 D, N = 4, 16
@@ -132,6 +132,12 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_verdict: bool) -> None
     actions, predicted = decoder.actions_of(chunk)
     assert predicted == steps * D - known
     assert actions.reshape(-1)[:known] == pytest.approx(values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
+
+
+def test_a_boundary_is_refused_rather_than_ignored() -> None:
+    method = MethodSettings(boundary=BoundarySettings("fused"))
+    with pytest.raises(UsageError, match="boundary=fused does not choose proposers yet"):
+        Decoder(random_target(0, 1, 1, 1), method)
 
 
 def test_an_opening_that_needs_states_is_refused() -> None:

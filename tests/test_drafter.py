@@ -23,7 +23,7 @@ def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, Tar
     hidden = torch.randn(prompt.shape, generator=torch.Generator().manual_seed(seed))
     state = DraftState(drafter.new_cache(prompt.shape[1] + 64), torch.empty(0))
     following = torch.cat([prompt[:, 1:], target.embedding(torch.tensor([[7]]))], 1)
-    observe(drafter, target, state, following, hidden, 0)
+    observe(drafter, state, following, hidden, 0)
     return drafter, target, state, grow_tree(drafter, target, state, depth, top_k, nodes)
 
 
@@ -68,12 +68,12 @@ def test_the_kept_nodes_are_the_most_probable_ones(seed: int) -> None:
 
 def test_true_states_replace_what_was_drafted() -> None:
     """After a round the cache holds what a drafter that never drafted would hold."""
-    drafter, target, state, _ = drafted(1, 4, 3, 12)
+    drafter, _, state, _ = drafted(1, 4, 3, 12)
     length = state.cache.length
     following, hidden = torch.randn(2, 1, 3, 32).unbind(0)
-    observe(drafter, target, state, following, hidden, length)
+    observe(drafter, state, following, hidden, length)
     fresh = drafted(1, 1, 1, 1)[2]
-    observe(drafter, target, fresh, following, hidden, length)
+    observe(drafter, fresh, following, hidden, length)
     assert state.cache.length == fresh.cache.length == length + 3
     assert torch.allclose(state.hidden, fresh.hidden, atol=1e-6)
     kept = state.cache.buffer[..., : length + 3, :]

@@ -110,7 +110,7 @@ from kerv_cli.studies import store as module
 cell = threshold_study(["reach-v3"])[-1]
 store = module.StudyStore(sys.argv[1], "threshold")
 records = run_cell(cell)
-write, sync = module._write_synced, module._sync_folder
+write, sync = module._write_synced, module.sync
 for stage in range(5):  # before each of the four files, and between the last one and the rename
     child = os.fork()
     if child == 0:
@@ -124,7 +124,7 @@ for stage in range(5):  # before each of the four files, and between the last on
             die_when_due()
             write(path, content)
         module._write_synced = half_written
-        module._sync_folder = lambda folder: (die_when_due(), sync(folder))
+        module.sync = lambda folder: (die_when_due(), sync(folder))
         store.write_cell(cell, records, {})
         os._exit(0)
     _, status = os.waitpid(child, 0)

@@ -47,6 +47,8 @@ class Decoder:
         self.target, self.method, self.parts = target, method, parts or Parts()
         if self.parts.opening is not None and self.parts.opening.needs_states:
             raise UsageError(f"opening '{self.parts.opening.name}' needs the target's states, which come after it")
+        if method.boundary.kind != "always":
+            raise UsageError(f"boundary={method.boundary.kind} does not choose proposers yet: leave it at always")
         self.rule: Rule = acceptance_rule(method.acceptance)
         self.threshold: Threshold = build_threshold(method.threshold)
         nodes = max(method.proposer.nodes, method.opening.nodes)

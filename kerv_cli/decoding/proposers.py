@@ -130,7 +130,7 @@ class DrafterProposer:
 
     def begin(self, chunk: Chunk) -> None:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
-        observe(self.drafter, self.target, self.state, following, chunk.hidden, 0)
+        observe(self.drafter, self.state, following, chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         s = self.settings
@@ -138,7 +138,7 @@ class DrafterProposer:
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         following = self.embed(chunk.tokens[first + 1 :])
-        observe(self.drafter, self.target, self.state, following, hidden, self.target.prompt_length + first)
+        observe(self.drafter, self.state, following, hidden, self.target.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
         """(1, T, E)."""

@@ -69,7 +69,7 @@ class DraftState:
     hidden: Tensor
 
 
-def observe(drafter: Drafter, target: Target, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
+def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
     """Feed true states: hidden (1, T, E) of the target at positions first, first + 1, … and what follows each of them
     (1, T, E). Entries of an earlier draft tree behind `first` are dropped."""
     state.cache.length = first
@@ -153,14 +153,20 @@ def save_drafter(folder: Path, drafter: Drafter, target_sha256: str, provenance:
     return save_module(folder, "drafter", drafter, description)
 
 
-def load_drafter(folder: Path, target: Target, target_sha256: str) -> tuple[Drafter, dict[str, Any]]:
-    """Raises CheckpointError where the drafter was trained for another target."""
+def read_drafter(folder: Path, target_sha256: str) -> dict[str, Any]:
+    """Its description. Raises CheckpointError where the drafter was trained for another target."""
     description = read_description(folder, "drafter")
     if description["target"] != target_sha256:
         raise CheckpointError(
             f"the drafter in {folder} was trained for target {description['target'][:12]}, not for "
             f"{target_sha256[:12]}: train one with 'kerv train drafter policy.target=…'"
         )
+    return description
+
+
+def load_drafter(folder: Path, target: Target, target_sha256: str) -> tuple[Drafter, dict[str, Any]]:
+    """The drafter, ready for inference, and its description; errors as `read_drafter`."""
+    description = read_drafter(folder, target_sha256)
     drafter = Drafter.beside(DrafterSettings(**description["settings"]), target)
     load_state(drafter, folder, "drafter")
     weight = target.head.weight

@@ -11,11 +11,11 @@ from typing import Any
 from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration
 from kerv_cli.drafting.datastore import Datastore, check_target, read_manifest
 from kerv_cli.drafting.datastore_build import datastore_beside
-from kerv_cli.drafting.drafter import Drafter, load_drafter
+from kerv_cli.drafting.drafter import Drafter, load_drafter, read_drafter
 from kerv_cli.drafting.kinematics import FILTERS
-from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
-from kerv_cli.places import drafter_beside, find_target
+from kerv_cli.places import drafter_folder, find_target
 from kerv_cli.runtime import DTYPES, set_up
 from kerv_cli.settings import EVALUATION_SEED, MethodSettings, RolloutSettings
 from kerv_cli.sim.tasks import resolve_tasks
@@ -40,7 +40,9 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     description = read_description(folder, "target")
     identity = {"target": description["sha256"], "observation": observation_of(description)}
     if settings.proposer.kind == "drafter":
-        identity["drafter"] = read_description(drafter_folder(settings, folder), "drafter")["sha256"]
+        identity["drafter"] = read_description(
+            drafter_folder(settings.results, settings.policy.drafter, folder), "drafter"
+        )["sha256"]
     if needs_calibration(settings.parts()):
         identity["calibration"] = sha256_of(calibration_beside(folder))
     if needs_datastore(settings.parts()):
@@ -82,13 +84,8 @@ def check(settings: RolloutSettings) -> None:
     if description["settings"]["observation"] == "vision" and camera.size != size:
         raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
     if settings.proposer.kind == "drafter":
-        beside = drafter_folder(settings, folder)
-        trained_for = read_description(beside, "drafter")["target"]
-        if trained_for != description["sha256"]:
-            raise CheckpointError(
-                f"the drafter in {beside} was trained for target {trained_for[:12]}, not for "
-                f"{description['sha256'][:12]}: run 'kerv train drafter policy.target={settings.policy.target}'"
-            )
+        beside = drafter_folder(settings.results, settings.policy.drafter, folder)
+        read_drafter(beside, description["sha256"])
     if needs_datastore(settings.parts()):
         check_target(read_manifest(datastore_beside(folder)), description, datastore_beside(folder))
     if needs_calibration(settings.parts()):
@@ -97,15 +94,6 @@ def check(settings: RolloutSettings) -> None:
         )
         for name in resolve_tasks(settings.task):
             calibration.threshold(settings.threshold, name)
-
-
-def drafter_folder(settings: RolloutSettings, target: Path) -> Path:
-    name = settings.policy.drafter
-    if name is None:
-        return drafter_beside(target)
-    if "/" in name:
-        return Path(name).expanduser()
-    return Path(settings.results) / "artifacts" / "drafter" / name
 
 
 @functools.lru_cache(maxsize=4)
@@ -128,6 +116,10 @@ def load_policy(settings: RolloutSettings) -> Policy:
     """The policy on its device; kept, so that the cells of a sweep share it."""
     device, _ = set_up(settings.runtime)
     folder = find_target(settings.results, settings.policy.target)
-    drafter = drafter_folder(settings, folder) if settings.proposer.kind == "drafter" else None
+    drafter = (
+        drafter_folder(settings.results, settings.policy.drafter, folder)
+        if settings.proposer.kind == "drafter"
+        else None
+    )
     method = settings.parts()
     return _load(folder, drafter, needs_calibration(method), needs_datastore(method), device, settings.runtime.dtype)

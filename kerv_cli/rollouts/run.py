@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -48,12 +48,7 @@ def close_worlds() -> None:
         _opened.pop().close()
 
 
-def run_task(
-    settings: RolloutSettings,
-    task: str,
-    seeds: Sequence[int],
-    on_episode: Callable[[EpisodeRecord], None] = lambda record: None,
-) -> Iterator[EpisodeRecord]:
+def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
     """One method on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
     policy = load_policy(settings)
     decoder = episode_decoder(policy, settings, task)
@@ -62,9 +57,7 @@ def run_task(
     logged = dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
     for number, seed in enumerate(seeds):
         recorded = settings.record < 0 or number < settings.record
-        record = run_episode(world, decoder, seed, Recording(logged if recorded else None))
-        on_episode(record)
-        yield record
+        yield run_episode(world, decoder, seed, Recording(logged if recorded else None))
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:

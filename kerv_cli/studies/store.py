@@ -31,7 +31,7 @@ import yaml
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
 from kerv_cli.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors
+from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, sync
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies import rows
 from kerv_cli.studies.plan import Cell
@@ -171,7 +171,7 @@ class StudyStore:
                 temporary.mkdir(parents=True)
                 for file, content in files.items():
                     _write_synced(temporary / file, content)
-                _sync_folder(temporary)
+                sync(temporary)
                 return _rename_once(temporary, folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -320,14 +320,6 @@ def _write_synced(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _rename_once(temporary: Path, folder: Path) -> bool:
     """Renames a folder where none is yet; False where another process was first."""
     try:
@@ -336,7 +328,7 @@ def _rename_once(temporary: Path, folder: Path) -> bool:
         if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
             return False
         raise
-    _sync_folder(folder.parent)
+    sync(folder.parent)
     return True
 
 

@@ -13,7 +13,7 @@ from torch import nn
 
 from kerv_cli.drafting.drafter import Drafter, save_drafter
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.places import artifact, drafter_beside, find_target
+from kerv_cli.places import artifact, drafter_folder, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
@@ -112,8 +112,7 @@ class DrafterRun:
         if settings.drafter.kind != "eagle":
             raise UnknownName("drafter.kind", settings.drafter.kind, ["eagle"])
         self.target_folder = find_target(settings.results, settings.policy.target)
-        name = settings.policy.drafter
-        self.folder = artifact(settings.results, "drafter", name) if name else drafter_beside(self.target_folder)
+        self.folder = drafter_folder(settings.results, settings.policy.drafter, self.target_folder)
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
 
     def plan(self) -> str:
