@@ -38,17 +38,18 @@ class RuntimeSettings:
 class ProposerSettings:
     """Who drafts (METHODS §2.2, §4, §5)."""
 
-    kind: str = "none"  # none | drafter | retrieval | hold | jacobi
+    kind: str = "none"  # none | drafter | retrieval | hybrid | early | jacobi | a predictor's name (hold, kalman, …)
     depth: int = 5  # draft depth, tokens
-    top_k: int = 8  # drafter: children expanded per level; retrieval: neighbours
+    top_k: int = 8  # drafter: children expanded per level
     nodes: int = 50  # tree nodes kept after reranking
+    neighbours: int = 5  # retrieval, hybrid: stored chunks
 
 
 @dataclass
 class AcceptanceSettings:
     """Which drafts are good enough (METHODS §2.1)."""
 
-    kind: str = "strict"  # strict | relaxed | sequence
+    kind: str = "strict"  # strict | relaxed | sequence | hybrid (sequence for retrieved drafts, relaxed for others)
     strict_gripper: bool = False  # the gripper's tokens must equal the verdict
     group_limit: int = 30  # sequence: summed bias of a kinematic group, bins
     token_limit: int = 15  # sequence: bias of one token, bins
@@ -72,7 +73,7 @@ class RectifierSettings:
     """What happens after a rejection (METHODS §3.1)."""
 
     kind: str = "reinfer"  # reinfer | compensate
-    predictor: str = "hold"  # compensate: hold | linear | kalman | …
+    predictor: str = "hold"  # compensate: hold | linear | kalman | … | draft (the rejected draft's own values, ours)
     steps: int = 1  # PL: control steps that a prediction may fill
     use_verdict: bool = True  # the verdict at the rejected position is kept (ours); false: predicted too (KERV)
     min_verified: int = 1  # DoFs of a step that must be known for it to be filled
@@ -92,12 +93,23 @@ class BoundarySettings:
 
 
 @dataclass
+class SkipSettings:
+    """When a retrieved chunk is executed without a verification (METHODS §4.3)."""
+
+    kind: str = "none"  # none | similarity
+    s_min: float | None = None  # least similarity; None: the task's, from the calibration
+    max_skips: int = 2  # decodes in a row without a verification
+    up: float = 0.25  # share of the calibrated range that s_min rises after a failed episode
+    down: float = 0.05  # and falls after a successful one
+
+
+@dataclass
 class OpeningSettings:
     """What is drafted before the prefill and verified inside it (METHODS §5, ours)."""
 
-    kind: str = "none"  # none | hold | retrieval | merged
-    nodes: int = 0  # tree nodes at most
-    neighbours: int = 5  # retrieval, merged: stored chunks
+    sources: list[str] = field(default_factory=list)  # early | retrieval | a predictor's name; each gives whole chunks
+    nodes: int = 64  # tree nodes at most; what is named last is dropped first
+    neighbours: int = 3  # retrieval: stored chunks
 
 
 @dataclass
@@ -111,6 +123,8 @@ class MethodSettings:
     rectifier: RectifierSettings = field(default_factory=RectifierSettings)
     boundary: BoundarySettings = field(default_factory=BoundarySettings)
     opening: OpeningSettings = field(default_factory=OpeningSettings)
+    skip: SkipSettings = field(default_factory=SkipSettings)
+    chunk: int = 0  # H, control steps decoded at once; 0: as many as the target was trained for
 
 
 @dataclass
@@ -119,6 +133,15 @@ class PolicySettings:
 
     target: str = "mt10-vision"
     drafter: str | None = None  # default: the drafter beside the target
+    early: str | None = None  # default: the early drafter beside the target
+
+
+@dataclass
+class DatastoreSettings:
+    """Who searches the datastore (METHODS §4.1): every backend gives the same neighbours."""
+
+    backend: str = "exact"  # exact (in process, numpy) | qdrant (optional)
+    url: str | None = None  # qdrant: a server; None: the engine in this process
 
 
 @dataclass
@@ -136,6 +159,9 @@ class RolloutSettings:
     threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
     rectifier: RectifierSettings = field(default_factory=RectifierSettings)
     boundary: BoundarySettings = field(default_factory=BoundarySettings)
+    skip: SkipSettings = field(default_factory=SkipSettings)
+    chunk: int = 0  # H, control steps decoded at once; 0: as many as the target was trained for
+    datastore: DatastoreSettings = field(default_factory=DatastoreSettings)
     world: WorldSettings = field(default_factory=WorldSettings)
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     deviation_every: int = 0  # decodes between two deviation samples; 0: never
@@ -146,7 +172,15 @@ class RolloutSettings:
     def parts(self) -> MethodSettings:
         """The method's parts alone: what a decoder is built from."""
         return MethodSettings(
-            self.method, self.proposer, self.acceptance, self.threshold, self.rectifier, self.boundary, self.opening
+            name=self.method,
+            proposer=self.proposer,
+            acceptance=self.acceptance,
+            threshold=self.threshold,
+            rectifier=self.rectifier,
+            boundary=self.boundary,
+            opening=self.opening,
+            skip=self.skip,
+            chunk=self.chunk,
         )
 
 
@@ -201,6 +235,7 @@ class TrainSettings:
     weight_decay: float = 0.02
     clip: float = 1.0
     ema: float = 0.999
+    init: str | None = None  # target whose weights the run begins with; its chunk may be shorter or longer
     label_sigma: float = 1.0  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
     scene_weight: float = 1.0  # weight of the position loss (vision only)
     scene_steps: int = 0  # first steps that train only the vision encoder, on positions
@@ -242,10 +277,14 @@ class DemosSettings:
 
 @dataclass
 class DrafterSettings:
-    """Shapes of the EAGLE-style drafter: one decoder layer of the target's width (METHODS §2.2)."""
+    """Shapes of a drafter. eagle: decoder layers of the target's width, behind its states (METHODS §2.2). early: a
+    residual network from the prompt and the last actions to the whole chunk, before the target runs (METHODS §5)."""
 
-    kind: str = "eagle"
+    kind: str = "eagle"  # eagle | early
     layers: int = 1
+    width: int = 512  # early: hidden units
+    rank: int = 64  # early: features per token in front of the bins
+    history: int = 2  # early: last executed actions it is shown
     noise: float = 0.0  # uniform noise on the input states, training only
     unroll: int = 3  # passes that feed the drafter its own predicted states, as drafting does; 1: the paper's
     samples: int = 12_000  # observations whose greedy decodes it is trained on
@@ -317,6 +356,9 @@ class CalibrateSettings:
     history: str = "labels"  # what predictions are made from: labels (clean) | executed (perturbed episodes: noisy)
     window: int = 10  # control steps of history
     fit_steps: int = 0  # steps ahead whose mean error is fitted; 0: the target's chunk
+    epsilon: float = 0.1  # verify-skip: mean abs error of a retrieved chunk that is good enough, normalised units
+    confidence: float = 0.9  # verify-skip: share of skipped chunks whose error stays below epsilon
+    boundary_window: int = 15  # positions that the boundary's ranges are taken over
     decodes: int = 60  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
     proposer: ProposerSettings = field(default_factory=ProposerSettings)
     acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
