@@ -8,7 +8,9 @@ of the tasks), so closed-loop episodes are the score wherever they are asked for
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -209,6 +211,28 @@ def new_target(settings: TargetSettings, samples: Samples, seed: int) -> Target:
     torch.manual_seed(seed)
     actions = ActionTokenizer.fit(samples.chunks[:, 0].numpy().astype(np.float64))
     return Target(replace(settings), actions, vocabulary())
+
+
+def check_init(settings: TargetSettings, description: dict[str, Any], folder: Path) -> None:
+    """Whether the target in `folder`, described by its JSON, can be fine-tuned to `settings`: no weight depends on the
+    chunk length, all else must agree.
+
+    Raises:
+        UsageError: the first shape that differs.
+    """
+    for name, wanted in asdict(settings).items():
+        there = description["settings"].get(name)
+        if name not in ("size", "chunk") and there != wanted:
+            raise UsageError(
+                f"train.init: the target in {folder} has {name}={there}, the run target.{name}={wanted}: set both alike"
+            )
+
+
+def continued_target(settings: TargetSettings, init: Target) -> Target:
+    """A policy of `settings` that begins with a copy of the weights of `init` and shares its statistics and words."""
+    target = Target(replace(settings), init.actions, init.words)
+    target.load_state_dict(init.state_dict())
+    return target
 
 
 def vocabulary() -> WordTokenizer:

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,9 +21,19 @@ from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettin
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.training.distillation import Distillation, distillation_job, teach
-from kerv_cli.training.imitation import Imitation, Samples, imitation_job, load_samples, new_target, split, vocabulary
+from kerv_cli.training.imitation import (
+    Imitation,
+    Samples,
+    check_init,
+    continued_target,
+    imitation_job,
+    load_samples,
+    new_target,
+    split,
+    vocabulary,
+)
 from kerv_cli.training.loop import Loop, Metrics
-from kerv_cli.vla.checkpoint import load_target, save_target
+from kerv_cli.vla.checkpoint import load_target, read_description, save_target
 from kerv_cli.vla.target import Target
 
 Progress = Callable[[int, int], None]
@@ -31,8 +42,9 @@ VALIDATION_SEED = EVALUATION_SEED // 2
 
 
 def determining(train: TrainSettings) -> dict[str, Any]:
-    """What of the optimisation settings makes two runs different. A run may be resumed with more or fewer steps."""
-    return {k: v for k, v in asdict(train).items() if k not in ("steps", "validate_every", "closed_loop")}
+    """What of the optimisation settings makes two runs different. A run may be resumed with more or fewer steps.
+    `init` is a name: the weights that it stands for count."""
+    return {k: v for k, v in asdict(train).items() if k not in ("steps", "validate_every", "closed_loop", "init")}
 
 
 def identity_of(**parts: Any) -> str:
@@ -54,29 +66,55 @@ class TargetRun:
                 "the policy must be shown what it was trained on, set both alike"
             )
         self.folder = artifact(settings.results, "target", settings.name)
+        self.init = self.find_init()
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         self.samples: Samples | None = None
+        self.begun: Target | None = None
+        self.origin: dict[str, str] = {}  # hash of the weights that the run begins with, where they are not fresh
+
+    def find_init(self) -> Path | None:
+        """The folder of the target that the run begins with."""
+        name = self.settings.train.init
+        if name is None:
+            return None
+        folder = find_target(self.settings.results, name)
+        if name == self.settings.name or folder.resolve() == self.folder.resolve():
+            raise UsageError(
+                f"train.init={name} would be overwritten by the run that begins with it: choose another name="
+            )
+        check_init(self.settings.target, read_description(folder, "target"), folder)
+        return folder
 
     def plan(self) -> str:
         train, episodes = self.settings.train, [e for e in self.dataset.episodes if e.task in self.tasks]
         return (
             f"{self.folder}: {self.settings.target.size} on {self.settings.target.observation}, {len(episodes)} "
             f"demonstrations of {len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples"
+            + (f", beginning with {self.init}" if self.init else "")
         )
 
     def load(self, progress: Progress) -> None:
         self.device, _ = set_up(self.settings.runtime)
-        self.samples = load_samples(self.dataset, self.settings.target, vocabulary(), self.tasks, progress)
+        if self.init is not None:
+            self.begun, described = load_target(self.init)
+            self.origin = {"init": described["sha256"]}
+        words = self.begun.words if self.begun else vocabulary()
+        self.samples = load_samples(self.dataset, self.settings.target, words, self.tasks, progress)
 
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
         assert self.samples is not None
         settings = self.settings
-        target = new_target(settings.target, self.samples, settings.train.seed).to(self.device)
+        if self.begun is None:
+            target = new_target(settings.target, self.samples, settings.train.seed)
+        else:
+            target = continued_target(settings.target, self.begun)
+        target = target.to(self.device)
         identity = identity_of(
             target=asdict(settings.target),
             train=determining(settings.train),
             demos=self.dataset.sha256,
             tasks=self.tasks,
+            **self.origin,
         )
         run = Imitation(target, self.samples, settings.train, torch.device(self.device))
         closed_loop = self.closed_loop if settings.train.closed_loop else None
@@ -96,6 +134,7 @@ class TargetRun:
         made = {
             "command": "kerv train target",
             "settings": asdict(self.settings),
+            **self.origin,
             "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
@@ -109,6 +148,8 @@ class DrafterRun:
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
         self.settings = settings
+        if settings.train.init is not None:
+            raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.drafter.kind != "eagle":
             raise UnknownName("drafter.kind", settings.drafter.kind, ["eagle"])
         self.target_folder = find_target(settings.results, settings.policy.target)
