@@ -58,6 +58,20 @@ def drafter_folder(results: str, name: str | None, target: Path) -> Path:
 
 def drafter_beside(target: Path) -> Path:
     """Shipped: pretrained/<name>/{target,drafter}; trained: artifacts/target/<name> and artifacts/drafter/<name>."""
+    return _beside(target, "drafter")
+
+
+def early_folder(results: str, name: str | None, target: Path) -> Path:
+    """The early drafter that is named, else the one beside the target."""
+    return artifact(results, "early", name) if name else early_beside(target)
+
+
+def early_beside(target: Path) -> Path:
+    """As `drafter_beside`, in folders named early."""
+    return _beside(target, "early")
+
+
+def _beside(target: Path, kind: str) -> Path:
     if target.name == "target":
-        return target.parent / "drafter"
-    return target.parent.parent / "drafter" / target.name if target.parent.name == "target" else target / "drafter"
+        return target.parent / kind
+    return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind
