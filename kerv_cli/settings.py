@@ -78,6 +78,7 @@ class RectifierSettings:
     use_verdict: bool = True  # the verdict at the rejected position is kept (ours); false: predicted too (KERV)
     min_verified: int = 1  # DoFs of a step that must be known for it to be filled
     rest: int = 0  # decodes without compensation after one (KERV: 4)
+    max_dropped: int = -1  # control steps of the chunk that a compensation may drop; -1: any number (KERV)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from kerv_cli.decoding.rectify import Compensation, assemble
 from kerv_cli.drafting.kinematics import ActionHistory, Hold, Linear
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import AcceptanceSettings, BoundarySettings, MethodSettings, OpeningSettings, RectifierSettings
+from kerv_cli.settings import AcceptanceSettings, MethodSettings, OpeningSettings, RectifierSettings
 from kerv_cli.vla.action_tokens import values_of
 
 D, N = 4, 16
@@ -75,6 +75,16 @@ def test_without_enough_history_the_target_decodes_on() -> None:
     assert chunk.closed is None
 
 
+@pytest.mark.parametrize(("known", "closed"), [(5, [False, False, True]), (9, [False, True, True]), (13, [True] * 3)])
+def test_a_chunk_is_not_closed_where_too_much_would_be_dropped(known: int, closed: list[bool]) -> None:
+    found = []
+    for most in (0, 1, 2):
+        chunk = chunk_with(PAST)
+        chunk.tokens = [100] * known
+        found.append(Compensation(RectifierSettings("compensate", max_dropped=most), Hold(D, minimum=1)).close(chunk))
+    assert found == closed
+
+
 def test_the_filter_rests_after_a_compensation() -> None:
     compensation = Compensation(RectifierSettings("compensate", rest=2), Hold(D, minimum=1))
     closed = []
@@ -111,9 +121,8 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_verdict: bool) -> None
             return TokenTree.chain(drafted)
 
     rectifier = RectifierSettings("compensate", use_verdict=use_verdict)
-    method = MethodSettings(
-        "test", acceptance=AcceptanceSettings("strict"), rectifier=rectifier, opening=OpeningSettings("opening", N)
-    )
+    opening = OpeningSettings(["opening"], N)
+    method = MethodSettings("test", acceptance=AcceptanceSettings("strict"), rectifier=rectifier, opening=opening)
     decoder = Decoder(
         target, method, Parts(opening=Opening(), compensation=Compensation(rectifier, Hold(D, minimum=1)))
     )
@@ -134,10 +143,43 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_verdict: bool) -> None
     assert actions.reshape(-1)[:known] == pytest.approx(values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
 
 
-def test_a_boundary_is_refused_rather_than_ignored() -> None:
-    method = MethodSettings(boundary=BoundarySettings("fused"))
-    with pytest.raises(UsageError, match="boundary=fused does not choose proposers yet"):
-        Decoder(random_target(0, 1, 1, 1), method)
+@pytest.mark.parametrize("wrong", range(N - 1))
+def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> None:
+    """predictor=draft: behind the verdict the step is filled with the draft's own values, at the first decode too."""
+    target = random_target(3, 2, 2, N // D)
+    prompt = random_prompt(target, 3)
+    truth = plain_greedy(target, prompt)
+    drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
+
+    class Opening:
+        name = "opening"
+        needs_states = False
+
+        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+            return TokenTree.chain(drafted[:depth])
+
+    rectifier = RectifierSettings("compensate", predictor="draft")
+    opening = OpeningSettings(["opening"], N)
+    method = MethodSettings("test", acceptance=AcceptanceSettings("strict"), rectifier=rectifier, opening=opening)
+    parts = Parts(opening=Opening(), compensation=Compensation(rectifier, Hold(D, minimum=1)))  # type: ignore[arg-type]
+    decoder = Decoder(target, method, parts)
+    chunk = decoder.decode_prompt(prompt)
+    assert chunk.forwards == 1
+    end = min(-(-(wrong + 1) // D) * D, N)
+    if (
+        end == N
+    ):  # the last token of all was not drafted, the bonus would have filled it: without a history it is decoded
+        assert chunk.closed is None or len(chunk.closed) == N // D
+        return
+    expected = [*truth[: wrong + 1], *drafted[wrong + 1 : end]]
+    assert chunk.closed is not None
+    assert chunk.closed.reshape(-1) == pytest.approx(values_of(np.array(expected)))
+    assert decoder.actions_of(chunk)[1] == end - wrong - 1
+
+
+def test_a_draft_that_goes_on_needs_the_verdict() -> None:
+    with pytest.raises(UsageError, match="use_verdict"):
+        Compensation(RectifierSettings("compensate", predictor="draft", use_verdict=False), Hold(D, minimum=1))
 
 
 def test_an_opening_that_needs_states_is_refused() -> None:

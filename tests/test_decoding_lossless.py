@@ -198,7 +198,7 @@ def test_drafts_verified_inside_the_prefill_are_lossless(
         drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
         proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
     method = MethodSettings(
-        "test", ProposerSettings(nodes=6), STRICT, ThresholdSettings(), opening=OpeningSettings("random", nodes)
+        "test", ProposerSettings(nodes=6), STRICT, ThresholdSettings(), opening=OpeningSettings(["random"], nodes)
     )
     parts = Parts(opening=RandomTrees(truth, seed, nodes), proposer=proposer)
     result = Decoder(target, method, parts).decode_prompt(prompt)
@@ -215,7 +215,7 @@ def test_a_perfect_opening_takes_one_forward() -> None:
         def propose(self, chunk: Chunk, depth: int) -> TokenTree:
             return TokenTree.chain(self.truth[:depth])
 
-    method = MethodSettings("test", acceptance=STRICT, opening=OpeningSettings("whole", 16))
+    method = MethodSettings("test", acceptance=STRICT, opening=OpeningSettings(["whole"], 16))
     result = Decoder(target, method, Parts(opening=Whole(truth, 0, 16))).decode_prompt(prompt)
     assert result.tokens == truth
     assert result.forwards == 1

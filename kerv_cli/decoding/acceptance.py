@@ -4,7 +4,7 @@ smaller summed distance, then to the node proposed first."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups
@@ -104,10 +104,18 @@ def limits_of(settings: AcceptanceSettings, r: int, dofs: int, gripper: int) -> 
     return tuple(limits)
 
 
+def judging(settings: AcceptanceSettings, proposer: str) -> AcceptanceSettings:
+    """The rule for drafts of `proposer`: `hybrid` judges retrieved ones by `sequence` and all others by `relaxed`."""
+    if settings.kind != "hybrid":
+        return settings
+    return replace(settings, kind="sequence" if proposer == "retrieval" else "relaxed")
+
+
 def acceptance_rule(settings: AcceptanceSettings) -> Rule:
     rules: dict[str, Rule] = {
         "strict": accept_by_distance,
         "relaxed": accept_by_distance,
+        "hybrid": accept_by_distance,
         "sequence": partial(accept_by_group, group_limit=settings.group_limit),
     }
     if settings.kind not in rules:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kerv_cli.decoding.boundary import Choice
 from kerv_cli.decoding.record import PHASES, Round
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree
@@ -43,10 +44,13 @@ class Clock:
 
 @dataclass(frozen=True)
 class Situation:
-    """What is known before the target runs. history: executed actions, normalised, oldest first."""
+    """What is known before the target runs. history: executed actions, normalised, oldest first; path: measured
+    end-effector positions (3,), metres; random: the episode's own numbers, for boundaries that draw lots."""
 
     task: str
     history: ActionHistory
+    path: list[np.ndarray] = field(default_factory=list)
+    random: np.random.Generator = field(default_factory=np.random.default_rng)
 
 
 @dataclass
@@ -64,6 +68,8 @@ class Chunk:
     forwards: int = 0
     variability: float = 0.0
     similarity: float | None = None  # of the best stored chunk, where one was looked up
+    choice: Choice | None = None  # who drafts, where a boundary decides
+    unverified: list[int] = field(default_factory=list)  # what the rejected draft had behind the rejected token
     closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property
@@ -72,12 +78,24 @@ class Chunk:
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
 
+class DraftsChunks(Protocol):
+    """Drafts whole chunks without the target's states: what openings are merged from."""
+
+    @property
+    def name(self) -> str: ...
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Tokens behind the committed ones, at most `depth` each, the best first; none where nothing is known."""
+
+
 class Proposer(Protocol):
     """Drafts a tree behind the committed tokens. `name` goes into the record; `needs_states` says whether it reads the
     target's hidden states: one that does not can also draft before the prefill."""
 
-    name: str
-    needs_states: bool
+    @property
+    def name(self) -> str: ...
+    @property
+    def needs_states(self) -> bool: ...
 
     def begin(self, chunk: Chunk) -> None:
         """The prompt is encoded and the first tokens are committed."""

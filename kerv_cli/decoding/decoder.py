@@ -9,10 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.decoding.acceptance import Rule, acceptance_rule, limits_of
+from kerv_cli.decoding.acceptance import acceptance_rule, judging, limits_of
+from kerv_cli.decoding.boundary import Boundary, episode_generator
 from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Situation
+from kerv_cli.decoding.proposers import EMPTY
 from kerv_cli.decoding.record import DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
+from kerv_cli.decoding.skipping import VerifySkip
 from kerv_cli.decoding.thresholds import Threshold, build_threshold
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree, prefill_mask, verify_mask
@@ -21,20 +24,21 @@ from kerv_cli.settings import MethodSettings
 from kerv_cli.vla.action_tokens import GRIPPER, values_of
 from kerv_cli.vla.target import Target
 
-EMPTY = TokenTree((), (), ())
-
 
 @dataclass(frozen=True)
 class Parts:
     """What a method is made of besides its rules.
 
     opening: drafts before the prefill, which then verifies them (METHODS §5). proposer: drafts behind committed
-    tokens. compensation: ends a chunk after a rejection; without it the target decodes on.
+    tokens. compensation: ends a chunk after a rejection; without it the target decodes on. boundary: chooses between
+    the sides of a hybrid proposer. skip: executes a retrieved chunk unverified.
     """
 
     opening: Proposer | None = None
     proposer: Proposer | None = None
     compensation: Compensation | None = None
+    boundary: Boundary | None = None
+    skip: VerifySkip | None = None
 
 
 class Decoder:
@@ -47,12 +51,13 @@ class Decoder:
         self.target, self.method, self.parts = target, method, parts or Parts()
         if self.parts.opening is not None and self.parts.opening.needs_states:
             raise UsageError(f"opening '{self.parts.opening.name}' needs the target's states, which come after it")
-        if method.boundary.kind != "always":
-            raise UsageError(f"boundary={method.boundary.kind} does not choose proposers yet: leave it at always")
-        self.rule: Rule = acceptance_rule(method.acceptance)
+        if not 0 <= method.chunk <= target.settings.chunk:
+            raise UsageError(f"chunk={method.chunk}: the target was trained for {target.settings.chunk} control steps")
+        self.size = (method.chunk or target.settings.chunk) * target.settings.dofs
+        acceptance_rule(method.acceptance)
         self.threshold: Threshold = build_threshold(method.threshold)
-        nodes = max(method.proposer.nodes, method.opening.nodes)
-        self.cache = target.trunk.new_cache(1, target.prompt_length + target.tokens_per_chunk + nodes + 1)
+        nodes = max(method.proposer.nodes, method.opening.nodes, self.size)
+        self.cache = target.trunk.new_cache(1, target.prompt_length + self.size + nodes + 1)
         self.situation = Situation("", ActionHistory(target.settings.dofs))
         self.words: Tensor | None = None
 
@@ -60,20 +65,25 @@ class Decoder:
     def needs_frame(self) -> bool:
         return self.target.needs_frame
 
-    def reset(self, task: str, instruction: str) -> None:
+    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
         """A new episode begins."""
         self.words = self.target.words_of(instruction)
-        self.situation = Situation(task, ActionHistory(self.target.settings.dofs))
+        random = episode_generator(self.method.boundary, task, seed)
+        self.situation = Situation(task, ActionHistory(self.target.settings.dofs), random=random)
         self.threshold.reset()
-        if self.parts.compensation is not None:
-            self.parts.compensation.reset()
+        for part in (self.parts.compensation, self.parts.skip):
+            if part is not None:
+                part.reset()
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """An action (D,) was executed; the end effector is now at (3,) metres."""
         self.situation.history.append(self.target.actions.normalise(action))
+        self.situation.path.append(np.asarray(end_effector))
 
     def finish(self, success: bool) -> None:
         """The episode ended."""
+        if self.parts.skip is not None:
+            self.parts.skip.finish(success)
 
     @torch.inference_mode()
     def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
@@ -87,7 +97,7 @@ class Decoder:
         clock.lap("vision")
         chunk = self.decode_prompt(prompt, clock)
         actions, compensated = self.actions_of(chunk)
-        compared = any(r.drafted for r in chunk.rounds)
+        compared = any(r.drafted and r.mode != "skip" for r in chunk.rounds)
         variability = chunk.variability if compared else None
         self.threshold.update(variability)
         if self.parts.compensation is not None:
@@ -99,12 +109,14 @@ class Decoder:
             size=chunk.size,
             forwards=chunk.forwards,
             rounds=tuple(chunk.rounds),
-            mode=next((r.proposer for r in chunk.rounds if r.tree_size), "ar"),
+            mode=next((r.mode if r.mode == "skip" else r.proposer for r in chunk.rounds if r.drafted), "ar"),
             seconds=seconds,
             phases=clock.phases,
             compensated=compensated,
             variability=variability,
+            skipped=any(r.mode == "skip" for r in chunk.rounds),
             similarity=chunk.similarity,
+            metric=chunk.choice.metric if chunk.choice is not None else None,
         )
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
@@ -119,7 +131,13 @@ class Decoder:
     def decode_prompt(self, prompt: Tensor, clock: Clock | None = None) -> Chunk:
         """prompt (1, P, E) -> a complete chunk, or one that the rectifier closed."""
         clock = clock or Clock(prompt.device)
-        chunk = Chunk(prompt, self.target.tokens_per_chunk, self.target.settings.dofs, self.cache, self.situation)
+        chunk = Chunk(prompt, self.size, self.target.settings.dofs, self.cache, self.situation)
+        if self.parts.boundary is not None:
+            chunk.choice = self.parts.boundary.choose(np.array(self.situation.path), self.situation.random)
+        skipped = self.parts.skip is not None and self.parts.skip.take(chunk)
+        clock.lap("propose")
+        if skipped:
+            return chunk
         self.open(chunk, clock)
         if self.parts.proposer is not None and chunk.left > 1:
             self.parts.proposer.begin(chunk)
@@ -131,8 +149,9 @@ class Decoder:
     def open(self, chunk: Chunk, clock: Clock) -> None:
         """The first forward: encodes the prompt and, with an opening draft, verifies that too."""
         tree, prompt, target = EMPTY, chunk.prompt, self.target
-        if self.parts.opening is not None:
-            tree = self.parts.opening.propose(chunk, chunk.size)
+        if self.parts.opening is not None and chunk.size > 1:
+            # as in a round: the bonus fills the last place
+            tree = self.parts.opening.propose(chunk, chunk.size - 1)
             clock.lap("propose")
         chunk.forwards = 1
         length = prompt.shape[1]
@@ -146,7 +165,8 @@ class Decoder:
         x = torch.cat([prompt, target.embedding(torch.tensor([tree.tokens], device=prompt.device))], 1)
         positions = torch.tensor([*range(length), *(length + d for d in tree.depths)], device=prompt.device)
         chunk.cache.length = 0
-        hidden = target.trunk(x, positions, chunk.cache, prefill_mask(tree, length, prompt))
+        mask = None if tree.is_chain else prefill_mask(tree, length, prompt)
+        hidden = target.trunk(x, positions, chunk.cache, mask)
         verdicts = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
         clock.lap("prefill")
         path = self.accept(chunk, tree, verdicts, self.parts.opening)
@@ -163,7 +183,7 @@ class Decoder:
         tree, proposer = EMPTY, self.parts.proposer
         if proposer is not None and chunk.left > 1:
             # one token less than is left: the bonus fills the last place whether or not everything is accepted
-            tree = proposer.propose(chunk, chunk.left - 1)
+            tree = proposer.propose(chunk, min(self.method.proposer.depth, chunk.left - 1))
             clock.lap("propose")
         hidden, verdicts = self.verify(chunk, tree)
         clock.lap("verify")
@@ -200,9 +220,11 @@ class Decoder:
             chunk.tokens.append(verdicts[0])
             chunk.rounds.append(Round("decode", "none", start, (), (verdicts[0],), 0, 1, 0, ()))
             return ()
-        limits = limits_of(self.method.acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
-        verdict = self.rule(tree, verdicts, start, limits)
+        acceptance = judging(self.method.acceptance, proposer.name)
+        limits = limits_of(acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
+        verdict = acceptance_rule(acceptance)(tree, verdicts, start, limits)
         path = verdict.path
+        chunk.unverified = [] if verdict.rejected is None else tree.tokens_behind(verdict.rejected)
         judged = path if verdict.rejected is None else (*path, verdict.rejected)
         seen = [verdicts[tree.parents[i] + 1] for i in judged]
         drafted = [tree.tokens[i] for i in judged]

@@ -3,39 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
 from kerv_cli.drafting.drafter import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.groups import kinematic_groups
+from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.settings import ProposerSettings
-from kerv_cli.vla.action_tokens import VOCABULARY, bins_of
+from kerv_cli.vla.action_tokens import VOCABULARY, bins_of, values_of
 from kerv_cli.vla.target import Target
 
+if TYPE_CHECKING:
+    from kerv_cli.drafting.early import EarlyDrafter
 
-class HoldProposer:
-    """The last executed action, repeated. Nothing is drafted before there was one."""
+EMPTY = TokenTree((), (), ())
 
-    name = "hold"
+
+class ChainProposer:
+    """A proposer whose draft is one chain of the chunk's remaining tokens."""
+
+    name = ""
     needs_states = False
 
     def begin(self, chunk: Chunk) -> None:
         pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        history = chunk.situation.history.values()
-        if not len(history):
-            return TokenTree((), (), ())
-        held = bins_of(history[-1]).tolist()
-        ahead = range(len(chunk.tokens), min(chunk.size, len(chunk.tokens) + depth))
-        return TokenTree.chain([held[i % chunk.dofs] for i in ahead])
+        chains = self.chains(chunk, depth)
+        return TokenTree.chain(chains[0]) if chains else EMPTY
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        raise NotImplementedError
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
+
+
+class PredictionProposer(ChainProposer):
+    """A kinematic prediction of the chunk (METHODS §3.1, §6: `hold`, `kalman_only`). Steps of the chunk that are
+    committed count as executed. Nothing is drafted before the predictor has its least history."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        self.name, self.predictor = predictor.name, predictor
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        whole = len(chunk.tokens) // chunk.dofs
+        pending = values_of(np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64)).reshape(whole, chunk.dofs)
+        history = chunk.situation.history.values(pending)
+        predicted = self.predictor.predict(history, chunk.size // chunk.dofs - whole)
+        if predicted is None:
+            return []
+        tokens: list[int] = bins_of(predicted).flatten().tolist()
+        return [tokens[len(chunk.tokens) - whole * chunk.dofs :][:depth]]
+
+
+class EarlyProposer(ChainProposer):
+    """The early drafter's chunk (METHODS §5), drafted once per observation."""
+
+    name = "early"
+
+    def __init__(self, early: EarlyDrafter) -> None:
+        self.early = early
+        self._drafted: tuple[Chunk, list[int]] | None = None
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        if self._drafted is None or self._drafted[0] is not chunk:
+            self._drafted = chunk, self.early.propose(chunk.prompt, chunk.situation.history.values())
+        return [self._drafted[1][len(chunk.tokens) : chunk.size][:depth]]
 
 
 class RetrievalProposer:
@@ -61,36 +101,67 @@ class RetrievalProposer:
         pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        return neighbour_tree(self.neighbours(chunk).chunks, len(chunk.tokens), self.groups, self.nodes, depth)
+        chunks = self.neighbours(chunk).chunks[:, : chunk.size]
+        return neighbour_tree(chunks, len(chunk.tokens), self.groups, self.nodes, depth)
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        start = len(chunk.tokens)
+        found: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
+        return found
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
 
 
 class MergedProposer:
-    """Whole drafts of retrieval and of hold in one prefix tree: each neighbour's chunk is a branch, so is the hold."""
+    """Whole drafts of several sources in one prefix tree, a branch each (METHODS §5)."""
 
-    name = "merged"
     needs_states = False
 
-    def __init__(self, retrieval: RetrievalProposer, hold: HoldProposer, nodes: int) -> None:
-        self.retrieval, self.hold, self.nodes = retrieval, hold, nodes
+    def __init__(self, sources: Sequence[DraftsChunks], nodes: int) -> None:
+        self.name = sources[0].name if len(sources) == 1 else "merged"
+        self.sources, self.nodes = sources, nodes
 
     def begin(self, chunk: Chunk) -> None:
         pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        start = len(chunk.tokens)
-        chains = [row[start : start + depth] for row in self.retrieval.neighbours(chunk).chunks.tolist()]
-        chains.append(list(self.hold.propose(chunk, depth).tokens))
+        chains = [chain for source in self.sources for chain in source.chains(chunk, depth)]
         tree = merge(chains)
-        while len(tree) > self.nodes and len(chains) > 1:  # the last neighbour goes first, hold stays
-            del chains[-2]
+        while len(tree) > self.nodes:
+            if len(chains) == 1:
+                return TokenTree.chain(chains[0][: self.nodes])
+            del chains[-1]
             tree = merge(chains)
         return tree
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
+
+
+class HybridProposer:
+    """HeiSD: retrieval on one side of the boundary, the drafter on the other (METHODS §4.4)."""
+
+    needs_states = True
+
+    def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
+        self.sides: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
+        self.chosen = drafter
+
+    @property
+    def name(self) -> str:
+        return self.chosen.name
+
+    def begin(self, chunk: Chunk) -> None:
+        assert chunk.choice is not None, "a hybrid proposer needs a boundary"
+        self.chosen = self.sides[chunk.choice.mode]
+        self.chosen.begin(chunk)
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        return self.chosen.propose(chunk, depth)
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+        self.chosen.committed(chunk, first, hidden, verdicts)
 
 
 class JacobiProposer:
@@ -113,7 +184,7 @@ class JacobiProposer:
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         accepted = len(chunk.tokens) - first - 2
-        self.guess = list(verdicts[accepted + 1 :])
+        self.guess = [*verdicts[accepted + 1 :], *self.guess[len(verdicts) - 1 :]]
 
 
 class DrafterProposer:

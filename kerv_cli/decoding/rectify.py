@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from kerv_cli.decoding.chunk import Chunk
@@ -10,18 +12,26 @@ from kerv_cli.errors import UsageError
 from kerv_cli.settings import RectifierSettings
 from kerv_cli.vla.action_tokens import values_of
 
+DRAFT = "draft"
+"""The one filling that no predictor of `drafting/kinematics.py` gives."""
+
 
 class Compensation:
     """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
 
     With `use_verdict` (ours) the verdict at the rejected position is kept too: it is there and free. `steps` (PL) lets
-    the prediction fill further control steps. After a compensation the filter rests for `rest` decodes.
+    the prediction fill further control steps. With `predictor: draft` (ours) what the rejected draft had behind the
+    rejected token goes before the prediction: it was drafted with the observation in view, which a filter has not.
+    After a compensation the filter rests for `rest` decodes.
     """
 
     def __init__(self, settings: RectifierSettings, predictor: Predictor) -> None:
         if settings.steps < 1 or settings.rest < 0 or settings.min_verified < 0:
             raise UsageError("rectifier: steps must be at least 1, rest and min_verified at least 0")
         self.settings, self.predictor = settings, predictor
+        self.from_draft = settings.predictor == DRAFT
+        if self.from_draft and not settings.use_verdict:
+            raise UsageError("rectifier.predictor=draft goes on behind the verdict: leave rectifier.use_verdict=true")
         self.resting = 0
 
     def reset(self) -> None:
@@ -40,8 +50,9 @@ class Compensation:
         if self.resting:
             return False
         tokens = chunk.tokens if self.settings.use_verdict else chunk.tokens[:-1]
-        values = assemble(tokens, chunk, self.predictor, self.settings)
-        if values is None:
+        drafted = chunk.unverified if self.from_draft else []
+        values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
+        if values is None or 0 <= self.settings.max_dropped < chunk.size // chunk.dofs - len(values):
             return False
         chunk.tokens = tokens[: values.size]
         chunk.closed = values
@@ -50,8 +61,15 @@ class Compensation:
         return True
 
 
-def assemble(tokens: list[int], chunk: Chunk, predictor: Predictor, settings: RectifierSettings) -> np.ndarray | None:
-    """Known tokens, then the prediction -> (steps, D) normalised actions; None where the history is too short.
+def assemble(
+    tokens: list[int],
+    chunk: Chunk,
+    predictor: Predictor,
+    settings: RectifierSettings,
+    drafted: Sequence[int] = (),
+) -> np.ndarray | None:
+    """Known tokens, then `drafted` ones, then the prediction -> (steps, D) normalised actions; None where the history
+    is too short to predict what is still missing.
 
     A step of which fewer than `min_verified` DoFs are known is dropped, unless nothing would be left.
     """
@@ -59,11 +77,11 @@ def assemble(tokens: list[int], chunk: Chunk, predictor: Predictor, settings: Re
     whole, part = divmod(len(tokens), dofs)
     filled = 1 if whole == 0 or (part and part >= settings.min_verified) else 0
     steps = min(horizon, whole + max(filled, settings.steps - 1 + filled))
-    values = values_of(np.array(tokens[: steps * dofs], dtype=np.int64))
+    values = values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
     flat = np.full(steps * dofs, np.nan)
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)
-    if steps > whole:
+    if np.isnan(actions).any():
         predicted = predictor.predict(chunk.situation.history.values(actions[:whole]), steps - whole)
         if predicted is None:
             return None

@@ -68,6 +68,15 @@ class TokenTree:
             tuple(self.depths[i] for i in keep),
         )
 
+    def tokens_behind(self, node: int) -> list[int]:
+        """Tokens below `node` along first children, down to a leaf."""
+        found: list[int] = []
+        for i in range(node + 1, len(self)):
+            if self.parents[i] == node:
+                found.append(self.tokens[i])
+                node = i
+        return found
+
     def path_to(self, node: int) -> list[int]:
         """Nodes from depth 0 down to `node`; empty for the root."""
         path: list[int] = []

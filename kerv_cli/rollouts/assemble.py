@@ -6,48 +6,92 @@ import dataclasses
 
 import numpy as np
 
+from kerv_cli.decoding.boundary import Boundary, build_boundary
 from kerv_cli.decoding.chunk import Proposer
 from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer, HoldProposer, JacobiProposer, MergedProposer, RetrievalProposer
+from kerv_cli.decoding.proposers import (
+    DrafterProposer,
+    EarlyProposer,
+    HybridProposer,
+    JacobiProposer,
+    MergedProposer,
+    PredictionProposer,
+    RetrievalProposer,
+)
 from kerv_cli.decoding.record import DecodeRecord
-from kerv_cli.decoding.rectify import Compensation
-from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, build_predictor
+from kerv_cli.decoding.rectify import DRAFT, Compensation
+from kerv_cli.decoding.skipping import SkipLevels, VerifySkip
+from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, PREDICTORS, Predictor, build_predictor
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.policy import Policy
 from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings
 from kerv_cli.vla.action_tokens import GRIPPER
 
-WARM_UP_DECODES = 3
+WARM_UP_DECODES = 6
 PREDICTED_FROM = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: see kinematics
 
 
-def build_decoder(policy: Policy, method: MethodSettings) -> Decoder:
+def build_decoder(policy: Policy, method: MethodSettings, task: str = "") -> Decoder:
     """The method's parts around the policy."""
-    return Decoder(policy.target, method, build_parts(policy, method))
+    return Decoder(policy.target, method, build_parts(policy, method, task))
 
 
-def build_parts(policy: Policy, method: MethodSettings) -> Parts:
-    return Parts(build_opening(policy, method), build_proposer(policy, method), build_compensation(policy, method))
+def build_parts(policy: Policy, method: MethodSettings, task: str = "") -> Parts:
+    """task: whose calibrated levels hold, where a part has one per task."""
+    proposer, boundary = build_proposer(policy, method), build_part_boundary(policy, method)
+    if (method.proposer.kind == "hybrid") != (boundary is not None):
+        raise UsageError(
+            f"proposer={method.proposer.kind} with boundary={method.boundary.kind}: a boundary chooses between the "
+            "two sides of proposer=hybrid, which needs one other than always"
+        )
+    return Parts(
+        opening=build_opening(policy, method),
+        proposer=proposer,
+        compensation=build_compensation(policy, method),
+        boundary=boundary,
+        skip=build_skip(policy, method, proposer, task),
+    )
+
+
+def build_part_boundary(policy: Policy, method: MethodSettings) -> Boundary | None:
+    ranges = policy.calibration.ranges() if policy.calibration is not None and method.boundary.kind == "fused" else None
+    return build_boundary(method.boundary, ranges)
 
 
 def build_opening(policy: Policy, method: MethodSettings) -> Proposer | None:
     settings = method.opening
-    if settings.kind == "none":
+    if not settings.sources:
         return None
-    if settings.kind == "hold":
-        return HoldProposer()
-    if settings.kind in ("retrieval", "merged"):
-        retrieval = build_retrieval(policy, settings.neighbours, settings.nodes)
-        return retrieval if settings.kind == "retrieval" else MergedProposer(retrieval, HoldProposer(), settings.nodes)
-    raise UnknownName("opening.kind", settings.kind, ["none", "hold", "retrieval", "merged"])
+    if settings.nodes < 1:
+        raise UsageError(f"opening.nodes={settings.nodes}: at least 1")
+    sources = [build_source(policy, name, settings.neighbours, settings.nodes) for name in settings.sources]
+    return MergedProposer(sources, settings.nodes)
 
 
-def build_retrieval(policy: Policy, neighbours: int, nodes: int) -> RetrievalProposer:
-    assert policy.datastore is not None
-    if min(neighbours, nodes) < 1:
-        raise UsageError("retrieval needs at least one neighbour and one node")
-    return RetrievalProposer(policy.datastore, policy.target, neighbours, nodes)
+def build_source(
+    policy: Policy, name: str, neighbours: int, nodes: int
+) -> PredictionProposer | EarlyProposer | RetrievalProposer:
+    """What drafts whole chunks without the target's states."""
+    if name == "early":
+        assert policy.early is not None
+        return EarlyProposer(policy.early)
+    if name == "retrieval":
+        assert policy.datastore is not None
+        if min(neighbours, nodes) < 1:
+            raise UsageError("retrieval needs at least one neighbour and one node")
+        return RetrievalProposer(policy.datastore, policy.target, neighbours, nodes)
+    if name in PREDICTORS:
+        return PredictionProposer(predictor_of(policy, name))
+    raise UnknownName("source of drafts", name, ["early", "retrieval", *PREDICTORS])
+
+
+def predictor_of(policy: Policy, name: str) -> Predictor:
+    chunk = policy.target.settings
+    if policy.calibration is not None and name in FILTERS:
+        return policy.calibration.predictor(name, horizon=chunk.chunk)
+    least = PREDICTED_FROM.get(name, MINIMUM)
+    return build_predictor(name, chunk.dofs, {}, least, horizon=chunk.chunk, gripper=GRIPPER)
 
 
 def build_compensation(policy: Policy, method: MethodSettings) -> Compensation | None:
@@ -56,31 +100,46 @@ def build_compensation(policy: Policy, method: MethodSettings) -> Compensation |
         raise UnknownName("rectifier.kind", settings.kind, ["reinfer", "compensate"])
     if settings.kind == "reinfer":
         return None
-    chunk = policy.target.settings
-    if policy.calibration is not None and settings.predictor in FILTERS:
-        predictor = policy.calibration.predictor(settings.predictor, horizon=chunk.chunk)
-    else:
-        least = PREDICTED_FROM.get(settings.predictor, MINIMUM)
-        predictor = build_predictor(settings.predictor, chunk.dofs, {}, least, horizon=chunk.chunk, gripper=GRIPPER)
-    return Compensation(settings, predictor)
+    return Compensation(settings, predictor_of(policy, "hold" if settings.predictor == DRAFT else settings.predictor))
 
 
 def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:
     settings = method.proposer
     if settings.kind == "none":
         return None
-    if settings.kind == "drafter":
-        assert policy.drafter is not None
-        if min(settings.depth, settings.top_k, settings.nodes) < 1:
-            raise UsageError("proposer.depth, proposer.top_k and proposer.nodes must be at least 1")
-        return DrafterProposer(policy.drafter, policy.target, settings)
-    if settings.kind == "retrieval":
-        return build_retrieval(policy, settings.top_k, settings.nodes)
-    if settings.kind == "hold":
-        return HoldProposer()
+    if min(settings.depth, settings.top_k, settings.nodes) < 1:
+        raise UsageError("proposer.depth, proposer.top_k and proposer.nodes must be at least 1")
     if settings.kind == "jacobi":
         return JacobiProposer()
-    raise UnknownName("proposer.kind", settings.kind, ["none", "drafter", "retrieval", "hold", "jacobi"])
+    if settings.kind in ("drafter", "hybrid"):
+        assert policy.drafter is not None
+        drafter = DrafterProposer(policy.drafter, policy.target, settings)
+        if settings.kind == "drafter":
+            return drafter
+        retrieval = build_source(policy, "retrieval", settings.neighbours, settings.nodes)
+        assert isinstance(retrieval, RetrievalProposer)
+        return HybridProposer(drafter, retrieval)
+    if settings.kind in ("early", "retrieval", *PREDICTORS):
+        return build_source(policy, settings.kind, settings.neighbours, settings.nodes)
+    known = ["none", "drafter", "retrieval", "hybrid", "early", "jacobi", *PREDICTORS]
+    raise UnknownName("proposer.kind", settings.kind, known)
+
+
+def build_skip(policy: Policy, method: MethodSettings, proposer: Proposer | None, task: str) -> VerifySkip | None:
+    settings = method.skip
+    if settings.kind not in ("none", "similarity"):
+        raise UnknownName("skip.kind", settings.kind, ["none", "similarity"])
+    if settings.kind == "none":
+        return None
+    retrieval = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
+    if not isinstance(retrieval, RetrievalProposer):
+        raise UsageError(
+            f"skip=similarity with proposer={method.proposer.kind}: only retrieved chunks have a similarity"
+        )
+    if settings.s_min is not None:
+        return VerifySkip(settings, retrieval, SkipLevels(settings.s_min, settings.s_min, settings.s_min))
+    assert policy.calibration is not None
+    return VerifySkip(settings, retrieval, SkipLevels(*policy.calibration.skip_levels(task, policy.datastore_sha256)))
 
 
 class Sampled:
@@ -93,10 +152,10 @@ class Sampled:
     def needs_frame(self) -> bool:
         return self.decoder.needs_frame
 
-    def reset(self, task: str, instruction: str) -> None:
+    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
         self.count = 0
-        self.decoder.reset(task, instruction)
-        self.reference.reset(task, instruction)
+        self.decoder.reset(task, instruction, seed)
+        self.reference.reset(task, instruction, seed)
 
     def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
         record = self.decoder.decode(frame, state)
@@ -120,15 +179,17 @@ def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> Act
     method = settings.parts()
     if policy.calibration is not None:
         method = dataclasses.replace(method, threshold=policy.calibration.threshold(method.threshold, task))
-    decoder = build_decoder(policy, method)
+    decoder = build_decoder(policy, method, task)
     if settings.deviation_every <= 0:
         return decoder
-    return Sampled(decoder, Decoder(policy.target, MethodSettings()), settings.deviation_every)
+    return Sampled(decoder, Decoder(policy.target, MethodSettings(chunk=method.chunk)), settings.deviation_every)
 
 
 def warm_up(decoder: ActionDecoder, task: str, camera: CameraSettings) -> None:
-    """First calls allocate, choose kernels and fault pages in: they are no part of any inference time."""
-    decoder.reset(task, "")
+    """First calls allocate, choose kernels and fault pages in: they are no part of any inference time. The hand moves,
+    so that parts which wait for a history or a path take their turn."""
+    decoder.reset(task, "", 0)
     frame = np.zeros((camera.size, camera.size, 3), dtype=np.uint8)
-    for _ in range(WARM_UP_DECODES):
-        decoder.decode(frame, np.zeros(39))
+    for i in range(WARM_UP_DECODES):
+        for action in decoder.decode(frame, np.zeros(39)).actions:
+            decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

@@ -20,7 +20,7 @@ class ActionDecoder(Protocol):
     def needs_frame(self) -> bool:
         """Whether decode() reads a frame; none is rendered otherwise."""
 
-    def reset(self, task: str, instruction: str) -> None:
+    def reset(self, task: str, instruction: str, seed: int) -> None:
         """A new episode begins: histories are cleared."""
 
     def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
@@ -48,7 +48,7 @@ def run_episode(world: World, decoder: ActionDecoder, seed: int, recording: Reco
     began = time.perf_counter()
     logged = recording.camera if recording else None
     observation = world.reset(seed)
-    decoder.reset(world.task, world.instruction)
+    decoder.reset(world.task, world.instruction, seed)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     actions: list[np.ndarray] = []

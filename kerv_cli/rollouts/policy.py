@@ -12,12 +12,22 @@ from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_
 from kerv_cli.drafting.datastore import Datastore, check_target, read_manifest
 from kerv_cli.drafting.datastore_build import datastore_beside
 from kerv_cli.drafting.drafter import Drafter, load_drafter, read_drafter
+
+try:
+    from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
+except ImportError:
+    EarlyDrafter = load_early = read_early = None
 from kerv_cli.drafting.kinematics import FILTERS
 from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, find_target
+
+try:
+    from kerv_cli.places import early_folder
+except ImportError:
+    early_folder = None
 from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import EVALUATION_SEED, MethodSettings, RolloutSettings
+from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
@@ -29,9 +39,10 @@ class Policy:
 
     target: Target
     drafter: Drafter | None
+    early: EarlyDrafter | None
     calibration: Calibration | None
     datastore: Datastore | None
-    identity: dict[str, str]
+    datastore_sha256: str
 
 
 def identity_of(settings: RolloutSettings) -> dict[str, str]:
@@ -39,20 +50,31 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     folder = find_target(settings.results, settings.policy.target)
     description = read_description(folder, "target")
     identity = {"target": description["sha256"], "observation": observation_of(description)}
-    if settings.proposer.kind == "drafter":
-        identity["drafter"] = read_description(
-            drafter_folder(settings.results, settings.policy.drafter, folder), "drafter"
-        )["sha256"]
-    if needs_calibration(settings.parts()):
+    method = settings.parts()
+    if needs_drafter(method):
+        beside = drafter_folder(settings.results, settings.policy.drafter, folder)
+        identity["drafter"] = read_description(beside, "drafter")["sha256"]
+    if needs_early(method):
+        beside = early_folder(settings.results, settings.policy.early, folder)
+        identity["early"] = read_description(beside, "early")["sha256"]
+    if needs_calibration(method):
         identity["calibration"] = sha256_of(calibration_beside(folder))
-    if needs_datastore(settings.parts()):
+    if needs_datastore(method):
         identity["datastore"] = sha256_of(datastore_beside(folder) / "manifest.json")
     return identity
 
 
+def needs_drafter(method: MethodSettings) -> bool:
+    return method.proposer.kind in ("drafter", "hybrid")
+
+
+def needs_early(method: MethodSettings) -> bool:
+    return method.proposer.kind == "early" or "early" in method.opening.sources
+
+
 def needs_datastore(method: MethodSettings) -> bool:
     """Whether a part retrieves stored chunks."""
-    return method.proposer.kind == "retrieval" or method.opening.kind in ("retrieval", "merged")
+    return method.proposer.kind in ("retrieval", "hybrid") or "retrieval" in method.opening.sources
 
 
 def observation_of(description: Mapping[str, Any]) -> str:
@@ -63,8 +85,15 @@ def observation_of(description: Mapping[str, Any]) -> str:
 
 def needs_calibration(method: MethodSettings) -> bool:
     """Whether a part reads what `kerv calibrate` fitted."""
-    reference = method.threshold.kind in ("kinematic", "change") and method.threshold.k_s is None
-    return reference or (method.rectifier.kind == "compensate" and method.rectifier.predictor in FILTERS)
+    predictors = {method.proposer.kind, *method.opening.sources}
+    if method.rectifier.kind == "compensate":
+        predictors.add(method.rectifier.predictor)
+    return (
+        not predictors.isdisjoint(FILTERS)
+        or (method.threshold.kind in ("kinematic", "change") and method.threshold.k_s is None)
+        or method.boundary.kind == "fused"
+        or (method.skip.kind == "similarity" and method.skip.s_min is None)
+    )
 
 
 def check(settings: RolloutSettings) -> None:
@@ -83,12 +112,14 @@ def check(settings: RolloutSettings) -> None:
     size, camera = description["settings"]["image_size"], settings.world.camera
     if description["settings"]["observation"] == "vision" and camera.size != size:
         raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
-    if settings.proposer.kind == "drafter":
-        beside = drafter_folder(settings.results, settings.policy.drafter, folder)
-        read_drafter(beside, description["sha256"])
-    if needs_datastore(settings.parts()):
+    method = settings.parts()
+    if needs_drafter(method):
+        read_drafter(drafter_folder(settings.results, settings.policy.drafter, folder), description["sha256"])
+    if needs_early(method):
+        read_early(early_folder(settings.results, settings.policy.early, folder), description)
+    if needs_datastore(method):
         check_target(read_manifest(datastore_beside(folder)), description, datastore_beside(folder))
-    if needs_calibration(settings.parts()):
+    if needs_calibration(method):
         calibration = load_calibration(
             calibration_beside(folder), description["sha256"], description["settings"]["chunk"]
         )
@@ -97,29 +128,39 @@ def check(settings: RolloutSettings) -> None:
 
 
 @functools.lru_cache(maxsize=4)
-def _load(target: Path, drafter: Path | None, calibrated: bool, stored: bool, device: str, dtype_name: str) -> Policy:
+def _load(
+    target: Path,
+    drafter: Path | None,
+    early: Path | None,
+    calibrated: bool,
+    stored: tuple[str, str | None] | None,
+    device: str,
+    dtype_name: str,
+) -> Policy:
+    """stored: the datastore's backend and url."""
     loaded, description = load_target(target, device, DTYPES[dtype_name])
-    identity = {"target": description["sha256"]}
-    beside = None
-    if drafter is not None:
-        beside, described = load_drafter(drafter, loaded, description["sha256"])
-        identity["drafter"] = described["sha256"]
-    calibration = None
-    if calibrated:
-        chunk = loaded.settings.chunk
-        calibration = load_calibration(calibration_beside(target), description["sha256"], chunk)
-    datastore = Datastore.open(datastore_beside(target), description) if stored else None
-    return Policy(loaded, beside, calibration, datastore, identity)
+    sha256, chunk, at = description["sha256"], loaded.settings.chunk, datastore_beside(target)
+    return Policy(
+        target=loaded,
+        drafter=load_drafter(drafter, loaded, sha256)[0] if drafter is not None else None,
+        early=load_early(early, loaded, description)[0] if early is not None else None,
+        calibration=load_calibration(calibration_beside(target), sha256, chunk) if calibrated else None,
+        datastore=Datastore.open(at, description) if stored else None,
+        datastore_sha256=sha256_of(at / "manifest.json") if stored else "",
+    )
 
 
 def load_policy(settings: RolloutSettings) -> Policy:
     """The policy on its device; kept, so that the cells of a sweep share it."""
     device, _ = set_up(settings.runtime)
-    folder = find_target(settings.results, settings.policy.target)
-    drafter = (
-        drafter_folder(settings.results, settings.policy.drafter, folder)
-        if settings.proposer.kind == "drafter"
-        else None
+    results, policy, method = settings.results, settings.policy, settings.parts()
+    folder = find_target(results, policy.target)
+    return _load(
+        folder,
+        drafter_folder(results, policy.drafter, folder) if needs_drafter(method) else None,
+        early_folder(results, policy.early, folder) if needs_early(method) else None,
+        needs_calibration(method),
+        (settings.datastore.backend, settings.datastore.url) if needs_datastore(method) else None,
+        device,
+        settings.runtime.dtype,
     )
-    method = settings.parts()
-    return _load(folder, drafter, needs_calibration(method), needs_datastore(method), device, settings.runtime.dtype)

@@ -1,0 +1,252 @@
+"""Every proposer, opening and boundary is lossless under strict acceptance; HeiSD's choice and skip as defined."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
+
+from kerv_cli.decoding.boundary import Random
+from kerv_cli.decoding.chunk import Chunk, Situation
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import (
+    DrafterProposer,
+    EarlyProposer,
+    HybridProposer,
+    MergedProposer,
+    PredictionProposer,
+    RetrievalProposer,
+)
+from kerv_cli.decoding.skipping import SkipLevels, VerifySkip
+from kerv_cli.drafting.datastore import Datastore, prompt_key
+from kerv_cli.drafting.drafter import Drafter
+from kerv_cli.drafting.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
+from kerv_cli.errors import UsageError
+from kerv_cli.settings import (
+    AcceptanceSettings,
+    BoundarySettings,
+    DrafterSettings,
+    MethodSettings,
+    OpeningSettings,
+    ProposerSettings,
+    SkipSettings,
+)
+from kerv_cli.vla.action_tokens import bins_of
+from kerv_cli.vla.target import Target
+
+D = 4
+STRICT = AcceptanceSettings("strict")
+
+
+class KnownDraft:
+    """Stands for the early drafter: the truth with some tokens wrong."""
+
+    def __init__(self, truth: list[int], random: np.random.Generator) -> None:
+        self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
+
+    def propose(self, prompt: torch.Tensor, history: np.ndarray) -> list[int]:
+        return self.tokens
+
+
+def stored(target: Target, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
+    """A datastore whose entries lie around this prompt's key; entry i is of episode i."""
+    random = np.random.default_rng(0)
+    key = prompt_key(prompt, target.settings, ["scene"])[0]
+    vectors = key + 0.05 * random.standard_normal((len(chunks), len(key)))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    return Datastore(
+        manifest={"key": ["scene"]},
+        vectors=vectors.astype(np.float32),
+        tokens=chunks.astype(np.uint8),
+        seeds=np.arange(len(chunks)),
+        steps=np.zeros(len(chunks), dtype=int),
+        left=np.full(len(chunks), left),
+        shards={"t": slice(0, len(chunks))},
+    )
+
+
+def situation(random: np.random.Generator, executed: int) -> Situation:
+    history = ActionHistory(D)
+    path = [np.zeros(3)]
+    for _ in range(executed):
+        history.append(random.uniform(-1, 1, D))
+        path.append(path[-1] + 0.01 * random.standard_normal(3))
+    return Situation("t", history, path, random)
+
+
+def proposers(target: Target, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:
+    random = np.random.default_rng(seed)
+    horizon = target.settings.chunk
+    wrong = np.array([truth] * 4)
+    wrong[random.random(wrong.shape) < 0.2] = random.integers(255)
+    retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 40)
+    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    drafting = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
+    hold = PredictionProposer(Hold(D, minimum=1, horizon=horizon))
+    early = EarlyProposer(KnownDraft(truth, random))  # type: ignore[arg-type]
+    return {
+        "hold": hold,
+        "linear": PredictionProposer(Linear(D, minimum=2, horizon=horizon)),
+        "kalman": PredictionProposer(Kalman(Noise.uniform(D, 1.0), horizon=horizon)),
+        "early": early,
+        "retrieval": retrieval,
+        "merged": MergedProposer([early, retrieval, hold], int(random.integers(1, 80))),
+        "hybrid": HybridProposer(drafting, retrieval),
+    }
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), depth=st.integers(1, 40), data=st.data())
+@pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "hybrid"])
+def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, depth: int, data: st.DataObject) -> None:
+    target = random_target(seed, 2, 2, chunk)
+    prompt = random_prompt(target, seed)
+    truth = plain_greedy(target, prompt)
+    proposer = proposers(target, prompt, truth, seed)[name]
+    steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
+    method = MethodSettings("test", ProposerSettings(name, depth, 2, 80), STRICT, chunk=steps)
+    boundary = Random(0.5) if name == "hybrid" else None
+    decoder = Decoder(target, method, Parts(proposer=proposer, boundary=boundary))
+    decoder.situation = situation(np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
+    for _ in range(2):  # the second decode finds the parts as the first left them
+        result = decoder.decode_prompt(prompt)
+        assert result.tokens == truth[: (steps or chunk) * D]
+        assert_adds_up(result)
+        assert all(len(r.drafted) <= depth for r in result.rounds)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), executed=st.integers(0, 12), carry_on=st.booleans()
+)
+@pytest.mark.parametrize("name", ["hold", "kalman", "early", "retrieval", "merged"])
+def test_every_opening_is_lossless(name: str, seed: int, chunk: int, executed: int, carry_on: bool) -> None:
+    target = random_target(seed, 2, 2, chunk)
+    prompt = random_prompt(target, seed)
+    truth = plain_greedy(target, prompt)
+    known = proposers(target, prompt, truth, seed)
+    opening = OpeningSettings([name], 80)
+    method = MethodSettings("test", ProposerSettings("hybrid", 5, 2, 80), STRICT, opening=opening)
+    parts = Parts(opening=known[name])
+    if carry_on:
+        parts = Parts(opening=known[name], proposer=known["hybrid"], boundary=Random(0.5))
+    decoder = Decoder(target, method, parts)
+    decoder.situation = situation(np.random.default_rng(seed), executed)
+    result = decoder.decode_prompt(prompt)
+    assert result.tokens == truth
+    assert_adds_up(result)
+
+
+def test_a_prediction_counts_committed_steps_as_executed() -> None:
+    target = random_target(1, 1, 1, 4)
+    chunk = Chunk(torch.zeros(1, 1, 16), 16, D, target.trunk.new_cache(1, 4), situation(np.random.default_rng(0), 5))
+    chunk.tokens = [10, 20, 30, 254, 40]
+    proposer = PredictionProposer(Hold(D, minimum=1, horizon=4))
+    assert proposer.chains(chunk, 7) == [[20, 30, 254, 10, 20, 30, 254]]
+    chunk.tokens = []
+    last = bins_of(chunk.situation.history.values()[-1]).tolist()
+    assert proposer.chains(chunk, 15) == [(last * 4)[:15]]
+
+
+def test_merging_drops_what_is_named_last_and_cuts_the_last_branch() -> None:
+    class Fixed:
+        def __init__(self, name: str, chains: list[list[int]]) -> None:
+            self.name, self.found = name, chains
+
+        def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+            return [c[:depth] for c in self.found]
+
+    one, two = Fixed("one", [[1, 2, 3], [1, 5, 6]]), Fixed("two", [[9, 9, 9]])
+    chunk: Any = None
+    assert MergedProposer([one, two], 8).propose(chunk, 3).tokens == (1, 2, 3, 5, 6, 9, 9, 9)
+    assert MergedProposer([one, two], 7).propose(chunk, 3).tokens == (1, 2, 3, 5, 6)
+    assert MergedProposer([two, one], 2).propose(chunk, 3).tokens == (9, 9)
+    assert (MergedProposer([one, two], 8).name, MergedProposer([two], 8).name) == ("merged", "two")
+
+
+# --- HeiSD: choice and skip
+
+
+def skipping(
+    left: int = 50, s_min: float = 0.5, entries: int = 1, **changes: Any
+) -> tuple[Decoder, torch.Tensor, list[int]]:
+    target = random_target(2, 1, 1, 4)
+    prompt = random_prompt(target, 2)
+    tokens = list(range(16))
+    store = stored(target, prompt, np.array([tokens] * entries), left)
+    retrieval = RetrievalProposer(store, target, 1, 16)
+    skip = VerifySkip(SkipSettings("similarity", **changes), retrieval, SkipLevels(0.4, s_min, 0.9))
+    decoder = Decoder(
+        target, MethodSettings("test", ProposerSettings("retrieval")), Parts(proposer=retrieval, skip=skip)
+    )
+    decoder.situation = situation(np.random.default_rng(0), 3)
+    return decoder, prompt, tokens
+
+
+def test_a_similar_enough_chunk_is_executed_without_a_forward() -> None:
+    decoder, prompt, tokens = skipping(max_skips=2)
+    chunks = [decoder.decode_prompt(prompt) for _ in range(4)]
+    assert [c.forwards for c in chunks][:2] == [0, 0]
+    assert chunks[2].forwards > 0  # at most two in a row
+    assert chunks[3].forwards == 0
+    assert chunks[0].tokens == tokens
+    assert [r.mode for r in chunks[0].rounds] == ["skip"]
+    assert chunks[2].tokens == plain_greedy(decoder.target, prompt) or chunks[2].rounds[0].mode == "prefill"
+
+
+def test_a_stored_episode_is_not_executed_beyond_its_end() -> None:
+    decoder, prompt, _ = skipping(left=4, max_skips=9)
+    assert [decoder.decode_prompt(prompt).forwards > 0 for _ in range(3)] == [False, True, True]
+    decoder.reset("t", "open the drawer")  # a new episode may use it again
+    assert decoder.decode_prompt(prompt).forwards == 0
+
+
+def test_below_s_min_nothing_is_skipped() -> None:
+    decoder, prompt, _ = skipping(s_min=0.9)
+    decoder.parts.skip.s_min = 1.01  # type: ignore[union-attr]
+    assert decoder.decode_prompt(prompt).forwards > 0
+
+
+def test_s_min_rises_after_a_failure_and_falls_after_a_success_within_bounds() -> None:
+    decoder, _, _ = skipping(up=0.5, down=0.1)
+    skip = decoder.parts.skip
+    assert skip is not None
+    decoder.finish(False)
+    assert skip.s_min == pytest.approx(0.75)
+    decoder.finish(False)
+    assert skip.s_min == pytest.approx(0.9)
+    for _ in range(30):
+        decoder.finish(True)
+    assert skip.s_min == pytest.approx(0.4)
+
+
+def test_nothing_is_skipped_on_the_drafters_side() -> None:
+    decoder, prompt, _ = skipping()
+    retrieval = decoder.parts.proposer
+    drafter = Drafter.beside(DrafterSettings(), decoder.target).eval().requires_grad_(False)
+    drafting = DrafterProposer(drafter, decoder.target, ProposerSettings("drafter", 4, 1, 4))
+    for p, forwards in ((0.0, True), (1.0, False)):
+        parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=Random(p), skip=decoder.parts.skip)  # type: ignore[arg-type]
+        hybrid = Decoder(decoder.target, MethodSettings("test", ProposerSettings("hybrid")), parts)
+        hybrid.situation = decoder.situation
+        assert (hybrid.decode_prompt(prompt).forwards > 0) == forwards
+
+
+def test_a_seed_gives_the_random_boundary_its_own_numbers() -> None:
+    decoder, _, _ = skipping()
+    decoder.method.boundary = BoundarySettings("random")
+    drawn = []
+    for seed in (5, 5, 6):
+        decoder.reset("t", "open the drawer", seed)
+        drawn.append(decoder.situation.random.random())
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_a_chunk_longer_than_the_target_knows_is_refused() -> None:
+    with pytest.raises(UsageError, match="trained for 4 control steps"):
+        Decoder(random_target(0, 1, 1, 4), MethodSettings(chunk=5))
