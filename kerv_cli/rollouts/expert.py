@@ -1,0 +1,62 @@
+"""The scripted expert in the policy's place: the ceiling of every success table (METHODS §6)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from kerv_cli.decoding.chunk import Clock
+from kerv_cli.decoding.record import DecodeRecord
+from kerv_cli.errors import KervError
+from kerv_cli.sim.world import ACTION_SIZE, Expert, Observation
+
+MODE = "expert"
+
+
+class ExpertDecoder:
+    """Meta-World's scripted policy of the episode's task, asked anew at every control step.
+
+    It reads the whole state, object and goal included: privileged, as `observation=state` is. It has no target, so its
+    records have no forwards, rounds and tokens, and what is measured per verification is undefined for it. Its time is
+    a few scalar formulas': no speedup of any decoding method.
+    """
+
+    needs_frame = False
+
+    def __init__(self) -> None:
+        self.task: str | None = None
+        self.expert: Expert | None = None
+
+    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
+        """Raises UnknownName for a task that does not exist."""
+        if self.expert is None or task != self.task:
+            self.task, self.expert = task, Expert(task)
+
+    def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
+        """state (39,) -> one control step's action (1, 4) in [-1, 1].
+
+        Raises:
+            KervError: before the first reset, or a state whose answer is not four finite numbers.
+        """
+        if self.expert is None:
+            raise KervError("the expert does not know its task yet: reset it before decoding")
+        clock = Clock(torch.device("cpu"))
+        action = self.expert(Observation(state, step=0, success=False))
+        seconds = clock.stop()
+        if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
+            raise KervError(f"the expert of {self.task} answered {action} to a state it cannot read")
+        return DecodeRecord(
+            tokens=(),
+            actions=action[None].astype(np.float32),
+            forwards=0,
+            rounds=(),
+            mode=MODE,
+            seconds=seconds,
+            phases=clock.phases,
+        )
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """It needs no history."""
+
+    def finish(self, success: bool) -> None:
+        """It learns nothing."""

@@ -1,0 +1,112 @@
+"""The scripted expert in the policy's place: closed loop on real Meta-World, and every reader of its records."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from kerv_cli.decoding.record import PHASES, EpisodeRecord
+from kerv_cli.errors import KervError, UnknownName
+from kerv_cli.rollouts.episode import run_episode
+from kerv_cli.rollouts.expert import ExpertDecoder
+from kerv_cli.rollouts.rerun_log import save_episode, summary
+from kerv_cli.rollouts.viewer import read_back
+from kerv_cli.settings import EVALUATION_SEED
+from kerv_cli.sim.tasks import task
+from kerv_cli.sim.world import Expert, World
+from kerv_cli.studies.measures import MACRO, MICRO, measure
+from kerv_cli.studies.rows import DECODE_SCHEMA, EPISODE_SCHEMA, decode_record, decode_rows, episode_row, parquet_bytes
+
+NAME = "window-close-v3"
+STAMPS = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}
+
+
+@pytest.fixture(scope="module")
+def world() -> Iterator[World]:
+    with World(NAME) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def episode(world: World) -> EpisodeRecord:
+    return run_episode(world, ExpertDecoder(), EVALUATION_SEED)
+
+
+def test_the_decoder_executes_the_experts_own_actions(world: World, episode: EpisodeRecord) -> None:
+    expert, observation, actions = Expert(NAME), world.reset(EVALUATION_SEED), []
+    while not world.done:
+        actions.append(expert(observation))
+        observation = world.step(np.float32(actions[-1]))
+    assert episode.success
+    assert episode.steps == len(actions) > 10
+    assert (episode.actions == np.float32(actions)).all()
+    assert np.abs(episode.actions).max() == 1.0  # raw outputs reach far beyond
+
+
+def test_a_record_has_one_step_and_no_target(episode: EpisodeRecord) -> None:
+    assert episode.decode_steps == tuple(range(episode.steps))
+    for decode in episode.decodes:
+        assert decode.actions.shape == (1, 4)
+        assert decode.actions.dtype == np.float32
+        assert (decode.mode, decode.forwards, decode.tokens, decode.rounds) == ("expert", 0, (), ())
+        assert set(decode.phases) == set(PHASES)
+        assert 0 < decode.seconds == pytest.approx(sum(decode.phases.values()))
+
+
+def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(episode: EpisodeRecord) -> None:
+    row = episode_row(episode, 1, "2026-01-01")
+    assert (row["forwards"], row["verifications"], row["tokens"], row["first_rejected_count"]) == (0, 0, 0, 0)
+    decodes = decode_rows(episode)
+    stored = pq.read_table(io.BytesIO(parquet_bytes(decodes, DECODE_SCHEMA))).to_pylist()
+    again = decode_record(stored[3])
+    assert (again.actions == episode.decodes[3].actions).all()
+    for name in ("tokens", "rounds", "mode", "forwards", "seconds", "phases", "skipped", "deviation"):
+        assert getattr(again, name) == getattr(episode.decodes[3], name)
+    frame = pd.DataFrame(pq.read_table(io.BytesIO(parquet_bytes([row], EPISODE_SCHEMA))).to_pylist())
+    frame = frame.assign(difficulty=task(NAME).difficulty, rand_vec=str(row["rand_vec"]), **STAMPS)
+    slow = frame.assign(seconds=frame["seconds"] * 10, success=False)
+    for averaging in (MICRO, MACRO):
+        found = measure(frame, slow, averaging)
+        assert found.success.value == 1.0
+        assert (found.counts.only_method, found.counts.both) == (1, 0)
+        assert found.values["time_per_step_ms"] > 0
+        assert found.values["forwards_per_step"] == found.values["skip_rate"] == 0.0
+        assert all(math.isnan(found.values[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_its_recording_can_be_written_and_read(episode: EpisodeRecord, tmp_path: Path, frames: bool) -> None:
+    drawn = {i: np.zeros((8, 8, 3), dtype=np.uint8) for i in range(episode.steps + 1)} if frames else {}
+    shown = dataclasses.replace(episode, frames=drawn)
+    found = read_back(save_episode(shown, tmp_path / "expert.rrd", method="expert"))
+    rows = found["entities"]
+    assert rows["/actions"] == rows["/decode/phases"] == rows["/decode/table"] == episode.steps
+    assert rows["/mode"] == 1
+    assert "/decode/acceptance" not in rows
+    assert rows.get("/camera", 0) == len(drawn)
+    assert found["blueprint"]
+    assert found["episode"]["forwards"] == 0
+    assert f"| decodes | {episode.steps} expert |" in summary(shown, "expert", 80.0)
+
+
+def test_it_follows_the_task_and_refuses_what_it_cannot_answer() -> None:
+    decoder = ExpertDecoder()
+    with pytest.raises(KervError, match="reset it before decoding"):
+        decoder.decode(None, np.zeros(39))
+    decoder.reset(NAME, "")
+    state = np.random.default_rng(0).uniform(0, 0.3, 39)
+    first = decoder.decode(None, state).actions
+    decoder.reset("drawer-open-v3", "")
+    assert (decoder.decode(None, state).actions != first).any()
+    with pytest.raises(KervError, match="a state it cannot read"):
+        decoder.decode(None, np.full(39, np.nan))
+    with pytest.raises(UnknownName, match="window-close"):
+        decoder.reset("window-clos", "")

@@ -1,0 +1,151 @@
+"""train.init: a run that begins with another target's weights, at another chunk length."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from kerv_cli.config import compose
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.sim.demo_dataset import DemoDataset, DemoEntry
+from kerv_cli.sim.demo_file import DemoEpisode
+from kerv_cli.training import runs
+from kerv_cli.training.runs import TargetRun
+from kerv_cli.vla.action_tokens import ActionTokenizer
+from kerv_cli.vla.checkpoint import load_target, read_description, save_target
+from kerv_cli.vla.target import Target
+from kerv_cli.vla.text import WordTokenizer
+
+LOW, HIGH = np.array([-0.5, -1.0, -1.0, -1.0]), np.array([0.5, 1.0, 2.0, 1.0])
+WORDS = WordTokenizer.build(["pull the drawer open", "jump"])
+
+
+class Demos:
+    """Four made-up episodes of a task."""
+
+    sha256 = "d" * 64
+    manifest = {"config": {}}  # noqa: RUF012
+    episodes = tuple(DemoEntry("drawer-open-v3", seed, False, 6, Path(), 0, "") for seed in range(4))
+
+    def load(self, index: int) -> DemoEpisode:
+        rng = np.random.default_rng(index)
+        labels = rng.uniform(-1, 1, (14, 4)).astype(np.float32)
+        states = rng.uniform(0, 0.3, (6, 39)).astype(np.float32)
+        frames, steps = np.zeros((3, 96, 96, 3), dtype=np.uint8), np.arange(0, 6, 2)
+        return DemoEpisode("drawer-open-v3", index, False, 6, frames, steps, states, labels, labels[:6], np.zeros(3))
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A results folder with the target `old` (H = 4), whose statistics and words no fresh run would have."""
+    monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: Demos()))
+    save_old(tmp_path, 3)
+    return tmp_path
+
+
+def save_old(results: Path, seed: int) -> None:
+    torch.manual_seed(seed)
+    shapes = compose("train_target", ["target=nano", "target.observation=state"], TrainTargetSettings).target
+    save_target(results / "artifacts/target/old", Target(shapes, ActionTokenizer(LOW, HIGH), WORDS), {})
+
+
+def settings(results: Path, *overrides: str) -> TrainTargetSettings:
+    common = ["name=new", "target=nano", "target.observation=state", "target.chunk=8", "task=drawer-open"]
+    common += ["train.init=old", "train.batch=4", "train.steps=4", "train.validate_every=2", f"results={results}"]
+    return compose("train_target", [*common, *overrides], TrainTargetSettings)
+
+
+def trained(results: Path, *overrides: str, stop: int | None = None) -> Path:
+    run = TargetRun(settings(results, *overrides))
+    run.load(lambda done, total: None)
+    run.train(lambda step, metrics: interrupt() if step == stop else None)
+    return run.folder
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_run_begins_with_the_weights_statistics_and_words(results: Path) -> None:
+    folder = trained(results, "train.lr=0", "train.weight_decay=0")
+    old, _ = load_target(results / "artifacts/target/old")
+    new, description = load_target(folder)
+    assert all(torch.equal(new.state_dict()[k], v) for k, v in old.state_dict().items())
+    assert (new.settings.chunk, new.tokens_per_chunk) == (8, 32)
+    assert dataclasses.replace(new.settings, chunk=old.settings.chunk) == old.settings
+    assert (new.actions.low == LOW).all()
+    assert (new.actions.high == HIGH).all()
+    assert new.words == WORDS
+    assert description["provenance"]["init"] == read_description(results / "artifacts/target/old", "target")["sha256"]
+
+
+def test_training_changes_the_new_target_and_not_the_old_one(results: Path) -> None:
+    before = load_file(results / "artifacts/target/old/model.safetensors")
+    run = TargetRun(settings(results))
+    run.load(lambda done, total: None)
+    assert run.samples is not None
+    assert run.samples.chunks.shape[1:] == (8, 4)
+    assert run.samples.words[0].tolist() == WORDS.encode("pull the drawer open", 10)
+    run.train(lambda step, metrics: None)
+    assert run.begun is not None
+    assert all(torch.equal(run.begun.state_dict()[k], v) for k, v in before.items())
+    after = load_file(run.folder / "model.safetensors")
+    assert not torch.equal(before["head.weight"], after["head.weight"])
+
+
+def test_an_interrupted_run_goes_on_where_it_was(results: Path) -> None:
+    whole = trained(results, "name=whole")
+    with pytest.raises(KeyboardInterrupt):
+        trained(results, "name=cut", stop=3)
+    assert json.loads((results / "artifacts/target/cut/progress.json").read_text())["step"] == 2
+    cut = trained(results, "name=cut")
+    a, b = (load_file(folder / "resume.safetensors") for folder in (whole, cut))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results: Path) -> None:
+    trained(results)
+    shutil.copytree(results / "artifacts/target/old", results / "artifacts/target/renamed")
+    trained(results, "train.init=renamed", "train.steps=5")
+    save_old(results, 4)
+    for other in ("train.init=old", "train.init=null"):
+        with pytest.raises(CheckpointError, match="other settings or data"):
+            trained(results, other)
+
+
+def test_a_run_without_it_is_the_same_run_as_before_there_was_init(results: Path) -> None:
+    fresh = settings(results, "train.init=null").train
+    assert "init" not in runs.determining(fresh)
+    assert runs.determining(fresh) == runs.determining(settings(results).train)
+
+
+@pytest.mark.parametrize(
+    ("override", "shape"),
+    [("target.width=64", "width"), ("target.observation=vision", "observation"), ("target.layers=1", "layers")],
+)
+def test_another_shape_is_refused_by_its_name(results: Path, override: str, shape: str) -> None:
+    old = read_description(results / "artifacts/target/old", "target")["settings"][shape]
+    with pytest.raises(UsageError, match=rf"train\.init: .* {shape}={old}, the run {override}: set both alike"):
+        TargetRun(settings(results, override))
+
+
+def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
+    with pytest.raises(CheckpointError, match="no target 'nobody'"):
+        TargetRun(settings(results, "train.init=nobody"))
+    for same in ("train.init=old", f"train.init={results}/artifacts/target/old"):
+        with pytest.raises(UsageError, match="would be overwritten"):
+            TargetRun(settings(results, "name=old", same))
+    with pytest.raises(UsageError, match=r"unknown key 'train\.init'"):
+        compose("train_drafter", ["train.init=old"], TrainDrafterSettings)
+
+
+def test_the_plan_names_it(results: Path) -> None:
+    assert TargetRun(settings(results)).plan().endswith(f"beginning with {results}/artifacts/target/old")
