@@ -38,7 +38,7 @@ class RuntimeSettings:
 class ProposerSettings:
     """Who drafts (METHODS §2.2, §4, §5)."""
 
-    kind: str = "none"  # none | drafter | retrieval | hybrid | early | jacobi | a predictor's name (hold, kalman, …)
+    kind: str = "none"  # none | drafter | retrieval | hybrid | early | jacobi | hold | linear | kalman | … | expert
     depth: int = 5  # draft depth, tokens
     top_k: int = 8  # drafter: children expanded per level
     nodes: int = 50  # tree nodes kept after reranking

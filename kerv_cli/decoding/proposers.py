@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,15 +11,13 @@ from torch import Tensor
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
 from kerv_cli.drafting.drafter import Drafter, DraftState, grow_tree, observe
+from kerv_cli.drafting.early import EarlyDrafter
 from kerv_cli.drafting.groups import kinematic_groups
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.settings import ProposerSettings
 from kerv_cli.vla.action_tokens import VOCABULARY, bins_of, values_of
 from kerv_cli.vla.target import Target
-
-if TYPE_CHECKING:
-    from kerv_cli.drafting.early import EarlyDrafter
 
 EMPTY = TokenTree((), (), ())
 

@@ -121,7 +121,7 @@ def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:
         return HybridProposer(drafter, retrieval)
     if settings.kind in ("early", "retrieval", *PREDICTORS):
         return build_source(policy, settings.kind, settings.neighbours, settings.nodes)
-    known = ["none", "drafter", "retrieval", "hybrid", "early", "jacobi", *PREDICTORS]
+    known = ["expert", "none", "drafter", "retrieval", "hybrid", "early", "jacobi", *PREDICTORS]
     raise UnknownName("proposer.kind", settings.kind, known)
 
 

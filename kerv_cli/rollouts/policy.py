@@ -12,22 +12,13 @@ from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_
 from kerv_cli.drafting.datastore import Datastore, check_target, read_manifest
 from kerv_cli.drafting.datastore_build import datastore_beside
 from kerv_cli.drafting.drafter import Drafter, load_drafter, read_drafter
-
-try:
-    from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
-except ImportError:
-    EarlyDrafter = load_early = read_early = None
+from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
 from kerv_cli.drafting.kinematics import FILTERS
 from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
-from kerv_cli.places import drafter_folder, find_target
-
-try:
-    from kerv_cli.places import early_folder
-except ImportError:
-    early_folder = None
+from kerv_cli.places import drafter_folder, early_folder, find_target
 from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings
+from kerv_cli.settings import EVALUATION_SEED, MethodSettings, RolloutSettings
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
@@ -47,6 +38,8 @@ class Policy:
 
 def identity_of(settings: RolloutSettings) -> dict[str, str]:
     """Hashes of the weights that determine a result, without loading them."""
+    if is_expert(settings):
+        return {"target": "", "observation": "state (privileged)"}
     folder = find_target(settings.results, settings.policy.target)
     description = read_description(folder, "target")
     identity = {"target": description["sha256"], "observation": observation_of(description)}
@@ -62,6 +55,11 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     if needs_datastore(method):
         identity["datastore"] = sha256_of(datastore_beside(folder) / "manifest.json")
     return identity
+
+
+def is_expert(settings: RolloutSettings) -> bool:
+    """Whether Meta-World's scripted policy acts in the target's place."""
+    return settings.proposer.kind == "expert"
 
 
 def needs_drafter(method: MethodSettings) -> bool:
@@ -107,6 +105,8 @@ def check(settings: RolloutSettings) -> None:
         raise UsageError(f"episodes={settings.episodes}: at least 1")
     if settings.seed < EVALUATION_SEED:
         raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {EVALUATION_SEED}")
+    if is_expert(settings):
+        return
     folder = find_target(settings.results, settings.policy.target)
     description = read_description(folder, "target")
     size, camera = description["settings"]["image_size"], settings.world.camera

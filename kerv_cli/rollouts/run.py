@@ -12,7 +12,8 @@ from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.rollouts.assemble import episode_decoder, warm_up
 from kerv_cli.rollouts.episode import Recording, run_episode
-from kerv_cli.rollouts.policy import load_policy
+from kerv_cli.rollouts.expert import ExpertDecoder
+from kerv_cli.rollouts.policy import is_expert, load_policy
 from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings, WorldSettings
 from kerv_cli.sim.camera import CameraConfig
 from kerv_cli.sim.world import World
@@ -50,8 +51,7 @@ def close_worlds() -> None:
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
     """One method on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
-    policy = load_policy(settings)
-    decoder = episode_decoder(policy, settings, task)
+    decoder = ExpertDecoder() if is_expert(settings) else episode_decoder(load_policy(settings), settings, task)
     warm_up(decoder, task, settings.world.camera)
     world = open_world(task, settings.world)
     logged = dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
