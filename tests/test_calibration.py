@@ -66,14 +66,14 @@ def made_up_episode(task: str, seed: int, tail: int = 8) -> DemoEpisode:
     )
 
 
-def write_dataset(folder: Path, episodes: int = 6) -> None:
+def write_dataset(folder: Path, episodes: int = 6, make: Callable[[str, int], DemoEpisode] = made_up_episode) -> None:
     """A complete dataset, without a simulator."""
     tasks: dict[str, Any] = {}
     for task in TASKS:
         entries = []
         for seed in range(episodes):
             path = episode_path(folder, task, seed)
-            episode = made_up_episode(task, seed)
+            episode = make(task, seed)
             save_episode(path, episode)
             entries.append(
                 {
@@ -201,7 +201,7 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     run.load(lambda done, total: None)
     variability = run.presample(lambda done, total: None)
     assert {row["decodes"] for row in variability.values()} == {4}
-    made = run.finish(variability)
+    made = run.finish(variability, run.boundary(lambda done, total: None), run.skip(lambda done, total: None))
     folder = find_target(str(results), target)
     assert run.path == calibration_beside(folder) == results / f"artifacts/calibration/{target}/calibration.json"
     described = read_description(folder, "target")
@@ -209,7 +209,10 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     assert loaded == made
     assert loaded.demos["sha256"] == run.dataset.sha256
     assert loaded.provenance["versions"]["numpy"] == np.__version__
-    assert (loaded.boundary, loaded.skip) == ({}, {})
+    assert loaded.boundary["episodes"] == 8
+    assert loaded.skip == {}
+    assert "kept" not in loaded.provenance
+    assert [line.split(":")[0] for line in run.notes] == ["skip levels"]
     for kind in PREDICTORS:
         ahead = loaded.predictor(kind).predict(np.full((10, 4), 0.25), 4)
         np.testing.assert_allclose(ahead, 0.25)
@@ -246,6 +249,8 @@ def calibration(levels: dict[str, float]) -> Calibration:
         noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped", "acceleration")},
         errors={},
         variability={task: {"k_s": level, "decodes": 5} for task, level in levels.items()},
+        boundary={"window": 15, "radius_low": 0.01, "radius_high": 2.0, "length_low": 0.0, "length_high": 0.2},
+        skip={"datastore": "d" * 64, "tasks": {task: {"low": 0.8, "s_min": 0.9, "high": 0.99} for task in levels}},
     )
 
 
@@ -262,6 +267,15 @@ def calibration(levels: dict[str, float]) -> Calibration:
         (lambda v: v["target"].pop("sha256"), "does not name its target"),
         (lambda v: v.update(window="ten"), "window ten"),
         (lambda v: v.update(boundary=[]), "must be sections"),
+        (lambda v: v["boundary"].pop("length_low"), "damaged"),
+        (lambda v: v["boundary"].update(window=2), "boundary window 2"),
+        (lambda v: v["boundary"].update(radius_high=0.001), "is no range"),
+        (lambda v: v["boundary"].update(radius_high=float("nan")), "is no range"),
+        (lambda v: v["skip"].pop("datastore"), "damaged"),
+        (lambda v: v["skip"].update(tasks={}), "has no task"),
+        (lambda v: v["skip"]["tasks"]["reach-v3"].update(low=0.95), "levels of reach-v3 are not in order"),
+        (lambda v: v["skip"]["tasks"]["reach-v3"].update(s_min=float("nan")), "are not in order"),
+        (lambda v: v["skip"]["tasks"]["reach-v3"].pop("high"), "damaged"),
         (lambda v: v.update(extra=1), "damaged"),
         (lambda v: v.update(format=99), "not a calibration of format 1"),
         (lambda v: v.update(kind="target"), "not a calibration of format 1"),
@@ -300,6 +314,10 @@ def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
         ("decodes=-1", UsageError, "decodes=-1"),
         ("held_out=0", UsageError, "held_out=0"),
         ("episodes=-2", UsageError, "episodes=-2"),
+        ("epsilon=0", UsageError, "epsilon=0"),
+        ("confidence=0.4", UsageError, "confidence=0.4"),
+        ("confidence=1", UsageError, "confidence=1"),
+        ("boundary_window=2", UsageError, "boundary_window=2"),
         ("fit_steps=5", UsageError, "the target's chunk of 4"),
         ("proposer=none", UsageError, "drafts nothing to compare"),
         ("task=push", CheckpointError, "no episode of push-v3"),
@@ -325,8 +343,11 @@ def test_the_command_prints_what_it_found(results: Path) -> None:
     common = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state", f"results={results}"]
     done = CliRunner().invoke(app, [*common, "decodes=0", "name=without"])
     assert done.exit_code == 0, done.output
-    for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without"):
+    for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without", "radius of curvature"):
         assert word in done.output
+    assert "reference levels K_S: decodes=0; left empty\n" in done.output
+    assert "skip levels: no datastore" in done.output
+    assert "s_min" not in done.output
     assert (results / "artifacts/calibration/without/calibration.json").is_file()
     assert "tested on 4" in CliRunner().invoke(app, [*common, "--plan"]).output
     assert "history: labels" in CliRunner().invoke(app, [*common, "--cfg"]).output

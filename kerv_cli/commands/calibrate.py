@@ -1,4 +1,4 @@
-"""`kerv calibrate`: noise of the kinematic predictors and each task's reference level of the kinematic variability."""
+"""`kerv calibrate`: what predictors, thresholds, the boundary and verify-skip need, from the demonstrations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @edge
 def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
-    """Fit the kinematic predictors on demonstrations and pre-sample each task's variability."""
+    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels."""
     from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import CalibrateSettings
 
@@ -32,14 +32,24 @@ def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPl
         return
     with progress_bar("reading demonstrations", len(run.chosen)) as advance:
         run.load(lambda done, total: advance(done, ""))
-    variability = {}
+    variability, skip = {}, {}
     if settings.decodes:
         with progress_bar("pre-sampling", len(run.tasks)) as advance:
             variability = run.presample(lambda done, total: advance(done, ""))
-    calibration = run.finish(variability)
+    with progress_bar("boundary ranges", len(run.paths)) as advance:
+        boundary = run.boundary(lambda done, total: advance(done, ""))
+    if run.stored:
+        with progress_bar("skip levels", len(run.tasks)) as advance:
+            skip = run.skip(lambda done, total: advance(done, ""))
+    with console(stderr=True).status("fitting the predictors"):
+        calibration = run.finish(variability, boundary, skip)
     _tasks(calibration, run.path)
     _noise(calibration)
     _errors(calibration)
+    _boundary(calibration)
+    _skip(calibration)
+    for line in run.notes:
+        typer.echo(line)
 
 
 def _tasks(calibration: Calibration, path: Path) -> None:
@@ -89,4 +99,31 @@ def _errors(calibration: Calibration) -> None:
         below = [int((error[:, h] < hold[:, h]).sum()) for h in (0, horizon - 1)]
         wins = ["-" if kind == "hold" else f"{count}/{len(hold)} tasks" for count in below]
         table.add_row(kind, *(f"{e:.4f}" for e in error.mean(0)), *wins)
+    console().print(table)
+
+
+def _boundary(calibration: Calibration) -> None:
+    from rich.table import Table
+
+    ranges, window = calibration.ranges(), calibration.boundary["window"]
+    table = Table("", "minimum", "95th percentile", title=f"boundary, windows of {window} positions, mm")
+    table.add_row("R, radius of curvature", f"{1000 * ranges.radius_low:.1f}", f"{1000 * ranges.radius_high:.1f}")
+    table.add_row("D, path length", f"{1000 * ranges.length_low:.1f}", f"{1000 * ranges.length_high:.1f}")
+    console().print(table)
+
+
+def _skip(calibration: Calibration) -> None:
+    from rich.table import Table
+
+    if not calibration.skip:
+        return
+    epsilon, confidence = calibration.skip["epsilon"], calibration.skip["confidence"]
+    table = Table(
+        *("task", "s_min", "low", "high", "would be skipped", f"error ≤ {epsilon:g}", "mean error", "entries"),
+        title=f"verify-skip, best neighbour in another episode, {confidence:.0%} with an error of at most {epsilon:g}",
+    )
+    for name, row in calibration.skip["tasks"].items():
+        levels = [f"{row[key]:.4f}" for key in ("s_min", "low", "high")] if row["share"] else ["never", "-", "-"]
+        figures = [f"{row['within']:.1%}", f"{row['error']:.4f}"] if row["share"] else ["-", "-"]
+        table.add_row(name, *levels, f"{row['share']:.1%}", *figures, str(row["entries"]))
     console().print(table)

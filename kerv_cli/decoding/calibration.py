@@ -1,15 +1,16 @@
-"""The calibration file: what was fitted on training demonstrations, read back and checked (METHODS §3).
+"""The calibration file: what was fitted on training demonstrations, read back and checked (METHODS §3, §4).
 
-`kerv calibrate` writes it (training/calibration.py); thresholds, predictors and boundaries read it.
+`kerv calibrate` writes it (training/calibration.py); thresholds, predictors, boundaries and verify-skip read it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.drafting.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.files import read_json, write_json
@@ -17,12 +18,14 @@ from kerv_cli.settings import ThresholdSettings
 from kerv_cli.vla.action_tokens import GRIPPER
 
 FORMAT = 1
+NEVER = 1.01  # a similarity that no neighbour reaches: the task is never skipped
+RANGES = tuple(f.name for f in fields(BoundaryRanges))
 Errors = dict[str, dict[str, dict[str, list[float]]]]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What `calibration.json` holds. `boundary` and `skip` belong to §4.4 and §4.3 and may be empty."""
+    """What `calibration.json` holds. `boundary` (§4.4), `skip` (§4.3) and `variability` may be empty."""
 
     target: dict[str, Any]  # {"sha256", "chunk", "dofs"}
     demos: dict[str, Any]  # {"sha256", "tasks": {task: {"training": episodes, "held_out": episodes}}}
@@ -30,8 +33,10 @@ class Calibration:
     noise: dict[str, Noise]  # per kind of filter
     errors: Errors
     variability: dict[str, dict[str, float]]  # task -> {"k_s", "decodes", "p25", "p75", "p90"}
-    boundary: dict[str, Any] = field(default_factory=dict)
-    skip: dict[str, Any] = field(default_factory=dict)
+    boundary: dict[str, Any] = field(default_factory=dict)  # {"window", "episodes", a BoundaryRanges' fields}
+    skip: dict[str, Any] = field(
+        default_factory=dict
+    )  # {"datastore", "epsilon", "confidence", "tasks": {task: levels}}
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def k_s(self, task: str) -> float:
@@ -52,6 +57,44 @@ class Calibration:
         if settings.kind not in ("kinematic", "change") or settings.k_s is not None:
             return settings
         return replace(settings, k_s=self.k_s(task))
+
+    def ranges(self, window: int | None = None) -> BoundaryRanges:
+        """What the boundary's R and D are normalised with; `window`: the positions that the boundary looks at.
+
+        Raises:
+            CheckpointError: there are none, or they were taken over another window.
+        """
+        if not self.boundary:
+            raise CheckpointError("the calibration has no ranges for the boundary: run 'kerv calibrate' again")
+        if window is not None and window != self.boundary["window"]:
+            raise CheckpointError(
+                f"the calibration's ranges were taken over {self.boundary['window']} positions, the boundary looks at "
+                f"{window}: run 'kerv calibrate boundary_window={window}'"
+            )
+        return BoundaryRanges(**{name: float(self.boundary[name]) for name in RANGES})
+
+    def skip_levels(self, task: str, datastore_sha256: str) -> tuple[float, float, float]:
+        """(low, s_min, high) of the task: cosine similarities, low <= s_min <= high; NEVER where nothing is skipped.
+
+        datastore_sha256: of the manifest of the datastore that retrieves.
+
+        Raises:
+            CheckpointError: no levels, none for this task, or those of another datastore.
+        """
+        again = "run 'kerv calibrate' again"
+        if not self.skip:
+            raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {again}")
+        if self.skip["datastore"] != datastore_sha256:
+            raise CheckpointError(
+                f"the calibration's skip levels are those of datastore {self.skip['datastore'][:12]}, not of "
+                f"{datastore_sha256[:12]}: {again}"
+            )
+        if task not in self.skip["tasks"]:
+            raise CheckpointError(
+                f"the calibration has no skip level for {task}, only for {', '.join(self.skip['tasks'])}: {again}"
+            )
+        row = self.skip["tasks"][task]
+        return float(row["low"]), float(row["s_min"]), float(row["high"])
 
     def predictor(self, kind: str, minimum: int = MINIMUM, horizon: int = HORIZON) -> Predictor:
         """The predictor `kind` with the fitted noise.
@@ -120,3 +163,25 @@ def _check(loaded: Calibration) -> None:
         raise ValueError("a reference level is not a number above 0")
     if not isinstance(loaded.boundary, dict) or not isinstance(loaded.skip, dict):
         raise ValueError("boundary and skip must be sections")
+    if loaded.boundary:
+        _check_boundary(loaded)
+    if loaded.skip:
+        _check_skip(loaded.skip)
+
+
+def _check_boundary(loaded: Calibration) -> None:
+    window = loaded.boundary["window"]
+    if not isinstance(window, int) or window < LEAST:
+        raise ValueError(f"boundary window {window}")
+    try:
+        loaded.ranges()
+    except CheckpointError as error:
+        raise ValueError(f"boundary: {error}") from error
+
+
+def _check_skip(skip: dict[str, Any]) -> None:
+    if not isinstance(skip["datastore"], str) or not skip["tasks"]:
+        raise ValueError("skip does not name its datastore or has no task")
+    for task, row in skip["tasks"].items():
+        if not -NEVER <= row["low"] <= row["s_min"] <= row["high"] <= NEVER:
+            raise ValueError(f"the skip levels of {task} are not in order")

@@ -1,17 +1,21 @@
-"""Calibration on the training demonstrations (METHODS §3): the noise of the kinematic predictors, their errors on
-held-out episodes, and each task's reference level K_S of the kinematic variability. One JSON holds all of it."""
+"""Calibration on the training demonstrations (METHODS §3, §4): the noise of the kinematic predictors, their errors on
+held-out episodes, each task's reference level K_S of the kinematic variability, the ranges of the hybrid boundary and
+the similarities from which on a verification is skipped. One JSON holds all of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kerv_cli.decoding.calibration import Calibration, calibration_beside, save_calibration
+from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
+from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration, save_calibration
 from kerv_cli.drafting.kinematics import MINIMUM
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.files import sha256_of
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, MethodSettings, RolloutSettings, as_plain
@@ -66,7 +70,7 @@ def presample(decoder: ActionDecoder, episode: DemoEpisode, instruction: str, de
     """
     chosen = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
     levels, seen = [], 0
-    decoder.reset(episode.task, instruction)
+    decoder.reset(episode.task, instruction, episode.seed)
     for index in chosen:
         step = int(episode.frame_steps[index])
         for t in range(seen, step):
@@ -79,10 +83,28 @@ def presample(decoder: ActionDecoder, episode: DemoEpisode, instruction: str, de
     return levels
 
 
+@dataclass(frozen=True)
+class PathReader(DemoDataset):
+    """A dataset that keeps the end-effector path of every episode it loads, so that each file is read once."""
+
+    paths: dict[int, np.ndarray] = field(default_factory=dict)  # index -> (T, 3) float32, metres
+
+    def load(self, index: int) -> DemoEpisode:
+        episode = super().load(index)
+        self.paths[index] = episode.end_effector.copy()
+        return episode
+
+
 class CalibrationRun:
-    """`kerv calibrate`."""
+    """`kerv calibrate`: `load`, then what there is to measure, then `finish`.
+
+    Attributes:
+        notes: lines for the user: what could not be computed now, and whether an earlier run's figures were kept.
+    """
 
     def __init__(self, settings: CalibrateSettings) -> None:
+        from kerv_cli.drafting.datastore import check_target, read_manifest
+        from kerv_cli.drafting.datastore_build import datastore_beside
         from kerv_cli.vla.checkpoint import read_description
 
         self.settings = settings
@@ -100,20 +122,56 @@ class CalibrationRun:
             self.path = artifact(settings.results, "calibration", settings.name) / "calibration.json"
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
+        self.datastore = datastore_beside(folder)
+        self.stored = (self.datastore / "manifest.json").is_file()
+        if self.stored:
+            check_target(read_manifest(self.datastore), self.described, self.datastore)
         self.windows: Windows | None = None
+        self.paths: list[np.ndarray] = []  # of the training episodes
+        self.notes: list[str] = []
 
     def plan(self) -> str:
         held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
+        skip = f"skip levels from {self.datastore}" if self.stored else f"no skip levels: no datastore {self.datastore}"
         return (
             f"{self.path}: predictors fitted on {len(self.chosen) - held_out} demonstrations of {len(self.tasks)} "
-            f"tasks, tested on {held_out}; {self.settings.decodes} decodes per task with {proposer} drafts"
+            f"tasks, tested on {held_out}; {self.settings.decodes} decodes per task with {proposer} drafts; boundary "
+            f"over {self.settings.boundary_window} positions; {skip}"
         )
 
     def load(self, progress: Progress) -> None:
-        """Reads the actions of the chosen episodes."""
+        """Reads the actions and paths of the chosen episodes."""
         s, statistics = self.settings, self.described["actions"]
         actions = ActionTokenizer(*(np.asarray(statistics[name]) for name in ("low", "high")))
-        self.windows = read_windows(self.dataset, self.chosen, actions, s.history, s.window, self.chunk, progress)
+        reader = PathReader(self.dataset.path, self.dataset.manifest, self.dataset.episodes)
+        self.windows = read_windows(reader, self.chosen, actions, s.history, s.window, self.chunk, progress)
+        self.paths = [reader.paths[index] for index, held_out in self.chosen.items() if not held_out]
+
+    def boundary(self, progress: Progress) -> dict[str, Any]:
+        """Ranges of R and D over every window of every training episode, in metres; none is left out.
+
+        Raises:
+            CheckpointError: no path bends, or none moves.
+        """
+
+        def read() -> Iterator[np.ndarray]:
+            for done, path in enumerate(self.paths, 1):
+                yield path
+                progress(done, len(self.paths))
+
+        window = self.settings.boundary_window
+        return {"window": window, "episodes": len(self.paths), **asdict(BoundaryRanges.fit(read(), window))}
+
+    def skip(self, progress: Progress) -> dict[str, Any]:
+        """The tasks' skip levels, from the datastore beside the target; empty where there is none."""
+        from kerv_cli.drafting.datastore import Datastore
+        from kerv_cli.training.skipping import skip_section
+
+        if not self.stored:
+            return {}
+        store = Datastore.open(self.datastore, self.described)
+        sha256 = sha256_of(self.datastore / "manifest.json")
+        return skip_section(store, sha256, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
 
     def presample(self, progress: Progress) -> dict[str, dict[str, float]]:
         """task -> K_S and how K is spread, from decodes of training observations with the settings' method."""
@@ -155,8 +213,11 @@ class CalibrationRun:
         method = MethodSettings("presampling", s.proposer, s.acceptance, s.threshold)
         return build_decoder(policy, method), policy.target.settings.image_size
 
-    def finish(self, variability: dict[str, dict[str, float]]) -> Calibration:
-        """Fits, measures and writes the calibration."""
+    def finish(
+        self, variability: dict[str, dict[str, float]], boundary: dict[str, Any], skip: dict[str, Any]
+    ) -> Calibration:
+        """Fits, measures and writes the calibration. A section that is empty now keeps what the file holds for the
+        same target."""
         assert self.windows is not None
         noise = fit_filters(self.windows, self.settings.fit_steps or self.chunk)
         made = {
@@ -164,17 +225,38 @@ class CalibrationRun:
             "settings": as_plain(self.settings),
             **provenance(self.settings.runtime.device),
         }
+        sections, origins = self._kept({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
             target={"sha256": self.described["sha256"], "chunk": self.chunk, "dofs": len(self.windows.past[0, 0])},
             demos={"sha256": self.dataset.sha256, "tasks": self.windows.episodes},
             window=self.settings.window,
             noise=noise,
             errors=prediction_errors(self.windows, noise),
-            variability=variability,
-            provenance=made,
+            **sections,
+            provenance={**made, "kept": origins} if origins else made,
         )
         save_calibration(self.path, calibration)
         return calibration
+
+    def _kept(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The sections, empty ones as an earlier run left them, and the provenance of each that was taken over."""
+        try:
+            earlier = load_calibration(self.path, self.described["sha256"], self.chunk)
+        except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew
+            earlier = None
+        reasons = {
+            "variability": f"reference levels K_S: decodes={self.settings.decodes}",
+            "skip": f"skip levels: no datastore of these tasks in {self.datastore} (kerv build datastore)",
+        }
+        origins = {}
+        for name in [name for name, section in sections.items() if not section]:
+            kept = getattr(earlier, name) if earlier else {}
+            if earlier and kept:
+                sections[name] = kept
+                made = {key: value for key, value in earlier.provenance.items() if key != "kept"}
+                origins[name] = earlier.provenance.get("kept", {}).get(name, made)
+            self.notes.append(f"{reasons.get(name, name)}; {'kept from the earlier run' if kept else 'left empty'}")
+        return sections, origins
 
 
 def _check_settings(settings: CalibrateSettings) -> None:
@@ -182,6 +264,12 @@ def _check_settings(settings: CalibrateSettings) -> None:
         raise UnknownName("history", settings.history, HISTORIES)
     if settings.window < MINIMUM:
         raise UsageError(f"window={settings.window}: at least {MINIMUM}")
+    if not 0 < settings.epsilon < math.inf:
+        raise UsageError(f"epsilon={settings.epsilon}: above 0, in normalised action units")
+    if not 0.5 <= settings.confidence < 1:
+        raise UsageError(f"confidence={settings.confidence}: from 0.5 to below 1")
+    if settings.boundary_window < LEAST:
+        raise UsageError(f"boundary_window={settings.boundary_window}: at least {LEAST} positions")
     if settings.decodes < 0:
         raise UsageError(f"decodes={settings.decodes}: 0 for none, or the number per task")
     if settings.decodes and settings.proposer.kind == "none":
