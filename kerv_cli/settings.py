@@ -359,7 +359,7 @@ class CalibrateSettings:
     fit_steps: int = 0  # steps ahead whose mean error is fitted; 0: the target's chunk
     epsilon: float = 0.1  # verify-skip: mean abs error of a retrieved chunk that is good enough, normalised units
     confidence: float = 0.9  # verify-skip: share of skipped chunks whose error stays below epsilon
-    boundary_window: int = 15  # positions that the boundary's ranges are taken over
+    boundary_windows: list[int] = field(default_factory=lambda: [5, 15, 30])  # positions; each has ranges of its own
     decodes: int = 60  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
     proposer: ProposerSettings = field(default_factory=ProposerSettings)
     acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)

@@ -249,7 +249,7 @@ def calibration(levels: dict[str, float]) -> Calibration:
         noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped", "acceleration")},
         errors={},
         variability={task: {"k_s": level, "decodes": 5} for task, level in levels.items()},
-        boundary={"window": 15, "radius_low": 0.01, "radius_high": 2.0, "length_low": 0.0, "length_high": 0.2},
+        boundary={"windows": {"15": {"radius_low": 0.01, "radius_high": 2.0, "length_low": 0.0, "length_high": 0.2}}},
         skip={"datastore": "d" * 64, "tasks": {task: {"low": 0.8, "s_min": 0.9, "high": 0.99} for task in levels}},
     )
 
@@ -267,10 +267,10 @@ def calibration(levels: dict[str, float]) -> Calibration:
         (lambda v: v["target"].pop("sha256"), "does not name its target"),
         (lambda v: v.update(window="ten"), "window ten"),
         (lambda v: v.update(boundary=[]), "must be sections"),
-        (lambda v: v["boundary"].pop("length_low"), "damaged"),
-        (lambda v: v["boundary"].update(window=2), "boundary window 2"),
-        (lambda v: v["boundary"].update(radius_high=0.001), "is no range"),
-        (lambda v: v["boundary"].update(radius_high=float("nan")), "is no range"),
+        (lambda v: v["boundary"]["windows"]["15"].pop("length_low"), "damaged"),
+        (lambda v: v["boundary"]["windows"].update({"2": {}}), "boundary window 2"),
+        (lambda v: v["boundary"]["windows"]["15"].update(radius_high=0.001), "is no range"),
+        (lambda v: v["boundary"]["windows"]["15"].update(radius_high=float("nan")), "is no range"),
         (lambda v: v["skip"].pop("datastore"), "damaged"),
         (lambda v: v["skip"].update(tasks={}), "has no task"),
         (lambda v: v["skip"]["tasks"]["reach-v3"].update(low=0.95), "levels of reach-v3 are not in order"),
@@ -317,7 +317,7 @@ def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
         ("epsilon=0", UsageError, "epsilon=0"),
         ("confidence=0.4", UsageError, "confidence=0.4"),
         ("confidence=1", UsageError, "confidence=1"),
-        ("boundary_window=2", UsageError, "boundary_window=2"),
+        ("boundary_windows=[2]", UsageError, "boundary_windows=.2"),
         ("fit_steps=5", UsageError, "the target's chunk of 4"),
         ("proposer=none", UsageError, "drafts nothing to compare"),
         ("task=push", CheckpointError, "no episode of push-v3"),
@@ -343,7 +343,7 @@ def test_the_command_prints_what_it_found(results: Path) -> None:
     common = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state", f"results={results}"]
     done = CliRunner().invoke(app, [*common, "decodes=0", "name=without"])
     assert done.exit_code == 0, done.output
-    for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without", "radius of curvature"):
+    for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without", "radius R, minimum"):
         assert word in done.output
     assert "reference levels K_S: decodes=0; left empty\n" in done.output
     assert "skip levels: no datastore" in done.output

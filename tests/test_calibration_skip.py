@@ -174,16 +174,16 @@ def test_tasks_that_the_datastore_does_not_hold_are_left_out() -> None:
 
 
 def test_the_ranges_are_those_of_the_training_episodes(copy: Path) -> None:
-    run, made = calibrated(copy, "boundary_window=7")
+    run, made = calibrated(copy, "boundary_windows=[7,15]")
     training = [run.dataset.load(i).end_effector for i, held_out in run.chosen.items() if not held_out]
     everything = [run.dataset.load(i).end_effector for i in run.chosen]
-    assert made.ranges() == made.ranges(7) == BoundaryRanges.fit(training, 7)
-    assert made.ranges() != BoundaryRanges.fit(everything, 7)
-    assert made.boundary["window"] == 7
-    with pytest.raises(CheckpointError, match="over 7 positions, the boundary looks at 15: run 'kerv calibrate"):
-        made.ranges(15)
+    assert made.ranges(7) == BoundaryRanges.fit(training, 7)
+    assert made.ranges(15) == BoundaryRanges.fit(training, 15)
+    assert made.ranges(7) != BoundaryRanges.fit(everything, 7)
+    with pytest.raises(CheckpointError, match="over 7, 15 positions, the boundary looks at 9: run 'kerv calibrate"):
+        made.ranges(9)
     with pytest.raises(CheckpointError, match="no ranges for the boundary"):
-        replace(made, boundary={}).ranges()
+        replace(made, boundary={}).ranges(7)
 
 
 def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
@@ -211,9 +211,9 @@ def test_what_cannot_be_computed_now_is_kept(copy: Path) -> None:
     _, first = calibrated(copy, levels=levels)
     assert "kept" not in first.provenance
     shutil.rmtree(copy / "artifacts/datastore")
-    run, second = calibrated(copy, "window=8", "boundary_window=5")
+    run, second = calibrated(copy, "window=8", "boundary_windows=[5]")
     assert (second.variability, second.skip) == (levels, first.skip)
-    assert (second.window, second.boundary["window"]) == (8, 5)
+    assert (second.window, list(second.boundary["windows"])) == (8, ["5"])
     assert [line.endswith("kept from the earlier run") for line in run.notes] == [True, True]
     _, third = calibrated(copy, "window=9")
     assert (third.variability, third.skip) == (levels, first.skip)
@@ -245,7 +245,7 @@ def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
     app.command()(calibrate)
     done = CliRunner().invoke(app, words(copy, "epsilon=1.9", "confidence=0.5"))
     assert done.exit_code == 0, done.output
-    for word in ("windows of 15 positions", "path length", "s_min", "would be skipped", "error ≤ 1.9", "144"):
+    for word in ("ranges of the boundary's metric", "path length", "s_min", "would be skipped", "error ≤ 1.9", "144"):
         assert word in done.output
     assert "skip levels from" in CliRunner().invoke(app, words(copy, "--plan")).output
     never = CliRunner().invoke(app, words(copy, "epsilon=0.0001"))

@@ -36,7 +36,7 @@ def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPl
     if settings.decodes:
         with progress_bar("pre-sampling", len(run.tasks)) as advance:
             variability = run.presample(lambda done, total: advance(done, ""))
-    with progress_bar("boundary ranges", len(run.paths)) as advance:
+    with progress_bar("boundary ranges", len(run.paths) * len(settings.boundary_windows)) as advance:
         boundary = run.boundary(lambda done, total: advance(done, ""))
     if run.stored:
         with progress_bar("skip levels", len(run.tasks)) as advance:
@@ -105,10 +105,12 @@ def _errors(calibration: Calibration) -> None:
 def _boundary(calibration: Calibration) -> None:
     from rich.table import Table
 
-    ranges, window = calibration.ranges(), calibration.boundary["window"]
-    table = Table("", "minimum", "95th percentile", title=f"boundary, windows of {window} positions, mm")
-    table.add_row("R, radius of curvature", f"{1000 * ranges.radius_low:.1f}", f"{1000 * ranges.radius_high:.1f}")
-    table.add_row("D, path length", f"{1000 * ranges.length_low:.1f}", f"{1000 * ranges.length_high:.1f}")
+    columns = ("positions", "radius R, minimum", "95th percentile", "length D, minimum", "95th percentile")
+    table = Table(*columns, title="ranges of the boundary's metric, mm")
+    for window in calibration.boundary["windows"]:
+        r = calibration.ranges(int(window))
+        bounds = (r.radius_low, r.radius_high, r.length_low, r.length_high)
+        table.add_row(window, *(f"{1000 * metres:.1f}" for metres in bounds))
     console().print(table)
 
 

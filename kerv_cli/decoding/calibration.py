@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from kerv_cli.vla.action_tokens import GRIPPER
 
 FORMAT = 1
 NEVER = 1.01  # a similarity that no neighbour reaches: the task is never skipped
-RANGES = tuple(f.name for f in fields(BoundaryRanges))
 Errors = dict[str, dict[str, dict[str, list[float]]]]
 
 
@@ -33,7 +32,9 @@ class Calibration:
     noise: dict[str, Noise]  # per kind of filter
     errors: Errors
     variability: dict[str, dict[str, float]]  # task -> {"k_s", "decodes", "p25", "p75", "p90"}
-    boundary: dict[str, Any] = field(default_factory=dict)  # {"window", "episodes", a BoundaryRanges' fields}
+    boundary: dict[str, Any] = field(
+        default_factory=dict
+    )  # {"episodes", "windows": {positions: a BoundaryRanges' fields}}
     skip: dict[str, Any] = field(
         default_factory=dict
     )  # {"datastore", "epsilon", "confidence", "tasks": {task: levels}}
@@ -58,20 +59,21 @@ class Calibration:
             return settings
         return replace(settings, k_s=self.k_s(task))
 
-    def ranges(self, window: int | None = None) -> BoundaryRanges:
-        """What the boundary's R and D are normalised with; `window`: the positions that the boundary looks at.
+    def ranges(self, window: int) -> BoundaryRanges:
+        """What the boundary's R and D are normalised with when it looks at `window` positions.
 
         Raises:
-            CheckpointError: there are none, or they were taken over another window.
+            CheckpointError: none were taken, or none over so many positions.
         """
         if not self.boundary:
             raise CheckpointError("the calibration has no ranges for the boundary: run 'kerv calibrate' again")
-        if window is not None and window != self.boundary["window"]:
+        windows = self.boundary["windows"]
+        if str(window) not in windows:
             raise CheckpointError(
-                f"the calibration's ranges were taken over {self.boundary['window']} positions, the boundary looks at "
-                f"{window}: run 'kerv calibrate boundary_window={window}'"
+                f"the calibration's ranges were taken over {', '.join(windows)} positions, the boundary looks at "
+                f"{window}: run 'kerv calibrate boundary_windows=[{','.join([*windows, str(window)])}]'"
             )
-        return BoundaryRanges(**{name: float(self.boundary[name]) for name in RANGES})
+        return BoundaryRanges(**windows[str(window)])
 
     def skip_levels(self, task: str, datastore_sha256: str) -> tuple[float, float, float]:
         """(low, s_min, high) of the task: cosine similarities, low <= s_min <= high; NEVER where nothing is skipped.
@@ -170,13 +172,13 @@ def _check(loaded: Calibration) -> None:
 
 
 def _check_boundary(loaded: Calibration) -> None:
-    window = loaded.boundary["window"]
-    if not isinstance(window, int) or window < LEAST:
-        raise ValueError(f"boundary window {window}")
-    try:
-        loaded.ranges()
-    except CheckpointError as error:
-        raise ValueError(f"boundary: {error}") from error
+    for window, ranges in loaded.boundary["windows"].items():
+        if not window.isdigit() or int(window) < LEAST:
+            raise ValueError(f"boundary window {window}")
+        try:
+            BoundaryRanges(**{name: float(value) for name, value in ranges.items()})
+        except CheckpointError as error:
+            raise ValueError(f"boundary: {error}") from error
 
 
 def _check_skip(skip: dict[str, Any]) -> None:

@@ -55,7 +55,11 @@ def build_parts(policy: Policy, method: MethodSettings, task: str = "") -> Parts
 
 
 def build_part_boundary(policy: Policy, method: MethodSettings) -> Boundary | None:
-    ranges = policy.calibration.ranges() if policy.calibration is not None and method.boundary.kind == "fused" else None
+    ranges = (
+        policy.calibration.ranges(method.boundary.window)
+        if policy.calibration is not None and method.boundary.kind == "fused"
+        else None
+    )
     return build_boundary(method.boundary, ranges)
 
 

@@ -136,7 +136,7 @@ class CalibrationRun:
         return (
             f"{self.path}: predictors fitted on {len(self.chosen) - held_out} demonstrations of {len(self.tasks)} "
             f"tasks, tested on {held_out}; {self.settings.decodes} decodes per task with {proposer} drafts; boundary "
-            f"over {self.settings.boundary_window} positions; {skip}"
+            f"over {', '.join(map(str, self.settings.boundary_windows))} positions; {skip}"
         )
 
     def load(self, progress: Progress) -> None:
@@ -153,14 +153,16 @@ class CalibrationRun:
         Raises:
             CheckpointError: no path bends, or none moves.
         """
+        windows, found = self.settings.boundary_windows, {}
 
-        def read() -> Iterator[np.ndarray]:
-            for done, path in enumerate(self.paths, 1):
+        def read(before: int) -> Iterator[np.ndarray]:
+            for done, path in enumerate(self.paths, before + 1):
                 yield path
-                progress(done, len(self.paths))
+                progress(done, len(self.paths) * len(windows))
 
-        window = self.settings.boundary_window
-        return {"window": window, "episodes": len(self.paths), **asdict(BoundaryRanges.fit(read(), window))}
+        for number, window in enumerate(windows):
+            found[str(window)] = asdict(BoundaryRanges.fit(read(number * len(self.paths)), window))
+        return {"episodes": len(self.paths), "windows": found}
 
     def skip(self, progress: Progress) -> dict[str, Any]:
         """The tasks' skip levels, from the datastore beside the target; empty where there is none."""
@@ -268,8 +270,8 @@ def _check_settings(settings: CalibrateSettings) -> None:
         raise UsageError(f"epsilon={settings.epsilon}: above 0, in normalised action units")
     if not 0.5 <= settings.confidence < 1:
         raise UsageError(f"confidence={settings.confidence}: from 0.5 to below 1")
-    if settings.boundary_window < LEAST:
-        raise UsageError(f"boundary_window={settings.boundary_window}: at least {LEAST} positions")
+    if not settings.boundary_windows or min(settings.boundary_windows) < LEAST:
+        raise UsageError(f"boundary_windows={settings.boundary_windows}: at least {LEAST} positions each")
     if settings.decodes < 0:
         raise UsageError(f"decodes={settings.decodes}: 0 for none, or the number per task")
     if settings.decodes and settings.proposer.kind == "none":
