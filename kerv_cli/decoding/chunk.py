@@ -68,6 +68,7 @@ class Chunk:
     forwards: int = 0
     variability: float = 0.0
     similarity: float | None = None  # of the best stored chunk, where one was looked up
+    limits: tuple[int, ...] = ()  # bins per DoF that a draft may be off: what is worth drafting depends on it
     choice: Choice | None = None  # who drafts, where a boundary decides
     unverified: list[int] = field(default_factory=list)  # what the rejected draft had behind the rejected token
     closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk

@@ -132,6 +132,7 @@ class Decoder:
         """prompt (1, P, E) -> a complete chunk, or one that the rectifier closed."""
         clock = clock or Clock(prompt.device)
         chunk = Chunk(prompt, self.size, self.target.settings.dofs, self.cache, self.situation)
+        chunk.limits = limits_of(self.method.acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
         if self.parts.boundary is not None:
             chunk.choice = self.parts.boundary.choose(np.array(self.situation.path), self.situation.random)
         skipped = self.parts.skip is not None and self.parts.skip.take(chunk)
