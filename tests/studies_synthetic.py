@@ -87,7 +87,7 @@ def decode_of(rounds: list[Round], phases: dict[str, float], mode: str) -> Decod
 def ar_decode(rng: np.random.Generator) -> DecodeRecord:
     rounds = [Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(TOKENS)]
     noise = rng.lognormal(0, 0.1)
-    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "verify": 0.0, "other": 0.045 * noise}
+    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "verify": 0.045 * noise, "other": 0.001}
     return decode_of(rounds, phases, "ar")
 
 

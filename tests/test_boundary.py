@@ -20,6 +20,7 @@ from kerv_cli.decoding.boundary import (
 )
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.settings import BoundarySettings
+from kerv_cli.studies.curvature import pseudo_radius
 
 WINDOW = 15
 RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)
@@ -134,11 +135,6 @@ def test_both_measures_survive_rigid_motion_and_reversal(seed: int) -> None:
 def test_the_path_length_is_the_way_travelled() -> None:
     assert path_length(np.array([[0, 0, 0], [0.3, 0.4, 0], [0, 0, 0]])) == pytest.approx(1.0)
     assert path_length(np.zeros((1, 3))) == path_length(np.zeros((0, 3))) == 0.0
-
-
-def pseudo_radius(points: np.ndarray) -> float:
-    """What METHODS §4.4 says of the peers' public code: a constant times the mean speed."""
-    return 10.0 * path_length(points) / (len(points) - 1)
 
 
 def test_the_pseudo_radius_cannot_tell_arcs_from_lines_and_ours_can() -> None:

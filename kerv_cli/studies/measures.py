@@ -15,7 +15,8 @@ from kerv_cli.studies.stats import Estimate
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 
-_SAME = ("device", "device_name", "dtype", "threads", "rand_vec")  # what two episodes of a pair must agree in
+COMPARABLE = ("device", "device_name", "dtype", "threads")  # what times must agree in to be compared
+_SAME = (*COMPARABLE, "rand_vec")  # what two episodes of a pair must agree in
 
 _RATIOS = {
     "AL": ("committed", "verifications"),
@@ -36,7 +37,7 @@ class Measured:
 
     values: dict[str, float]  # every measure but the two below
     success: Estimate  # Wilson interval
-    speedup: Estimate  # bootstrap interval; NaN without pairs
+    speedup: Estimate  # bootstrap interval; NaN without pairs, and where no target decodes
     counts: stats.PairedCounts
     mcnemar_p: float  # NaN without pairs
     same_run: bool  # all pairs were measured in one run
@@ -58,12 +59,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> M
     return Measured(
         values=_by_group(episodes, _means) if macro else _means(episodes),
         success=_success(episodes, macro),
-        speedup=stats.speedup(
-            pairs["time_baseline"].to_numpy(),
-            pairs["time_method"].to_numpy(),
-            list(pairs["task"]),
-            list(pairs["difficulty"]) if macro else None,
-        ),
+        speedup=_speedup(pairs, macro) if _decodes(episodes) else stats.NO_ESTIMATE,
         counts=counts,
         mcnemar_p=stats.mcnemar(counts) if len(pairs) else math.nan,
         same_run=bool(len(pairs) and pairs["same_run"].all()),
@@ -87,6 +83,16 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     both["same_run"] = both["run_method"] == both["run_baseline"]
     return both.rename(columns={"difficulty_method": "difficulty"})
+
+
+def _decodes(episodes: pd.DataFrame) -> bool:
+    """Whether a target decodes at all. The scripted expert's time is no speedup of any decoding method."""
+    return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
+
+
+def _speedup(pairs: pd.DataFrame, macro: bool) -> Estimate:
+    times = pairs["time_baseline"].to_numpy(), pairs["time_method"].to_numpy()
+    return stats.speedup(*times, list(pairs["task"]), list(pairs["difficulty"]) if macro else None)
 
 
 def _means(episodes: pd.DataFrame) -> dict[str, float]:

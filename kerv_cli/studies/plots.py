@@ -2,47 +2,24 @@
 
 from __future__ import annotations
 
-import io
 import math
+import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kerv_cli.decoding.record import PHASES
-from kerv_cli.files import atomic_path
+from kerv_cli.studies.drawing import COLOURS, DASHES, INK, MUTED, STYLE, colour, entitle, new_figure
 from kerv_cli.studies.measures import MICRO
+from kerv_cli.studies.scatter import tradeoff_figure
 from kerv_cli.studies.tables import is_number
 
-_INK, _MUTED, _GRID = "#1f2933", "#6b7785", "#e3e8ee"
-_COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # told apart when colour-blind
 _PHASE_COLOURS = ("#b8c4d0", "#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
-_STYLE: Any = {
-    "figure.constrained_layout.use": True,
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.edgecolor": _MUTED,
-    "axes.labelcolor": _INK,
-    "text.color": _INK,
-    "xtick.color": _MUTED,
-    "ytick.color": _MUTED,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": _GRID,
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "svg.hashsalt": "kerv",  # ids in the file do not change from run to run
-    "svg.fonttype": "path",
-}
 _PANELS = (
     ("speedup", "Speedup", "time per step, baseline ÷ setting", 1.0),
     ("success", "Success", "episodes, % and 95 % interval", 100.0),
@@ -51,7 +28,8 @@ _PANELS = (
 
 
 def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
-    """Name suffix -> figure: measures against the axis (or by setting), and inference time by phase.
+    """Name suffix -> figure: measures against the axis, and inference time by phase; without an axis the measures by
+    setting, and success against speedup.
 
     Args:
         table: `study_table`.
@@ -60,108 +38,101 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
         averaging: the rows that are drawn; named in the figure.
     """
     rows = table[table["averaging"] == averaging].reset_index(drop=True)
-    numbers = axis in rows and pd.to_numeric(rows.loc[~_is_baseline(rows), axis], errors="coerce").nunique() > 1
-    with mpl.rc_context(_STYLE):
-        measures = _against_axis(rows, axis) if numbers else _by_setting(rows)
-        figures = {"": measures, "_phases": _phases(rows)}
+    numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
+    with mpl.rc_context(STYLE):
+        figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
+        figures["_phases"] = _phases(rows)
         for figure in figures.values():
-            _entitle(figure, title, rows, averaging)
+            entitle(figure, title, _about(rows, averaging))
+        if not numbers:
+            figures["_tradeoff"] = tradeoff_figure(rows, title, _about(rows, averaging))
     return figures
 
 
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Writes a figure as the format of its suffix (.png, .svg), atomically and without a date.
-
-    Raises:
-        StorageError: the disk refused.
-    """
-    content = figure_bytes(figure, path.suffix[1:])
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-    return path
-
-
-def figure_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as the bytes of a PNG or SVG file."""
-    buffer = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    with mpl.rc_context(_STYLE):
-        figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
-    return buffer.getvalue()
+def _about(rows: pd.DataFrame, averaging: str) -> str:
+    first = rows.iloc[0]
+    counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
+    return f"{counts} · {averaging} · {first['device_name']}, {first['dtype']}"
 
 
 def _is_baseline(rows: pd.DataFrame) -> pd.Series:
     return rows["label"] == rows["baseline"]
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height))
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _entitle(figure: Figure, title: str, rows: pd.DataFrame, averaging: str) -> None:
-    """Title and what the figure averages over, in a band of their own above the panels."""
-    height, inch = figure.get_figheight(), 1.0 / figure.get_figheight()
-    engine = figure.get_layout_engine()
-    if isinstance(engine, ConstrainedLayoutEngine):
-        engine.set(rect=(0.0, 0.0, 1.0, 1.0 - 0.72 / height), w_pad=0.12, h_pad=0.06)
-    first = rows.iloc[0]
-    counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
-    where = f"{counts} · {averaging} · {first['device_name']}, {first['dtype']}"
-    figure.text(0.012, 1.0 - 0.24 * inch, title, fontsize=13, fontweight="bold", va="center")
-    figure.text(0.012, 1.0 - 0.54 * inch, where, fontsize=9, color=_MUTED, va="center")
-
-
 def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
-    """Rows without the baseline, by everything that varies besides the axis: legend text -> rows along the axis."""
+    """Rows by everything that varies besides the axis: legend text -> rows along the axis, with its number as `x`.
+
+    A row on which the axis has no number is a series of its own. The baseline is left out, unless it is one point of a
+    series of others.
+    """
     own = rows[~_is_baseline(rows)]
-    first, last = list(rows.columns).index("overrides") + 1, list(rows.columns).index("horizon")
-    candidates = ["method", *rows.columns[first:last]]
-    varying = [name for name in candidates if name != axis and own[name].astype(str).nunique() > 1]
+    varying = _varying(own, axis)
+    numbers = axis_numbers(own, axis)
     series: dict[str, pd.DataFrame] = {}
-    groups = own.groupby([own[name].astype(str) for name in varying], sort=False) if varying else [((), own)]
-    for _, group in groups:
-        shared = [f"{name.split('.')[-1]} {group[name].iloc[0]}" for name in varying if "sha256" not in name]
-        name = str(group["label"].iloc[0]) if len(group) == 1 else str(group["method"].iloc[0])
-        if name in series:
-            name = f"{name}, {', '.join(shared)}"
-        series[name] = group.assign(x=pd.to_numeric(group[axis], errors="coerce")).sort_values("x")
+    keys = [own[name].astype(str) for name in varying] + [own["label"].where(numbers.isna(), "")]
+    for _, group in own.groupby(keys, sort=False):
+        stems = {_stem(str(label), axis) for label in group["label"]}
+        name = str(group["label"].iloc[0]) if len(group) == 1 else stems.pop()
+        if len(group) > 1 and (stems or name in series):
+            shared = [f"{key.split('.')[-1]} {group[key].iloc[0]}" for key in varying if "sha256" not in key]
+            name = ", ".join([str(group["method"].iloc[0]), *shared])
+        if len(group) > 1:
+            group = pd.concat([group, rows[_is_baseline(rows) & (rows["label"].map(lambda x: _stem(x, axis)) == name)]])
+        series[name] = group.assign(x=axis_numbers(group, axis)).sort_values("x")
     return series
 
 
+def _varying(own: pd.DataFrame, axis: str) -> list[str]:
+    first, last = list(own.columns).index("overrides") + 1, list(own.columns).index("horizon")
+    candidates = ["method", *own.columns[first:last]]
+    return [name for name in candidates if name != axis and own[name].astype(str).nunique() > 1]
+
+
+def axis_numbers(rows: pd.DataFrame, axis: str) -> pd.Series:
+    """The axis's values; NaN where they are no numbers (text, switches, nothing)."""
+    values = rows[axis] if axis in rows else pd.Series(math.nan, index=rows.index)
+    values = values.map(lambda value: math.nan if isinstance(value, bool | np.bool_) else value)
+    return pd.to_numeric(values, errors="coerce")
+
+
+def _stem(label: str, axis: str) -> str:
+    """A grid's label without the axis: `fused f_star=0.3` -> `fused`."""
+    return re.sub(rf"\s+{re.escape(axis.rsplit('.', 1)[-1])}=\S+", "", label)
+
+
 def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
-    figure = _figure(12.0, 4.6)
-    axes = figure.subplots(1, len(_PANELS))
     series = series_of(rows, axis)
+    names = [*series, str(rows["baseline"].iloc[0])]
+    columns = max(1, min(6, int(12.0 / (0.7 + 0.08 * max(map(len, names))))))
+    figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns))
+    axes = figure.subplots(1, len(_PANELS))
+    ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
-        for colour, (label, group) in zip(_cycle(len(series)), series.items(), strict=True):
-            _draw_series(panel, group, measure, scale, colour, label)
+        for place, (label, group) in enumerate(series.items()):
+            _draw_series(panel, group, measure, scale, place, label)
         _draw_baseline(panel, rows, measure, scale)
         panel.set(title=name, ylabel=unit, xlabel=axis)
+        if len(ticks) <= 9:
+            panel.set_xticks(ticks, [f"{value:g}" for value in ticks])
         _limit(panel, measure)
-    handles, labels = axes[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
+    shown = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in shown}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
     return figure
 
 
-def _cycle(count: int) -> list[str]:
-    return [_COLOURS[i % len(_COLOURS)] for i in range(count)]
-
-
-def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, colour: str, label: str) -> None:
+def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, place: int, label: str) -> None:
     if len(group) == 1:  # a setting that the axis does not touch: a level to compare with
         level = group[measure].iloc[0] * scale
         if is_number(level):
-            panel.axhline(level, color=colour, linestyle=(0, (4, 2)), linewidth=1.4, label=label)
+            dashes = DASHES[place % len(DASHES)]
+            panel.axhline(level, color=colour(place), linestyle=dashes, linewidth=1.4, label=label)
         return
     x, y = group["x"].to_numpy(float), group[measure].to_numpy(float) * scale
-    panel.plot(x, y, color=colour, marker="o", markersize=5, linewidth=1.8, label=label)
+    panel.plot(x, y, color=colour(place), marker="o", markersize=5, linewidth=1.8, label=label)
     if f"{measure}_low" in group:
         low, high = group[f"{measure}_low"].to_numpy(float) * scale, group[f"{measure}_high"].to_numpy(float) * scale
-        panel.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-    if len(x) <= 9:
-        panel.set_xticks(x, [f"{value:g}" for value in x])
+        panel.fill_between(x, low, high, color=colour(place), alpha=0.15, linewidth=0)
 
 
 def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) -> None:
@@ -170,9 +141,9 @@ def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) 
         return
     row = own.iloc[0]
     value = 1.0 / scale if measure in ("speedup", "AL") else row[measure]  # AR commits one token per forward
-    panel.axhline(value * scale, color=_INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
+    panel.axhline(value * scale, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
     if measure == "success":
-        panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=_INK, alpha=0.06, linewidth=0)
+        panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=INK, alpha=0.06, linewidth=0)
 
 
 def _limit(panel: Axes, measure: str) -> None:
@@ -184,7 +155,7 @@ def _limit(panel: Axes, measure: str) -> None:
 
 
 def _by_setting(rows: pd.DataFrame) -> Figure:
-    figure = _figure(12.0, 2.0 + 0.38 * len(rows))
+    figure = new_figure(12.0, 2.0 + 0.38 * len(rows))
     axes = figure.subplots(1, len(_PANELS), sharey=True)
     places = range(len(rows))
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
@@ -193,19 +164,28 @@ def _by_setting(rows: pd.DataFrame) -> Figure:
         reference = rows[_is_baseline(rows)]
         if len(reference) and measure != "AL":
             level = 1.0 if measure == "speedup" else reference.iloc[0][measure] * scale
-            panel.axvline(level, color=_INK, linewidth=1.2, linestyle=":")
+            panel.axvline(level, color=INK, linewidth=1.2, linestyle=":")
         panel.set(title=name, xlabel=unit)
         panel.grid(axis="y", visible=False)
+        if measure == "speedup":
+            _draw_ceilings(panel, rows)
         panel.set_xlim(0, 104 if measure == "success" else 1.08 * panel.get_xlim()[1])
-    axes[0].set_yticks(list(places), list(rows["label"]), color=_INK)
+    axes[0].set_yticks(list(places), list(rows["label"]), color=INK)
     axes[0].set_ylim(len(rows) - 0.5, -0.5)
     return figure
+
+
+def _draw_ceilings(panel: Axes, rows: pd.DataFrame) -> None:
+    known = rows["ceiling"].notna()
+    if known.any():
+        panel.plot(rows.loc[known, "ceiling"], rows.index[known], "|", color=MUTED, markersize=13, markeredgewidth=1.6)
+        panel.set_xlabel(f"{panel.get_xlabel()}; | ceiling")
 
 
 def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale: float) -> None:
     if not is_number(row[measure]):
         return
-    colour = _INK if row["label"] == row["baseline"] else _COLOURS[0]
+    colour = INK if row["label"] == row["baseline"] else COLOURS[0]
     value = row[measure] * scale
     low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
     if is_number(low):
@@ -224,18 +204,18 @@ def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale:
 
 
 def _phases(rows: pd.DataFrame) -> Figure:
-    figure = _figure(10.0, 2.0 + 0.36 * len(rows))
+    figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
     panel = figure.subplots()
     places = list(range(len(rows)))
     left = [0.0] * len(rows)
-    for phase, colour in zip(PHASES, _phase_colours(len(PHASES)), strict=True):
+    for phase, shade in zip(PHASES, _phase_colours(len(PHASES)), strict=True):
         widths = rows[f"ms.{phase}"].fillna(0.0).to_list()
         if any(widths):
-            panel.barh(places, widths, 0.66, left, color=colour, label=phase, edgecolor="white", linewidth=0.6)
+            panel.barh(places, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
         left = [a + b for a, b in zip(left, widths, strict=True)]
     for place, total in zip(places, rows["time_per_step_ms"], strict=True):
         panel.text(total, place, f"  {total:.3g}", va="center", fontsize=9)
-    panel.set_yticks(places, list(rows["label"]), color=_INK)
+    panel.set_yticks(places, list(rows["label"]), color=INK)
     panel.set_ylim(len(rows) - 0.5, -0.5)
     panel.set(title="Inference time by phase", xlabel="ms per control step")
     panel.grid(axis="y", visible=False)

@@ -28,12 +28,16 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     """The rows of one averaging of `study_table`, for the terminal: 80 columns hold labels of 16 characters."""
     frame = _narrow(summary_frame(table, averaging))
     title = Text(_title(table, averaging), style="bold")
-    caption = f"95 % intervals in brackets; p: exact McNemar test of success against {table['baseline'].iloc[0]}"
+    caption = f"brackets: 95 % intervals; p: exact McNemar test against {table['baseline'].iloc[0]}"
+    if "ceiling" in frame:
+        caption += "\nceiling: speedup if every chunk were accepted whole at once"
     printed = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD)
-    printed.padding, printed.show_edge = (0, 1, 0, 0), False
+    printed.padding, printed.show_edge = 0, False
     for name in frame.columns:
         left = name == "setting"
-        printed.add_column(name.replace(" / ", "\n/ "), justify="left" if left else "right", overflow="fold")
+        head = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
+        interval = name in ("success %", "speedup")  # better a label in two lines than an interval
+        printed.add_column(head, justify="left" if left else "right", overflow="fold", no_wrap=interval)
     for row in frame.itertuples(index=False):
         printed.add_row(*(escape(str(value)) for value in row))
     return printed
@@ -53,15 +57,17 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """The same as texts: 95 % intervals in brackets, `–` where a value does not exist, unused columns left out."""
     rows = table[table["averaging"] == averaging].to_dict("records")
     used = {key: name for key, name in _WHERE_USED.items() if any(is_number(row[key]) and row[key] for row in rows)}
-    return pd.DataFrame([_cells({str(k): v for k, v in row.items()}, _ALWAYS | used) for row in rows])
+    limited = any(is_number(row["ceiling"]) for row in rows)
+    return pd.DataFrame([_cells({str(k): v for k, v in row.items()}, _ALWAYS | used, limited) for row in rows])
 
 
-def _cells(row: Mapping[str, Any], columns: Mapping[str, str]) -> dict[str, str]:
+def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) -> dict[str, str]:
     reference = row["label"] == row["baseline"]
     return {
         "setting": str(row["label"]),
         "success %": _interval(row, "success", 100.0, 0),
         "speedup": "1" if reference else _interval(row, "speedup", 1.0, 2),
+        **({"ceiling": number(row["ceiling"])} if limited else {}),
         "ms / step": number(row["time_per_step_ms"]),
         **{name: _percent(row[key]) if key in _PERCENT else number(row[key]) for key, name in columns.items()},
         "lost/won": "" if reference or not row["pairs"] else f"{row['only_baseline']}/{row['only_method']}",

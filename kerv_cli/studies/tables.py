@@ -13,7 +13,15 @@ import pandas as pd
 from kerv_cli.files import atomic_path
 from kerv_cli.provenance import PACKAGES
 from kerv_cli.sim.tasks import TASKS
-from kerv_cli.studies.measures import MACRO, MICRO, Measured, measure
+from kerv_cli.studies.ceiling import (
+    NONE,
+    Ceiling,
+    ceiling,
+    chunk_ratio,
+    is_autoregressive,
+    opens_with_drafts,
+)
+from kerv_cli.studies.measures import COMPARABLE, MACRO, MICRO, Measured, measure
 from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
@@ -78,15 +86,26 @@ def difficulty_of(task: str) -> str:
 def per_task_table(data: StudyData) -> pd.DataFrame:
     """One row per task and label: tasks by name, labels in the plan's order."""
     by_task = [episodes for _, episodes in data.episodes.groupby("task", sort=True)]
-    return pd.DataFrame([row for episodes in by_task for row in _rows(data, episodes, "one task")])
+    return _frame([row for episodes in by_task for row in _rows(data, episodes, "one task")])
 
 
 def study_table(data: StudyData) -> pd.DataFrame:
     """Two rows per label: micro over tasks and macro over difficulty groups."""
-    return pd.DataFrame([row for averaging in (MICRO, MACRO) for row in _rows(data, data.episodes, averaging)])
+    return _frame([row for averaging in (MICRO, MACRO) for row in _rows(data, data.episodes, averaging)])
 
 
-def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[dict[str, Any]]:
+Sections = list[dict[str, Any]]
+"""One row, in the order of its columns. Settings differ in what they have; what they share stays together."""
+
+
+def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
+    """Rows as a table: within a section, columns that only later rows have come behind those of the first."""
+    columns = [name for parts in zip(*rows, strict=True) for part in parts for name in part]
+    merged = [{name: value for part in row for name, value in part.items()} for row in rows]
+    return pd.DataFrame(merged, columns=list(dict.fromkeys(columns)))
+
+
+def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
     """One row per label that has episodes here."""
     baseline = episodes[episodes["label"] == data.plan.baseline]
     for label in data.plan.labels:
@@ -95,7 +114,7 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[d
             yield _row(data, label, own, baseline, averaging)
 
 
-def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> dict[str, Any]:
+def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
     tasks = sorted(set(episodes["task"]))
     cells = [c for c in data.plan.cells if c.label == label and c.task in tasks and c.id in data.cells]
     head = {
@@ -110,12 +129,31 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "episodes": len(episodes),
         "baseline": data.plan.baseline,
     }
-    return head | _measured(measure(episodes, baseline, averaging), episodes) | _origin(data, cells)
+    measured = measure(episodes, baseline, averaging)
+    best = _ceiling(data, cells[0], episodes, averaging)
+    return [head, _measured(measured, best, episodes), *_origin(data, cells)]
 
 
-def _measured(found: Measured, episodes: pd.DataFrame) -> dict[str, Any]:
+def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:
+    """Against autoregressive decoding of the same target on the same device: the baseline, or else the first one."""
+    if is_autoregressive(cell.settings):
+        return NONE
+    target = cell.identity.get("target")
+    found = [c for c in data.plan.cells if is_autoregressive(c.settings) and c.identity.get("target") == target]
+    found.sort(key=lambda other: other.label != data.plan.baseline)
+    if not found:
+        return NONE
+    reference = data.episodes[data.episodes["label"] == found[0].label]
+    for name in ("task", *COMPARABLE):
+        reference = reference[reference[name].isin(set(episodes[name]))]
+    chunks = chunk_ratio(cell.settings, found[0].settings)
+    return ceiling(episodes, reference, opens_with_drafts(cell.settings), chunks, averaging == MACRO)
+
+
+def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[str, Any]:
     phases = {name: value for name, value in found.values.items() if name.startswith("ms.")}
     rest = {name: value for name, value in found.values.items() if name not in phases}
+    limit = best.columns()
     return {
         "successes": int(episodes["success"].sum()),
         "success": found.success.value,
@@ -124,6 +162,7 @@ def _measured(found: Measured, episodes: pd.DataFrame) -> dict[str, Any]:
         "speedup": found.speedup.value,
         "speedup_low": found.speedup.low,
         "speedup_high": found.speedup.high,
+        "ceiling": limit.pop("ceiling"),
         **rest,
         "pairs": sum(found.counts),
         **found.counts._asdict(),
@@ -133,22 +172,24 @@ def _measured(found: Measured, episodes: pd.DataFrame) -> dict[str, Any]:
         "decodes": int(episodes["decodes"].sum()),
         "deviation_samples": int(episodes["deviation_count"].sum()),
         **phases,
+        **limit,
     }
 
 
-def _origin(data: StudyData, cells: Sequence[Cell]) -> dict[str, Any]:
-    """Settings and provenance of a row, the same for all its cells or joined by semicolons."""
+def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
+    """Settings, weights and provenance of a row, the same for all its cells or joined by semicolons."""
     settings, policy = cells[0].settings, cells[0].settings["policy"]
     world, runtime = settings["world"], settings["runtime"]
     statuses = [data.cells[cell.id].status for cell in cells]
     parts = {key: value for key, value in settings.items() if key not in {*_SETTINGS_ELSEWHERE, "world", "runtime"}}
-    return {
-        "overrides": cells[0].overrides,
-        **flatten(parts),
+    weights = {
         "target": policy["target"],
         "drafter": policy.get("drafter"),
+        "early": policy.get("early"),
         OBSERVATION: cells[0].identity.get(OBSERVATION, ""),
         **{f"{name}_sha256": value for name, value in sorted(cells[0].identity.items()) if name != OBSERVATION},
+    }
+    surroundings = {
         "horizon": world["horizon"],
         "camera": world["camera"]["name"],
         **flatten({"camera": {k: v for k, v in world["camera"].items() if k != "name"}}),
@@ -156,16 +197,17 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> dict[str, Any]:
         **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),
     }
+    return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; a list becomes its text."""
+    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; lists joined by semicolons."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, Mapping):
             flat |= flatten(value, f"{prefix}{key}.")
         else:
-            flat[f"{prefix}{key}"] = str(value) if isinstance(value, list) else value
+            flat[f"{prefix}{key}"] = _joined(value) if isinstance(value, list | tuple) else value
     return flat
 
 

@@ -1,0 +1,213 @@
+"""The ceiling column against numbers worked out by hand (METHODS §5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from studies_synthetic import IDENTITY, settings_of
+
+from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.settings import RolloutSettings, StudySettings
+from kerv_cli.studies.measures import MACRO, MICRO
+from kerv_cli.studies.plan import Cell, make_cell, plan
+from kerv_cli.studies.store import StudyStore
+from kerv_cli.studies.summary import summary_frame
+from kerv_cli.studies.tables import flatten, load_study, per_task_table, study_table
+
+STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip"}
+PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
+PLAIN = Round("decode", "none", 3, (), (1,), 0, 1, 0, ())
+VERIFY = Round("verify", "drafter", 1, (5, 6), (5, 6), 2, 2, 2, (9, 9, 9, 0))
+OPENED = Round("verify", "merged", 0, (4, 5, 6), (4, 5, 6, 7), 3, 4, 9, (9, 9, 9, 0))
+SKIPPED = Round("skip", "retrieval", 0, (1, 2, 3, 4), (), 4, 4, 4, ())
+
+
+def decode(rounds: Sequence[Round], **phases: float) -> DecodeRecord:
+    """One control step of four tokens."""
+    return DecodeRecord(
+        tokens=(1, 2, 3, 4),
+        actions=np.zeros((1, 4), np.float32),
+        forwards=sum(r.mode != "skip" for r in rounds),
+        rounds=tuple(rounds),
+        mode="x",
+        seconds=sum(phases.values()),
+        phases=phases,
+        skipped=rounds == [SKIPPED],
+    )
+
+
+# per decode: overhead 0.3, prefill 0.4, three forwards of 0.2, and 0.1 that no ceiling counts
+AR = decode([PREFILL, PLAIN, PLAIN, PLAIN], preprocess=0.1, vision=0.2, prefill=0.4, verify=0.6, other=0.1)
+BASELINE = 0.3 + 0.4 + 3 * 0.2
+DECODES = {
+    "ar": [AR, AR],
+    # one verification of 0.3 and one forward over the token that was left, 0.2; a decode with neither
+    "kerv": [
+        decode([PREFILL, VERIFY, PLAIN], vision=0.9, prefill=0.9, propose=0.3, verify=0.5),
+        decode([SKIPPED], vision=0.9, propose=0.1),
+    ],
+    "one_pass": [decode([OPENED], vision=0.1, propose=0.3, prefill=0.45), decode([OPENED], vision=0.1, prefill=0.55)],
+    "expert": [decode([], other=1e-6)],
+}
+EXPECTED = {
+    "kerv": BASELINE / (0.3 + 0.4 + 0.3),
+    "one_pass": BASELINE / (0.3 + 0.5),
+}
+
+
+def settings() -> dict[str, RolloutSettings]:
+    found = {label: settings_of(label, 0 if label == "ar" else 9, episodes=2) for label in DECODES}
+    found["one_pass"].opening.sources = ["early", "hold"]
+    found["expert"].proposer.kind = "none"
+    return found
+
+
+def record(cell: Cell, seed: int, slower: float = 1.0) -> EpisodeRecord:
+    decodes = [
+        replace(d, seconds=slower * d.seconds, phases={name: slower * s for name, s in d.phases.items()})
+        for d in DECODES[cell.label.split()[0]]
+    ]
+    steps = len(decodes)
+    return EpisodeRecord(
+        task=cell.task,
+        instruction="",
+        seed=seed,
+        success=True,
+        steps=steps,
+        decodes=tuple(decodes),
+        decode_steps=tuple(range(steps)),
+        actions=np.zeros((steps, 4), np.float32),
+        path=np.zeros((steps + 1, 3), np.float32),
+        gripper=np.zeros(steps + 1, np.float32),
+        rand_vec=np.array([float(seed)]),
+    )
+
+
+def write(
+    results: Path,
+    cells: Sequence[Cell],
+    slower: Mapping[str, float] | None = None,
+    status: Mapping[str, Mapping[str, Any]] | None = None,
+) -> pd.DataFrame:
+    """The study's table; slower: factor per task, status: what differs from STATUS per label."""
+    store = StudyStore(results, "best")
+    for cell in cells:
+        factor = (slower or {}).get(cell.task, 1.0)
+        records = [record(cell, seed, factor) for seed in cell.seeds]
+        store.write_cell(cell, records, {**STATUS, **(status or {}).get(cell.label, {})})
+    store.write_plan(StudySettings("best", "", cells[0].label), cells)
+    return study_table(load_study(store))
+
+
+def ceilings(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, float]:
+    rows = table[table["averaging"] == averaging]
+    return dict(zip(rows["label"], rows["ceiling"], strict=True))
+
+
+def test_by_hand(tmp_path: Path) -> None:
+    table = write(tmp_path, plan(settings(), ["reach-v3"], IDENTITY, baseline="ar"))
+    found = ceilings(table)
+    assert {label: found[label] for label in EXPECTED} == pytest.approx(EXPECTED)
+    assert math.isnan(found["ar"])
+    assert math.isnan(found["expert"])
+    row = table[(table["label"] == "kerv") & (table["averaging"] == MICRO)].iloc[0]
+    parts = {"ceiling_tokens": 4.0, "ceiling_ms.overhead": 300, "ceiling_ms.prefill": 400}
+    parts |= {"ceiling_ms.one_token": 200, "ceiling_ms.own": 300}
+    assert {name: row[name] for name in parts} == pytest.approx(parts)
+
+
+def test_summaries_show_it_beside_the_speedup(tmp_path: Path) -> None:
+    table = write(tmp_path, plan(settings(), ["reach-v3"], IDENTITY, baseline="ar"))
+    frame = summary_frame(table)
+    columns = list(frame.columns)
+    assert columns[columns.index("speedup") + 1] == "ceiling"
+    assert dict(zip(frame["setting"], frame["ceiling"], strict=True)) == {
+        "ar": "–",
+        "kerv": "1.30",
+        "one_pass": "1.62",
+        "expert": "–",
+    }
+    only_ar = table[table["label"] == "ar"]
+    assert "ceiling" not in summary_frame(only_ar).columns
+
+
+def test_the_expert_has_no_speedup(tmp_path: Path) -> None:
+    table = write(tmp_path, plan(settings(), ["reach-v3"], IDENTITY, baseline="ar"))
+    rows = table[table["label"] == "expert"]
+    assert rows["speedup"].isna().all()
+    assert (rows["success"] == 1.0).all()
+    assert (rows["pairs"] == 2).all()
+
+
+def test_macro_takes_the_ratio_of_the_groups_means(tmp_path: Path) -> None:
+    cells = plan(settings(), ["reach-v3", "push-v3"], IDENTITY, baseline="ar")  # easy and hard
+    slow = [c for c in cells if c.task == "push-v3" and c.label == "one_pass"]
+    table = write(tmp_path, [c for c in cells if c not in slow], {"push-v3": 3.0})
+    # kerv: a factor in common cancels; one_pass has one group only
+    assert ceilings(table, MACRO)["kerv"] == pytest.approx(EXPECTED["kerv"])
+    assert ceilings(table, MACRO)["one_pass"] == pytest.approx(EXPECTED["one_pass"])
+    assert ceilings(table, MICRO)["one_pass"] == pytest.approx(EXPECTED["one_pass"])
+
+
+def test_per_task_rows_use_their_own_task(tmp_path: Path) -> None:
+    cells = plan(settings(), ["reach-v3", "push-v3"], IDENTITY, baseline="ar")
+    write(tmp_path, cells, {"push-v3": 3.0})
+    table = per_task_table(load_study(StudyStore(tmp_path, "best")))
+    own = table[table["label"] == "kerv"].set_index("task")["ceiling_ms.own"]
+    assert dict(own) == pytest.approx({"reach-v3": 300.0, "push-v3": 900.0})
+    assert table[table["label"] == "kerv"]["ceiling"].to_list() == pytest.approx([EXPECTED["kerv"]] * 2)
+
+
+def test_longer_chunks_count_per_control_step(tmp_path: Path) -> None:
+    chosen = {}
+    for steps in (4, 8):
+        for label in ("ar", "kerv"):
+            chosen[f"{label} chunk={steps}"] = replace(settings()[label], chunk=steps)
+    found = ceilings(write(tmp_path, plan(chosen, ["reach-v3"], IDENTITY, baseline="ar chunk=4")))
+    assert found["kerv chunk=4"] == pytest.approx(EXPECTED["kerv"])
+    assert found["kerv chunk=8"] == pytest.approx(2 * EXPECTED["kerv"])
+    assert math.isnan(found["ar chunk=8"])
+
+
+def test_another_target_or_device_gives_none(tmp_path: Path) -> None:
+    first = settings()
+    cells = plan({"ar": first["ar"]}, ["reach-v3"], IDENTITY)
+    cells += plan({"kerv": first["kerv"]}, ["reach-v3"], {**IDENTITY, "target": "c" * 64})
+    cells += plan({"one_pass": first["one_pass"]}, ["reach-v3"], IDENTITY)
+    found = ceilings(write(tmp_path, cells, status={"one_pass": {"device_name": "another chip"}}))
+    assert all(math.isnan(value) for value in found.values())
+
+
+def test_cells_of_before_are_readable(tmp_path: Path) -> None:
+    """Settings without skip, datastore, chunk and opening.sources, beside newer ones."""
+    cells = plan(settings(), ["reach-v3"], IDENTITY, baseline="ar")
+    old = []
+    for cell in cells[:2]:
+        plain = {k: v for k, v in cell.settings.items() if k not in ("skip", "datastore", "chunk")}
+        plain["opening"] = {"kind": "none", "nodes": 0}
+        plain["policy"] = {"target": "mt10-vision", "drafter": None}
+        old.append(make_cell(cell.label, "", plain, IDENTITY, "reach-v3"))
+    assert [cell.label for cell in old] == ["ar", "kerv"]
+    table = write(tmp_path, [*old, cells[2]])
+    assert ceilings(table)["kerv"] == pytest.approx(EXPECTED["kerv"])
+    assert ceilings(table)["one_pass"] == pytest.approx(EXPECTED["one_pass"])
+    columns = list(table.columns)
+    # a setting that only later rows have stands among the settings, not behind the provenance
+    assert columns.index("overrides") < columns.index("skip.kind") < columns.index("target") < columns.index("horizon")
+    assert list(table["opening.sources"].fillna("missing"))[:3] == ["missing", "missing", "early;hold"]
+
+
+def test_flatten() -> None:
+    assert flatten({"opening": {"sources": ["early", "hold"]}, "skip": {"s_min": None}, "chunk": 4}) == {
+        "opening.sources": "early;hold",
+        "skip.s_min": None,
+        "chunk": 4,
+    }
+    assert flatten({"opening": {"sources": []}}) == {"opening.sources": ""}

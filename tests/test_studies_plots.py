@@ -1,0 +1,135 @@
+"""Figures of studies whose axis is text, nothing or a number on some rows only; labels that stay apart."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from studies_synthetic import IDENTITY, run_cell, settings_of
+
+from kerv_cli.settings import RolloutSettings, StudySettings
+from kerv_cli.studies.drawing import STYLE, new_figure
+from kerv_cli.studies.measures import MICRO
+from kerv_cli.studies.plan import plan
+from kerv_cli.studies.plots import series_of, study_figures
+from kerv_cli.studies.scatter import place_labels
+from kerv_cli.studies.store import StudyStore
+from kerv_cli.studies.tables import load_study, study_table
+
+
+def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:
+    found = settings_of(method, 0 if method == "ar" else 9, episodes=2)
+    for part, values in parts.items():
+        for name, value in values.items():
+            setattr(getattr(found, part), name, value)
+    return found
+
+
+def table_of(results: Path, settings: dict[str, RolloutSettings], baseline: str = "ar") -> pd.DataFrame:
+    cells = plan(settings, ["reach-v3"], IDENTITY, baseline=baseline)
+    store = StudyStore(results, "drawn")
+    for cell in cells:
+        store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
+    store.write_plan(StudySettings("drawn", "", baseline), cells)
+    return study_table(load_study(store))
+
+
+def boundary_study() -> dict[str, RolloutSettings]:
+    found = {"ar": setting("ar"), "always drafter": setting(boundary={"kind": "always_drafter"})}
+    for value in (0.1, 0.3, 0.7):
+        found[f"fused f_star={value}"] = setting(boundary={"kind": "fused", "f_star": value})
+    return found | {"radius alone": setting(boundary={"kind": "fused", "alpha": 1.0})}
+
+
+@pytest.fixture(scope="module")
+def boundaries(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    unused = setting("kerv", rectifier={"use_verdict": False}, threshold={"r": 3})
+    return table_of(tmp_path_factory.mktemp("boundaries"), boundary_study() | {"unused": unused})
+
+
+def texts(figure: Figure) -> set[str]:
+    shown = {text.get_text() for panel in figure.axes for text in [*panel.get_yticklabels(), *panel.texts]}
+    return shown | {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+
+
+def test_what_the_axis_does_not_touch_is_a_level(boundaries: pd.DataFrame) -> None:
+    table = boundaries
+    rows = table[table["averaging"] == MICRO]
+    series = series_of(rows, "boundary.f_star")
+    assert {name: len(group) for name, group in series.items()} == {
+        "always drafter": 1,
+        "fused": 3,
+        "radius alone": 1,
+        "unused": 1,
+    }
+    figure = study_figures(table, "boundary.f_star", "Title")[""]
+    assert {"fused", "always drafter", "radius alone", "unused", "ar"} == texts(figure) - ticks(figure)
+    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    assert list(lines["fused"].get_xdata()) == [0.1, 0.3, 0.7]
+    level = float(rows[rows["label"] == "always drafter"]["speedup"].iloc[0])
+    assert list(lines["always drafter"].get_ydata()) == [level, level]
+
+
+def ticks(figure: Figure) -> set[str]:
+    return {text.get_text() for panel in figure.axes for text in panel.get_yticklabels()}
+
+
+def test_a_row_without_a_number_on_the_axis_is_a_level_of_its_own(tmp_path: Path) -> None:
+    settings = {"ar": setting("ar"), "auto": setting("kerv", threshold={"kind": "kinematic"})}
+    for value in (0.1, 0.4):
+        settings[f"level k_s={value}"] = setting("kerv", threshold={"kind": "kinematic", "k_s": value})
+    rows = table_of(tmp_path, settings).query("averaging == @MICRO")
+    series = series_of(rows, "threshold.k_s")
+    assert {name: list(group["x"].fillna(-1)) for name, group in series.items()} == {"auto": [-1], "level": [0.1, 0.4]}
+
+
+def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path: Path) -> None:
+    settings = {}
+    for method in ("ar", "kerv"):
+        for steps in (1, 4, 8):
+            settings[f"{method} chunk={steps}"] = setting(method)
+            settings[f"{method} chunk={steps}"].chunk = steps
+    rows = table_of(tmp_path, settings, "ar chunk=4").query("averaging == @MICRO")
+    series = series_of(rows, "chunk")
+    assert {name: list(group["x"]) for name, group in series.items()} == {"ar": [1, 4, 8], "kerv": [1, 4, 8]}
+    assert list(series["ar"]["speedup"])[1] == 1.0
+
+
+@pytest.mark.parametrize("axis", ["boundary.kind", "rectifier.use_verdict", "no.such"])
+def test_without_numbers_on_the_axis_every_setting_is_a_row(boundaries: pd.DataFrame, axis: str) -> None:
+    figures = study_figures(boundaries, axis, "Title")
+    assert set(figures) == {"", "_phases", "_tradeoff"}
+    for figure in figures.values():
+        assert set(boundaries["label"]) <= texts(figure)
+
+
+def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
+    panel = study_figures(boundaries, "", "Title")[""].axes[0]
+    known = boundaries[(boundaries["averaging"] == MICRO) & boundaries["ceiling"].notna()]["ceiling"]
+    assert len(known) == 6
+    marks = [line for line in panel.get_lines() if line.get_marker() == "|"]
+    assert [list(line.get_xdata()) for line in marks] == [list(known)]
+    assert panel.get_xlim()[1] > known.max()
+
+
+def test_labels_keep_apart_in_a_crowd() -> None:
+    rng = np.random.default_rng(0)
+    labels = [(1.0 + 0.3 * rng.uniform(), 97.0 + 3 * rng.uniform(), f"some_method_{i}") for i in range(12)]
+    labels += [(1.1, 98.0, "the same"), (1.1, 98.0, "place"), (3.0, 100.0, "far away")]
+    with mpl.rc_context(STYLE):
+        figure = new_figure(11.0, 6.4)
+        panel = figure.subplots()
+        panel.set(xlim=(0.5, 3.5), ylim=(60, 106))
+        notes = place_labels(figure, panel, labels, ["black"] * len(labels))
+        renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+        boxes = [mpl.text.Text.get_window_extent(note, renderer) for note in notes]
+        frame = panel.get_window_extent(renderer)
+    assert {note.get_text() for note in notes} == {text for _, _, text in labels}
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    assert all(frame.x0 <= b.x0 and b.x1 <= frame.x1 and frame.y0 <= b.y0 and b.y1 <= frame.y1 for b in boxes)
