@@ -12,7 +12,7 @@ from studies_synthetic import IDENTITY, run_cell, settings_of
 from kerv_cli.decoding.calibration import Calibration, save_calibration
 from kerv_cli.drafting.kinematics import FILTERS, Noise
 from kerv_cli.errors import CheckpointError
-from kerv_cli.files import sha256_of, write_json
+from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies.curvature import RADII, radius_table
 from kerv_cli.studies.plan import plan
@@ -119,6 +119,15 @@ def test_a_damaged_calibration_is_named(tmp_path: Path) -> None:
     path.write_text("{}", encoding="utf-8")
     with pytest.raises(CheckpointError, match="is not a calibration"):
         read_predictions(tmp_path, "made-here")
+    write_json(path, {"format": 1, "kind": "calibration", "errors": {"hold": {}}})
+    with pytest.raises(CheckpointError, match=r"damaged \('window' is missing\)"):
+        read_predictions(tmp_path, "made-here")
+
+
+def test_sections_of_another_version_do_not_matter(tmp_path: Path) -> None:
+    path = calibrate(tmp_path)
+    write_json(path, {**read_json(path), "boundary": {"what": "ever"}, "noise": {}})
+    assert read_predictions(tmp_path, "made-here") is not None
 
 
 def test_whose_methods_predict() -> None:

@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration
+from kerv_cli.decoding.calibration import FORMAT, Errors, calibration_beside
 from kerv_cli.drafting.kinematics import PREDICTORS
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of
@@ -33,7 +33,11 @@ class Predictions:
     """The predictors' errors of one target's calibration."""
 
     target: str
-    calibration: Calibration
+    errors: Errors
+    window: int  # control steps that predictions were made from
+    target_sha256: str
+    demos: Mapping[str, Any]  # {"sha256", "tasks": {task: {"training": episodes, "held_out": episodes}}}
+    provenance: Mapping[str, Any]
     sha256: str  # of the calibration's file
 
     @property
@@ -55,10 +59,23 @@ def read_predictions(results: Path, target: str) -> Predictions | None:
     if not path.is_file():
         return None
     value = read_json(path)
-    made_for = value.get("target", {}) if isinstance(value, dict) else {}
-    # whether the target has changed since does not matter here: the errors are the demonstrations'
-    found = load_calibration(path, made_for.get("sha256", ""), made_for.get("chunk", 0))
-    return Predictions(target, found, sha256_of(path)) if found.errors else None
+    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, "calibration"):
+        raise CheckpointError(f"{path} is not a calibration of format {FORMAT}: run 'kerv calibrate' again")
+    # only what the report shows: the rest may be of another version, and the target another since, the errors are
+    # the demonstrations'
+    try:
+        found = Predictions(
+            target,
+            errors=value["errors"],
+            window=value["window"],
+            target_sha256=value["target"]["sha256"],
+            demos=value["demos"],
+            provenance=value.get("provenance", {}),
+            sha256=sha256_of(path),
+        )
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged ({error} is missing): run 'kerv calibrate' again") from error
+    return found if found.errors else None
 
 
 def calibrated_targets(results: Path) -> list[str]:
@@ -80,18 +97,18 @@ def _predicts(settings: Mapping[str, Any]) -> bool:
 
 def prediction_table(predictions: Predictions) -> pd.DataFrame:
     """One row per predictor, task, DoF and step ahead; errors in normalised action units."""
-    found, errors = predictions.calibration, predictions.calibration.errors
+    errors = predictions.errors
     origin = {
-        "window": found.window,
+        "window": predictions.window,
         "calibration_sha256": predictions.sha256,
-        "target_sha256": found.target["sha256"],
-        "demos_sha256": found.demos.get("sha256", ""),
-        "git_commit": found.provenance.get("git_commit", ""),
+        "target_sha256": predictions.target_sha256,
+        "demos_sha256": predictions.demos.get("sha256", ""),
+        "git_commit": predictions.provenance.get("git_commit", ""),
     }
     rows = []
     for predictor, tasks in errors.items():
         for task, dofs in tasks.items():
-            counts = found.demos.get("tasks", {}).get(task, {})
+            counts = predictions.demos.get("tasks", {}).get(task, {})
             held_out = {"held_out_episodes": counts.get("held_out"), "training_episodes": counts.get("training")}
             for dof, steps in dofs.items():
                 for step, error in enumerate(steps):

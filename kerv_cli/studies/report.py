@@ -111,11 +111,10 @@ def _report_prediction(results: Path, target: str) -> Section:
 
 
 def _prediction_note(predictions: Predictions) -> str:
-    found = predictions.calibration
     return (
         "Mean absolute error on held-out demonstrations, mean of dx, dy, dz over the tasks, in normalised action "
         "units; brackets: share of the error of holding the last action. "
-        f"Calibration {predictions.sha256[:12]}, predicted from the last {found.window} steps; "
+        f"Calibration {predictions.sha256[:12]}, predicted from the last {predictions.window} steps; "
         f"per task and DoF: tables/{predictions.name}.csv."
     )
 
