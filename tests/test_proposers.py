@@ -49,7 +49,7 @@ class KnownDraft:
     def __init__(self, truth: list[int], random: np.random.Generator) -> None:
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def propose(self, prompt: torch.Tensor, history: np.ndarray) -> list[int]:
+    def propose(self, prompt: torch.Tensor, history: np.ndarray, size: int, radius: int) -> list[int]:
         return self.tokens
 
 

@@ -71,7 +71,8 @@ class EarlyProposer(ChainProposer):
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         if self._drafted is None or self._drafted[0] is not chunk:
-            self._drafted = chunk, self.early.propose(chunk.prompt, chunk.situation.history.values())
+            history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
+            self._drafted = chunk, self.early.propose(chunk.prompt, history, chunk.size, radius)
         return [self._drafted[1][len(chunk.tokens) : chunk.size][:depth]]
 
 

@@ -23,7 +23,7 @@ OBSERVATION = "observation"
 # counts, so a setting that is added later makes new cells instead of being overlooked.
 _NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
 _NOT_DETERMINING_RUNTIME = frozenset({"workers"})
-_NOT_DETERMINING_POLICY = frozenset({"target", "drafter"})
+_NOT_DETERMINING_POLICY = frozenset({"target", "drafter", "early"})
 
 
 @dataclass(frozen=True)
