@@ -38,7 +38,7 @@ def target(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan 
 @app.command("drafter")
 @edge
 def drafter(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
-    """Train a drafter on the target's own greedy decodes."""
+    """Train a drafter, or with drafter=early the early one, on the target's own greedy decodes."""
     from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import TrainDrafterSettings
 
@@ -46,9 +46,9 @@ def drafter(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         return
-    from kerv_cli.training.runs import DrafterRun
+    from kerv_cli.training.runs import drafter_run
 
-    run = DrafterRun(settings)
+    run = drafter_run(settings)
     if plan:
         typer.echo(run.plan())
         return

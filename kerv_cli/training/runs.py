@@ -13,14 +13,16 @@ import torch
 from torch import nn
 
 from kerv_cli.drafting.drafter import Drafter, save_drafter
+from kerv_cli.drafting.early import EarlyDrafter, save_early
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.places import artifact, drafter_folder, find_target
+from kerv_cli.places import artifact, drafter_folder, early_folder, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.training.distillation import Distillation, distillation_job, teach
+from kerv_cli.training.early import EarlyDistillation, early_job, teach_early
 from kerv_cli.training.imitation import (
     Imitation,
     Samples,
@@ -32,7 +34,7 @@ from kerv_cli.training.imitation import (
     split,
     vocabulary,
 )
-from kerv_cli.training.loop import Loop, Metrics
+from kerv_cli.training.loop import Job, Loop, Metrics
 from kerv_cli.vla.checkpoint import load_target, read_description, save_target
 from kerv_cli.vla.target import Target
 
@@ -146,26 +148,32 @@ class TargetRun:
 class DrafterRun:
     """`kerv train drafter`."""
 
+    noun = "drafter"
+
     def __init__(self, settings: TrainDrafterSettings) -> None:
         self.settings = settings
         if settings.train.init is not None:
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
-        if settings.drafter.kind != "eagle":
-            raise UnknownName("drafter.kind", settings.drafter.kind, ["eagle"])
         self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = drafter_folder(settings.results, settings.policy.drafter, self.target_folder)
+        self.folder = self.place()
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+
+    def place(self) -> Path:
+        return drafter_folder(self.settings.results, self.settings.policy.drafter, self.target_folder)
 
     def plan(self) -> str:
         s = self.settings
         return (
-            f"{self.folder}: {s.drafter.layers}-layer drafter of {self.target_folder}, greedy decodes of "
+            f"{self.folder}: {s.drafter.layers}-layer {self.noun} of {self.target_folder}, greedy decodes of "
             f"{s.drafter.samples} observations, {s.train.steps} steps of {s.train.batch}"
         )
 
     def load(self, progress: Progress) -> None:
         self.device, _ = set_up(self.settings.runtime)
         self.target, self.described = load_target(self.target_folder, self.device)
+        self.teach(progress)
+
+    def teach(self, progress: Progress) -> None:
         tasks = tuple(dict.fromkeys(e.task for e in self.dataset.episodes))
         samples = load_samples(self.dataset, self.target.settings, self.target.words, tasks)
         training, held_out = split(samples, self.settings.train.held_out)
@@ -173,23 +181,26 @@ class DrafterRun:
         self.states = teach(self.target, training, limit, lambda done, total: progress(done, total))
         self.held_out = teach(self.target, held_out, max(60, limit // 50), lambda done, total: None)
 
+    def job(self) -> Job:
+        drafter = Drafter.beside(self.settings.drafter, self.target).to(self.device)
+        run = Distillation(drafter, self.target, self.states, self.held_out, self.settings.drafter)
+        return distillation_job(run, self.save)
+
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
         settings = self.settings
         torch.manual_seed(settings.train.seed)
-        drafter = Drafter.beside(settings.drafter, self.target).to(self.device)
+        job = self.job()
         identity = identity_of(
             drafter=asdict(settings.drafter),
             train=determining(settings.train),
             demos=self.dataset.sha256,
             target=self.described["sha256"],
         )
-        run = Distillation(drafter, self.target, self.states, self.held_out, settings.drafter)
-        loop = Loop(distillation_job(run, self.save), settings.train, self.folder, identity)
-        drafter.train()
+        loop = Loop(job, settings.train, self.folder, identity)
+        job.module.train()
         return loop.run(on_step)
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
-        assert isinstance(module, Drafter)
         made = {
             "command": "kerv train drafter",
             "settings": asdict(self.settings),
@@ -198,4 +209,45 @@ class DrafterRun:
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
         }
+        self.write(module, made)
+
+    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+        assert isinstance(module, Drafter)
         save_drafter(self.folder, module, self.described["sha256"], made)
+
+
+class EarlyRun(DrafterRun):
+    """`kerv train drafter drafter=early`."""
+
+    noun = "early drafter"
+
+    def place(self) -> Path:
+        return early_folder(self.settings.results, self.settings.policy.early, self.target_folder)
+
+    def teach(self, progress: Progress) -> None:
+        taught = teach_early(self.target, self.dataset, self.settings.drafter, progress)
+        self.training, self.validation = taught.split(self.settings.train.held_out)
+
+    def job(self) -> Job:
+        early = EarlyDrafter(self.settings.drafter, self.target.settings)
+        early.standardise(self.training.features)
+        run = EarlyDistillation(early.to(self.device), self.training, self.validation, self.settings.train)
+        return early_job(run, self.save)
+
+    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+        assert isinstance(module, EarlyDrafter)
+        save_early(self.folder, module, self.described["sha256"], made)
+
+
+DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": EarlyRun}
+
+
+def drafter_run(settings: TrainDrafterSettings) -> DrafterRun:
+    """The run of `drafter.kind`.
+
+    Raises:
+        UnknownName: no such kind.
+    """
+    if settings.drafter.kind not in DRAFTER_RUNS:
+        raise UnknownName("drafter.kind", settings.drafter.kind, DRAFTER_RUNS)
+    return DRAFTER_RUNS[settings.drafter.kind](settings)

@@ -1,0 +1,345 @@
+"""The early drafter: what it reads, what it is trained on, and that it only serves the target it imitates."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from kerv_cli.config import compose
+from kerv_cli.drafting.early import EarlyDrafter, choose, load_early, padded, pool, pooled_width, read_early, save_early
+from kerv_cli.drafting.kinematics import ActionHistory
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.places import early_folder
+from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.sim.camera import CameraConfig
+from kerv_cli.sim.demo_dataset import DemoDataset
+from kerv_cli.sim.demo_file import DemoEpisode
+from kerv_cli.sim.demos import DemoConfig, record
+from kerv_cli.training.early import (
+    EarlyDistillation,
+    EarlySamples,
+    accepted_tokens,
+    measure,
+    observations,
+    teach_early,
+)
+from kerv_cli.training.imitation import load_samples, split
+from kerv_cli.training.runs import EarlyRun, drafter_run
+from kerv_cli.vla.checkpoint import load_target
+from kerv_cli.vla.target import Target
+
+SMALL = DrafterSettings(kind="early", layers=2, width=32, rank=8, history=2, samples=1000)
+SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10
+
+
+def drafter(settings: DrafterSettings = SMALL, shape: TargetSettings = SHAPE) -> EarlyDrafter:
+    torch.manual_seed(0)
+    early = EarlyDrafter(settings, shape).eval()
+    for parameter in early.parameters():
+        if parameter.dim() == 2:
+            torch.nn.init.normal_(parameter, std=0.3)
+    return early
+
+
+def test_pooling_takes_every_part_of_the_prompt_once() -> None:
+    """Token i of the prompt is i everywhere, so the pooled vector shows what was taken from where."""
+    prompt = torch.arange(10.0)[None, :, None].expand(1, 10, 16)
+    pooled = pool(prompt, SHAPE)
+    assert pooled.shape == (1, pooled_width(SHAPE))
+    assert pooled[0].unflatten(0, (-1, 16))[:, 0].tolist() == [7, 8, 9, 5, 1.5]  # scene ×2, hand, words, vision
+    state = dataclasses.replace(SHAPE, observation="state")
+    assert pool(prompt[:, :6], state)[0].unflatten(0, (-1, 16))[:, 0].tolist() == [3, 4, 5, 1]
+    assert pooled_width(state) == 4 * 16
+
+
+def test_history_is_the_newest_actions_and_says_what_is_missing() -> None:
+    past = ActionHistory(4)
+    assert [x.tolist() for x in padded(past.values(), 2, 4)] == [[[0.0] * 4] * 2, [0.0, 0.0]]
+    past.append(np.full(4, 0.25))
+    assert [x.tolist() for x in padded(past.values(), 2, 4)] == [[[0.0] * 4, [0.25] * 4], [0.0, 1.0]]
+    for value in (0.5, 0.75):
+        past.append(np.full(4, value))
+    assert [x.tolist() for x in padded(past.values(), 2, 4)] == [[[0.5] * 4, [0.75] * 4], [1.0, 1.0]]
+    assert padded(past.values(), 0, 4)[0].shape == (0, 4)
+
+
+def test_a_proposal_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -> None:
+    early = drafter()
+    prompt, history = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1)), np.full((5, 4), 0.5)
+    drafted = early.propose(prompt, history)
+    logits = early(prompt, torch.full((1, 2, 4), 0.5), torch.ones(1, 2))
+    assert logits.shape == (1, 8, 255)
+    assert drafted == logits[0].argmax(-1).tolist()
+    assert early.propose(prompt, history, 3) == drafted[:3]
+    assert early.propose(prompt, history, radius=9) == choose(logits, 9, 4)[0].tolist()
+    assert early.propose(prompt, -history) != drafted
+    zeros = torch.zeros(1, 2, 4)
+    unknown, zero = (early(prompt, zeros, known) for known in (torch.zeros(1, 2), torch.ones(1, 2)))
+    assert not torch.allclose(unknown, zero)
+    assert early.propose(prompt, np.zeros((0, 4))) == unknown[0].argmax(-1).tolist()
+    for token in range(10):
+        moved = prompt.clone()
+        moved[:, token] += 3.0
+        assert early.propose(moved, history) != drafted
+
+
+def test_features_are_standardised_and_constants_survive() -> None:
+    early = drafter(dataclasses.replace(SMALL, history=0))
+    features = torch.randn(50, pooled_width(SHAPE), generator=torch.Generator().manual_seed(0)) * 30 + 7
+    features[:, 3] = 1.25
+    early.standardise(features)
+    plain = drafter(dataclasses.replace(SMALL, history=0))
+    empty = torch.zeros(50, 0, 4), torch.zeros(50, 0)
+    expected = (features - features.mean(0)) / features.std(0).clamp_min(1e-3)
+    assert torch.allclose(early.draft(features, *empty), plain.draft(expected, *empty), atol=1e-3)
+
+
+@pytest.mark.parametrize("wrong", [{"width": 0}, {"rank": 0}, {"layers": -1}, {"history": -1}])
+def test_impossible_shapes_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match="drafter:"):
+        EarlyDrafter(dataclasses.replace(SMALL, **wrong), SHAPE)
+
+
+def test_accepted_tokens_count_the_prefix_and_keep_the_gripper_strict() -> None:
+    teacher = torch.tensor([[100, 100, 100, 100, 100, 100, 100, 100]])
+
+    def accepted(r: int, **moved: int) -> int:
+        draft = teacher.clone()
+        for position, by in moved.items():
+            draft[0, int(position[1:])] += by
+        return int(accepted_tokens(draft, teacher, r, 4)[0])
+
+    assert accepted(0) == accepted(9) == 8
+    assert accepted(9, _2=9) == accepted(9, _2=-9, _6=9) == 8
+    assert accepted(9, _2=10) == accepted(0, _2=-1) == 2
+    assert accepted(9, _3=1) == 3
+    assert accepted(9, _1=3, _7=-1) == 7
+    assert accepted(2, _1=3, _7=-1) == 1
+
+
+def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted() -> None:
+    """Against brute force: among all 255 bins, the chosen one's probability within the radius is the greatest (up to
+    the small weight of closeness)."""
+    generator = torch.Generator().manual_seed(3)
+    logits = torch.randn(2, 8, 255, generator=generator) * 2
+    logits[0, 0, 17], logits[0, 0, 100:104] = 9.0, 8.5  # one likely bin against four neighbours
+    assert choose(logits, 0, 4)[0, 0] == 17
+    assert 100 <= choose(logits, 3, 4)[0, 0] <= 103
+    probability = logits.softmax(-1)
+    for radius in (1, 4, 9):
+        tokens = choose(logits, radius, 4)
+        assert torch.equal(tokens[:, 3::4], logits.argmax(-1)[:, 3::4])
+        for b in range(2):
+            for j in (0, 1, 2, 4, 5, 6):
+                sums = [probability[b, j, max(0, t - radius) : t + radius + 1].sum() for t in range(255)]
+                assert sums[int(tokens[b, j])] > max(sums) - 0.15 * max(sums) - 1e-6
+    assert choose(torch.eye(255)[None, [254] * 4] * 30, 9, 4).tolist() == [[254] * 4]  # not nine bins inside
+
+
+def test_plain_and_perturbed_episodes_count_alike() -> None:
+    """Three perturbed samples that fail at once and one plain sample that is drafted whole: half, not a quarter."""
+    tokens = torch.full((4, 8), 50)
+    perturbed = torch.tensor([True, True, True, False])
+    samples = EarlySamples(
+        torch.zeros(4, 1), torch.zeros(4, 0, 4), torch.zeros(4, 0), tokens, torch.arange(4), perturbed
+    )
+    drafts = tokens.clone()
+    drafts[:3, 0] += 20
+    logits = 20.0 * torch.nn.functional.one_hot(drafts, 255)
+    metrics = measure(logits, samples, 4)
+    assert metrics["accepted_r9"] == metrics["accepted_strict"] == 4.0
+    assert metrics["whole_r9"] == 0.5
+    only = measure(logits[:3], samples.where(perturbed), 4)
+    assert only["accepted_r9"] == 0.0
+
+
+def test_the_network_learns_what_the_teacher_says() -> None:
+    """Tokens that are a function of features and history are learned, and the score shows it."""
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(256, pooled_width(SHAPE), generator=generator).sign()
+    history = torch.randn(256, 2, 4, generator=generator).sign()
+    tokens = torch.where(history[:, 1, 0] > 0, 200, 40)[:, None].repeat(1, 8)
+    tokens[:, 1] = torch.where(features[:, 0] > 0, 90, 170)
+    samples = EarlySamples(features, history, torch.ones(256, 2), tokens, torch.arange(256), torch.arange(256) % 2 == 0)
+    torch.manual_seed(0)
+    early = EarlyDrafter(SMALL, SHAPE)
+    run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
+    before = run.validate(early)["score"]
+    optimiser = torch.optim.AdamW(early.parameters(), lr=2e-3)
+    for step in range(120):
+        optimiser.zero_grad()
+        run.loss(torch.randint(256, (64,), generator=generator), step)[0].backward()
+        optimiser.step()
+    assert before < 2
+    assert run.validate(early)["score"] > 11  # of 8 strict + 8 relaxed
+
+
+# what it is trained on
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
+    """The nano policies' results folder with a few real demonstrations."""
+    import shutil
+
+    folder = tmp_path_factory.mktemp("early")
+    shutil.copytree(policies, folder, dirs_exist_ok=True)
+    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraConfig(), frame_stride=8, workers=1)
+    record(config, folder / "artifacts/demos/few")
+    return folder
+
+
+def episode(steps: int) -> DemoEpisode:
+    executed = np.linspace(-0.9, 0.9, 4 * steps).reshape(steps, 4).astype(np.float32)
+    states = np.random.default_rng(0).normal(size=(steps, 39)).astype(np.float32)
+    nothing = np.zeros((1, 8, 8, 3), np.uint8), np.zeros(1, np.int64)
+    return DemoEpisode("reach-v3", 0, True, steps, *nothing, states, executed, executed, np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def nano(policies: Path) -> Target:
+    return load_target(policies / "artifacts/target/nano-state")[0]
+
+
+def test_observations_come_with_what_was_executed_before_them(nano: Target) -> None:
+    demo = episode(10)
+    some = observations(nano, demo, 3, 1.0, 2)
+    assert len(some) == 10
+    assert some.known[:3].tolist() == [[0, 0], [0, 1], [1, 1]]
+    normal = nano.actions.normalise(demo.executed)
+    for t in range(2, 10):
+        assert np.allclose(some.history[t], normal[t - 2 : t])
+    assert np.allclose(some.history[1, 1], normal[0])
+    assert torch.equal(some.inputs.states, torch.from_numpy(demo.states))
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.5, 5), (0.1, 1), (0.34, 4), (1.0, 10)])
+def test_a_share_of_the_observations_is_spread_evenly(nano: Target, share: float, count: int) -> None:
+    demo = episode(10)
+    some = observations(nano, demo, 0, share, 0)
+    where = [int(np.flatnonzero((demo.states == s).all(1))[0]) for s in some.inputs.states.numpy()]
+    assert len(where) == count
+    assert where[0] == 0
+    assert np.ptp(np.diff([*where, 10])) <= 1
+
+
+@pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
+def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
+    """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
+    from kerv_cli.decoding.decoder import Decoder
+    from kerv_cli.settings import MethodSettings
+
+    target = load_target(results / "artifacts/target" / name)[0]
+    dataset = DemoDataset.open(results / "artifacts/demos/few")
+    taught = teach_early(target, dataset, SMALL)
+    samples = load_samples(dataset, target.settings, target.words, ("drawer-close-v3",))
+    assert torch.equal(taught.episodes, samples.episodes)
+    assert [bool(x) for x in taught.perturbed] == [dataset.episodes[e].perturbed for e in taught.episodes]
+    decoder = Decoder(target, MethodSettings())
+    for i in range(0, len(samples), 7):
+        prompt, _ = target.encode(samples.inputs(torch.tensor([i]), target.device))
+        assert taught.tokens[i].tolist() == decoder.decode_prompt(prompt).tokens
+        assert torch.allclose(taught.features[i].float(), pool(prompt, target.settings)[0], atol=1e-2)
+    held = taught.split(0.34)[1]
+    assert torch.equal(held.episodes, split(samples, 0.34)[1].episodes)
+    few = teach_early(target, dataset, dataclasses.replace(SMALL, samples=12))
+    assert 12 <= len(few) <= 18
+
+
+def test_held_out_shares_that_leave_nothing_are_refused() -> None:
+    zeros = torch.zeros(4, dtype=torch.long)
+    one = EarlySamples(torch.zeros(4, 1), torch.zeros(4, 0, 4), torch.zeros(4, 0), zeros[:, None], zeros, zeros.bool())
+    with pytest.raises(CheckpointError, match="at least two"):
+        one.split(0.1)
+    with pytest.raises(UsageError, match="held_out"):
+        dataclasses.replace(one, episodes=torch.arange(4)).split(0.7)
+
+
+def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results: Path) -> None:
+    words = ["train", "drafter", "drafter=early", "demos=few", "policy.target=nano-vision", "policy.early=whole"]
+    words += ["drafter.width=32", "drafter.rank=8", "train.batch=8", "train.steps=4", "train.held_out=0.34"]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *words, f"results={results}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert "accepted_r9" in done.stdout
+    target, description = load_target(results / "artifacts/target/nano-vision")
+    early, own = load_early(results / "artifacts/early/whole", target, description)
+    assert own["target"] == description["sha256"]
+    assert own["chunk"] == target.settings.chunk
+    assert own["provenance"]["settings"]["drafter"]["width"] == early.settings.width == 32
+    assert early.scale.min() > 0
+    assert not torch.equal(early.scale, torch.ones_like(early.scale))
+    prompt = torch.randn(1, target.prompt_length, target.settings.width)
+    drafted = early.propose(prompt, np.zeros((0, 4)))
+    assert len(drafted) == target.tokens_per_chunk
+    assert all(0 <= token < 255 for token in drafted)
+    other = load_target(results / "artifacts/target/nano-state")[1]
+    with pytest.raises(CheckpointError, match="was trained for target"):
+        read_early(results / "artifacts/early/whole", other)
+    longer = {**description, "settings": {**description["settings"], "chunk": 8}}
+    with pytest.raises(CheckpointError, match="chunks of 4"):
+        read_early(results / "artifacts/early/whole", longer)
+
+
+def test_an_interrupted_run_ends_where_the_uninterrupted_one_does(results: Path) -> None:
+    def run(name: str) -> EarlyRun:
+        overrides = ["drafter=early", "policy.target=nano-state", f"policy.early={name}", "demos=few"]
+        overrides += ["drafter.width=32", "drafter.rank=8", "drafter.samples=60", "train.batch=8", "train.steps=9"]
+        overrides += ["train.validate_every=3", "train.held_out=0.34", f"results={results}"]
+        made = drafter_run(compose("train_drafter", overrides, TrainDrafterSettings))
+        assert isinstance(made, EarlyRun)
+        made.load(lambda done, total: None)
+        return made
+
+    def interrupt(step: int, metrics: object) -> None:
+        if step == 7:
+            raise KeyboardInterrupt
+
+    run("a").train(lambda step, metrics: None)
+    with pytest.raises(KeyboardInterrupt):
+        run("b").train(interrupt)
+    run("b").train(lambda step, metrics: None)
+    a, b = (load_file(results / f"artifacts/early/{name}/model.safetensors") for name in "ab")
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    logs = [(results / f"artifacts/early/{name}/log.csv").read_text() for name in "ab"]
+    assert logs[0] == logs[1]
+
+
+def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_path: Path, policies: Path) -> None:
+    target, description = load_target(policies / "artifacts/target/nano-state")
+    early = drafter(SMALL, target.settings)
+    early.standardise(torch.randn(20, pooled_width(target.settings)))
+    with pytest.raises(CheckpointError, match="kerv train drafter drafter=early"):
+        load_early(tmp_path, target, description)
+    save_early(tmp_path, early, description["sha256"], {})
+    loaded, _ = load_early(tmp_path, target, description)
+    prompt = torch.randn(1, target.prompt_length, target.settings.width)
+    assert loaded.propose(prompt, np.zeros((1, 4))) == early.propose(prompt, np.zeros((1, 4)))
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    with pytest.raises(CheckpointError, match="does not match"):
+        load_early(tmp_path, target, description)
+
+
+def test_the_folder_is_beside_the_target(policies: Path) -> None:
+    assert early_folder("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
+    assert early_folder("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
+    assert early_folder("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")
+
+
+def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line() -> None:
+    early = compose("train_drafter", ["drafter=early"], TrainDrafterSettings)
+    eagle = compose("train_drafter", [], TrainDrafterSettings)
+    assert (early.drafter.kind, eagle.drafter.kind) == ("early", "eagle")
+    assert early.train.batch == 256
+    assert eagle.train.batch == 64
+    assert compose("train_drafter", ["drafter=early", "train.batch=9"], TrainDrafterSettings).train.batch == 9
+    with pytest.raises(UnknownName, match=r"drafter\.kind"):
+        drafter_run(compose("train_drafter", ["drafter.kind=late"], TrainDrafterSettings))
