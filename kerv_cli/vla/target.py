@@ -18,6 +18,8 @@ from torch import Tensor, nn
 
 from kerv_cli.settings import TargetSettings
 from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
+from kerv_cli.vla.encode_plan import EncodePlan
+from kerv_cli.vla.inference import Planned
 from kerv_cli.vla.text import WordTokenizer
 from kerv_cli.vla.trunk import Cache, Trunk
 from kerv_cli.vla.vision import VisionEncoder
@@ -58,7 +60,7 @@ def privileged_features(states: Tensor) -> Tensor:
     return torch.cat([states[:, 7:18], velocity.clamp(-3, 3), *vectors], -1)
 
 
-class Target(nn.Module):
+class Target(Planned):
     """The policy put together. Parameters in float32; `VOCABULARY` action tokens; greedy verdicts are the argmax."""
 
     centre: Tensor
@@ -121,8 +123,14 @@ class Target(nn.Module):
         """(1, L) int64."""
         return torch.tensor([self.words.encode(instruction, self.settings.instruction_tokens)], device=self.device)
 
+    def make_plan(self) -> None:
+        if self.needs_frame:
+            self.plan = EncodePlan(self)
+
     def encode(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Prompt embeddings (B, P, E) and the object and goal positions (B, 6) in metres they are built on."""
+        if self.plan is not None and len(inputs.states) == 1:
+            return self.plan(inputs)
         words = self.word_embedding(inputs.words)
         hand = torch.cat([(inputs.states[:, :3] - self.centre) / 0.1, inputs.states[:, 3:4]], -1)
         parts = []
@@ -141,8 +149,7 @@ class Target(nn.Module):
     def see(self, inputs: Inputs, words: Tensor, hand: Tensor) -> tuple[Tensor, Tensor]:
         """Vision tokens (B, grid², E) and estimated object and goal positions (B, 6), metres."""
         assert inputs.images is not None
-        images = inputs.images.to(self.head.weight.dtype) / 255.0 - 0.5
-        tokens, points = self.vision(images)
+        tokens, points = self.vision(inputs.images)
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)

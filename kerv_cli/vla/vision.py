@@ -11,6 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.vla.inference import Planned, has_blocked_layouts
+from kerv_cli.vla.vision_plan import VisionPlan
+
 
 class Residual(nn.Module):
     def __init__(self, channels: int) -> None:
@@ -23,8 +26,8 @@ class Residual(nn.Module):
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
-class VisionEncoder(nn.Module):
-    """(B, 3, size, size) in [0, 1] -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
+class VisionEncoder(Planned):
+    """(B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
 
     columns: Tensor
 
@@ -44,7 +47,14 @@ class VisionEncoder(nn.Module):
         self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
+    def make_plan(self) -> None:
+        if has_blocked_layouts():
+            self.plan = VisionPlan(self)
+
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        if self.plan is not None and len(images) == 1:
+            return self.plan(images)
+        images = images.to(self.patch.weight.dtype) / 255.0 - 0.5
         fine = self.fine(images)
         middle = self.middle(fine)
         coarse = self.coarse(middle)

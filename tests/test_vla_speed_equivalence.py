@@ -1,0 +1,224 @@
+"""The plans of a frozen CPU policy compute what its plain modules do; training and other devices never meet them."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kerv_cli.drafting.drafter import Drafter
+from kerv_cli.drafting.tree import ROOT, TokenTree, prefill_mask, verify_mask
+from kerv_cli.settings import DrafterSettings, TargetSettings
+from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
+from kerv_cli.vla.inference import FastLinear, has_blocked_layouts
+from kerv_cli.vla.target import Inputs, Target
+from kerv_cli.vla.text import WordTokenizer
+from kerv_cli.vla.trunk import Trunk, lay_out_for_inference
+
+
+def shaken(module: torch.nn.Module, seed: int) -> torch.nn.Module:
+    """Gains, biases and temperatures away from their initial ones and zeros, so that forgetting one shows."""
+    generator = torch.Generator().manual_seed(seed)
+    for name, parameter in module.named_parameters():
+        if parameter.dim() == 1:
+            noise = torch.rand(parameter.shape, generator=generator)
+            parameter.data += 0.5 * noise if "norm" in name or "temperature" in name else 0.2 * (noise - 0.5)
+    return module.eval().requires_grad_(False)
+
+
+def both_trunks(seed: int, layers: int, heads: int, channels: int) -> tuple[Trunk, Trunk]:
+    torch.manual_seed(seed)
+    plain = Trunk(heads * channels, layers, heads, 48)
+    for parameter in plain.parameters():
+        if parameter.dim() == 2:
+            torch.nn.init.normal_(parameter, std=0.1)
+    shaken(plain, seed)
+    planned = copy.deepcopy(plain)
+    lay_out_for_inference(planned)
+    assert all(layer.plan is not None for layer in planned.layers)
+    return plain, planned
+
+
+def both_targets(observation: str, seed: int, **changes: int) -> tuple[Target, Target]:
+    torch.manual_seed(seed)
+    small = {"image_size": 48, "grid": 2, "keypoints": 5, "channels": 16, "scene_tokens": 3, **changes}
+    shape = TargetSettings(observation=observation, width=32, layers=2, heads=2, feed_forward=48, **small)
+    words = WordTokenizer.build(["open the drawer"])
+    plain = Target(shape, ActionTokenizer(-np.ones(4), np.ones(4)), words)
+    shaken(plain, seed)
+    planned = copy.deepcopy(plain)
+    lay_out_for_inference(planned)
+    return plain, planned
+
+
+def random_tree(random: np.random.Generator, nodes: int) -> TokenTree:
+    parents = [int(random.integers(ROOT, i)) for i in range(nodes)]
+    return TokenTree.build(random.integers(0, VOCABULARY, nodes).tolist(), parents)
+
+
+def close(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return a.shape == b.shape and torch.allclose(a, b, atol=1e-5, rtol=1e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    layers=st.integers(1, 2),
+    heads=st.integers(1, 3),
+    channels=st.sampled_from([2, 8, 32]),
+    prompt=st.integers(1, 40),
+    nodes=st.integers(0, 40),
+)
+def test_the_planned_trunk_is_the_trunk(
+    seed: int, layers: int, heads: int, channels: int, prompt: int, nodes: int
+) -> None:
+    """A prefill, a tree behind it, its commit, single tokens behind that; and the tree inside the prefill."""
+    plain, planned = both_trunks(seed, layers, heads, channels)
+    random = np.random.default_rng(seed)
+    tree = random_tree(random, nodes)
+    x = torch.randn(1, prompt + nodes + 3, heads * channels)
+    outputs = []
+    with torch.inference_mode():
+        for trunk in (plain, planned):
+            cache = trunk.new_cache(1, prompt + nodes + 3)
+            seen = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
+            drafted = x[:, prompt : prompt + 1 + nodes]
+            positions = torch.tensor([prompt, *(prompt + 1 + d for d in tree.depths)])
+            seen.append(trunk(drafted, positions, cache, verify_mask(tree, prompt, x)))
+            path = tree.path_to(nodes - 1) if nodes else []
+            cache.keep(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
+            for i in range(2):
+                at = prompt + 1 + len(path) + i
+                seen.append(trunk(x[:, -1 - i][:, None], torch.tensor([at]), cache))
+            whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
+            cache.length = 0
+            seen.append(trunk(x[:, : prompt + nodes], whole, cache, prefill_mask(tree, prompt, x)))
+            seen.append(trunk(x[:, :prompt], torch.arange(prompt)))
+            outputs.append(seen)
+    assert all(close(a, b) for a, b in zip(*outputs, strict=True))
+
+
+@pytest.mark.parametrize("tokens", [1, 5, 30])
+def test_the_planned_trunk_takes_batches(tokens: int) -> None:
+    plain, planned = both_trunks(7, 2, 2, 16)
+    x = torch.randn(3, tokens + 1, 32)
+    outputs = []
+    with torch.inference_mode():
+        for trunk in (plain, planned):
+            cache = trunk.new_cache(3, tokens + 1)
+            first = trunk(x[:, :tokens], torch.arange(tokens), cache)
+            outputs.append(torch.cat([first, trunk(x[:, tokens:], torch.tensor([tokens]), cache)], 1))
+    assert close(*outputs)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 64])
+def test_both_layouts_of_a_weight_give_its_product(rows: int) -> None:
+    weight, x, other = torch.randn(300, 100), torch.randn(rows, 100), torch.randn(rows, 300)
+    fast = FastLinear(weight)
+    assert fast.rows == 20  # one row and three take the plain product, 64 the blocked one
+    with torch.inference_mode():
+        assert torch.allclose(fast(x), x @ weight.t(), atol=1e-4)
+        assert torch.allclose(fast.added_to(other, x), other + x @ weight.t(), atol=1e-4)
+        assert torch.allclose(fast.of_vector(x[0], 0.5), 0.5 * (weight @ x[0]), atol=1e-4)
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    grid=st.sampled_from([1, 2, 3]),
+    keypoints=st.integers(1, 9),
+    channels=st.sampled_from([8, 24]),
+)
+def test_the_planned_prompt_is_the_prompt(seed: int, grid: int, keypoints: int, channels: int) -> None:
+    plain, planned = both_targets("vision", seed, grid=grid, keypoints=keypoints, channels=channels)
+    assert (planned.vision.plan is not None) == has_blocked_layouts()
+    random = np.random.default_rng(seed)
+    frame = random.integers(0, 256, (48, 48, 3), dtype=np.uint8)
+    state = random.normal(0, 0.2, 39)
+    with torch.inference_mode():
+        a, b = (t.encode(t.inputs(frame, state, t.words_of("open the drawer"))) for t in (plain, planned))
+    assert close(a[0], b[0])
+    assert close(a[1], b[1])
+
+
+def test_a_sharp_temperature_does_not_overflow() -> None:
+    plain, planned = both_targets("vision", 3)
+    for target in (plain, planned):
+        target.vision.temperature.data.fill_(1e4)
+    lay_out_for_inference(planned)
+    images = torch.randint(0, 256, (1, 3, 48, 48), dtype=torch.uint8)
+    with torch.inference_mode():
+        points = planned.vision(images)[1]
+        assert torch.isfinite(points).all()
+        assert torch.allclose(points, plain.vision(images)[1], atol=1e-2)
+
+
+@pytest.mark.parametrize("observation", ["vision", "state"])
+def test_batches_and_teacher_forcing_agree(observation: str) -> None:
+    plain, planned = both_targets(observation, 5)
+    images = torch.randint(0, 256, (3, 3, 48, 48), dtype=torch.uint8) if observation == "vision" else None
+    inputs = Inputs(images, torch.randn(3, 39) * 0.1, torch.ones(3, plain.settings.instruction_tokens).long())
+    tokens = torch.randint(0, VOCABULARY, (3, plain.tokens_per_chunk))
+    with torch.inference_mode():
+        assert close(plain(inputs, tokens)[0], planned(inputs, tokens)[0])
+
+
+def test_the_drafter_has_a_plan_too() -> None:
+    target, _ = both_targets("state", 1)
+    plain = shaken(Drafter.beside(DrafterSettings(), target), 1)
+    planned = copy.deepcopy(plain)
+    lay_out_for_inference(planned)
+    assert planned.layers[0].plan is not None
+    following, hidden = torch.randn(1, 9, 32), torch.randn(1, 9, 32)
+    with torch.inference_mode():
+        outputs = []
+        for drafter in (plain, planned):
+            cache = drafter.new_cache(9)
+            first = drafter(following[:, :8], hidden[:, :8], torch.arange(8), cache)
+            outputs.append(torch.cat([first, drafter(following[:, 8:], hidden[:, 8:], torch.tensor([8]), cache)], 1))
+    assert close(*outputs)
+
+
+def test_the_callers_tensor_is_left_alone() -> None:
+    _, planned = both_trunks(2, 2, 2, 8)
+    with torch.inference_mode():
+        for tokens in (1, 30):
+            x = torch.randn(1, tokens, 16)
+            before = x.clone()
+            planned(x, torch.arange(tokens), planned.new_cache(1, tokens))
+            assert torch.equal(x, before)
+
+
+def test_a_plan_never_outlives_its_weights() -> None:
+    for change in (
+        lambda m: m.load_state_dict(m.state_dict()),
+        lambda m: m.to(torch.float64),
+        lambda m: m.train(),
+    ):
+        _, planned = both_targets("vision", 4)
+        change(planned)
+        assert all(getattr(part, "plan", None) is None for part in planned.modules())
+    plain, planned = both_targets("vision", 4)
+    for twin in (copy.deepcopy(planned), pickle.loads(pickle.dumps(planned.trunk))):
+        assert all(getattr(part, "plan", None) is None for part in twin.modules())
+    assert planned.state_dict().keys() == plain.state_dict().keys()
+
+
+def test_what_trains_gets_no_plan_and_its_gradients() -> None:
+    _, frozen = both_trunks(6, 1, 2, 8)
+    learning = copy.deepcopy(frozen).requires_grad_(True)
+    lay_out_for_inference(learning)
+    assert learning.layers[0].plan is None
+    learning(torch.randn(1, 4, 16), torch.arange(4)).sum().backward()
+    assert learning.layers[0].qkv.weight.grad is not None
+    x = torch.randn(1, 4, 16, requires_grad=True)
+    frozen(x, torch.arange(4)).sum().backward()
+    twin = x.detach().clone().requires_grad_(True)
+    copy.deepcopy(frozen)(twin, torch.arange(4)).sum().backward()
+    assert x.grad is not None
+    assert close(x.grad, twin.grad)
