@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
+from heapq import heappop, heappush
+from importlib.util import find_spec
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +22,20 @@ from typer.testing import CliRunner
 
 from kerv_cli.commands import build as command
 from kerv_cli.drafting import datastore_build
-from kerv_cli.drafting.datastore import Datastore, check_seeds, neighbour_tree, prompt_key, segments_of
+from kerv_cli.drafting.datastore import (
+    Datastore,
+    check_seeds,
+    neighbour_tree,
+    open_datastore,
+    prompt_key,
+    segments_of,
+)
 from kerv_cli.drafting.datastore_build import DatastoreBuild, leave_one_out
 from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
-from kerv_cli.drafting.tree import TokenTree, merge
+from kerv_cli.drafting.tree import ROOT, TokenTree, merge
 from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
+from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, DatastoreSettings, PolicySettings
 from kerv_cli.sim.demo_dataset import dataset_hash, episode_path
 from kerv_cli.sim.demo_file import FORMAT, DemoEpisode, save_episode
 from kerv_cli.vla.checkpoint import load_target
@@ -138,6 +148,49 @@ def test_the_search_is_exact_at_real_size_and_duplicates_keep_their_order() -> N
             exact = (vectors.astype(np.float64) @ key.astype(np.float64)).astype(np.float32)
             assert found.steps.tolist() == np.argsort(-exact, kind="stable")[:5].tolist()
             assert found.similarity == pytest.approx(exact[found.steps], abs=1e-6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 9), st.sampled_from([0.0, 1e-7, 1e-3, 0.1]))
+def test_the_search_is_exact_where_an_outline_says_most(seed: int, rank: int, k: int, noise: float) -> None:
+    """Keys near a subspace, as an encoder's are; with noise rows differ in the rest, too."""
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(500, rank)) @ rng.normal(size=(rank, 64)) + noise * rng.normal(size=(500, 64))
+    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    vectors[400:] = vectors[300:400]
+    seeds = rng.integers(0, 4, 500)
+    store = store_of(vectors, {"a": slice(0, 500)}, seeds)
+    for key in (vectors[450], (vectors[3] + 0.1 * rng.normal(size=64)).astype(np.float32)):
+        exact = (vectors.astype(np.float64) @ key.astype(np.float64)).astype(np.float32)
+        for without in (None, 2):
+            ranked = [row for row in np.argsort(-exact, kind="stable") if without is None or seeds[row] != without]
+            assert store.query(key, "a", k, without).steps.tolist() == ranked[:k]
+
+
+def test_few_rows_are_read_whole() -> None:
+    rng = np.random.default_rng(0)
+    vectors = rng.normal(size=(9000, 12)) @ rng.normal(size=(12, 128)) + 0.05 * rng.normal(size=(9000, 128))
+    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    index = store_of(vectors, {"a": slice(0, 9000)}).index
+    assert index is not None
+    assert max(len(index.candidates(vectors[row], "a", 5, None)) for row in range(0, 9000, 500)) < 30
+
+
+@pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
+def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
+    store, _, description = opened(results, name)
+    backends = [DatastoreSettings()]
+    if find_spec("qdrant_edge") is not None:
+        backends.append(DatastoreSettings("qdrant"))
+    for chosen in backends:
+        other = open_datastore(folder_of(results, name), description, chosen)
+        assert other.manifest == store.manifest
+        for task, shard in store.shards.items():
+            for row in range(shard.start, shard.stop):
+                asked_for = (store.vectors[row], task, 3, int(store.seeds[row]) if row % 2 else None)
+                expected, found = store.query(*asked_for), other.query(*asked_for)
+                for field in ("similarity", "chunks", "seeds", "steps", "left"):
+                    assert np.array_equal(getattr(found, field), getattr(expected, field))
 
 
 def test_a_task_that_is_not_there_gets_one_line(results: Path) -> None:
@@ -469,3 +522,83 @@ def test_the_nearest_neighbours_chunk_comes_first() -> None:
     assert {tuple(chunks[0, 1:]), tuple(chunks[1, 1:])} <= set(more)
     assert len(neighbour_tree(chunks, 16, kinematic_groups(4))) == 0
     assert len(neighbour_tree(chunks[:0], 0, kinematic_groups(4))) == 0
+
+
+def plain_tree(
+    chunks: np.ndarray, start: int, groups: Groups, nodes: int, depth: int | None, cross: float
+) -> tuple[list[int], list[int]]:
+    """The tree of METHODS §4.2 without a thought for speed -> tokens, parents."""
+    stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
+    cuts = list(segments(start, stop, groups))
+    rows, order = chunks.tolist(), count()
+    tokens: list[int] = []
+    parents: list[int] = []
+    children: dict[tuple[int, int], int] = {}
+    waiting: list[Any] = []
+
+    def weight(neighbours: Any) -> float:
+        return sum(1 / (1 + i) for i in neighbours)
+
+    def offer(parent: int, level: int, gave: Any, followed: Any, cost: float) -> None:
+        if level == len(cuts):
+            return
+        first, last, gripper = cuts[level]
+        pool = gave if gripper else range(len(rows))
+        givers: dict[tuple[int, ...], list[int]] = {}
+        for i in pool:
+            givers.setdefault(tuple(rows[i][first:last]), []).append(i)
+        for group, owners in givers.items():
+            staying = [i for i in owners if i in followed]
+            probability = (1 - cross) * weight(staying) / weight(followed) + cross * weight(owners) / weight(pool)
+            if probability > 0:
+                entry = (cost - math.log(probability), next(order), parent, level, group, owners, staying or owners)
+                heappush(waiting, entry)
+
+    offer(ROOT, 0, range(len(rows)), range(len(rows)), 0.0)
+    while waiting and len(tokens) < nodes:
+        cost, _, node, level, group, gave, followed = heappop(waiting)
+        at, new = node, 0
+        for token in group:
+            at = children.get((at, token), -2)  # behind a new node everything is new
+            new += at == -2
+        if len(tokens) + new > nodes:
+            continue
+        for token in group:
+            if (node, token) not in children:
+                children[node, token] = len(tokens)
+                tokens.append(token)
+                parents.append(node)
+            node = children[node, token]
+        offer(node, level + 1, gave, followed, cost)
+    return tokens, parents
+
+
+@settings(deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([4, 7]),
+    st.integers(1, 9),
+    st.sampled_from([1, 2, 3, 255]),
+    st.integers(0, 9),
+    st.integers(0, 60),
+    st.sampled_from([None, 1, 3, 6]),
+    st.sampled_from([0.0, 0.1, 0.5, 1.0]),
+)
+def test_the_tree_is_node_for_node_that_of_the_plain_algorithm(
+    seed: int, dofs: int, k: int, span: int, start: int, nodes: int, depth: int | None, cross: float
+) -> None:
+    chunks = np.random.default_rng(seed).integers(0, span, (k, 3 * dofs))
+    groups = kinematic_groups(dofs)
+    tree = neighbour_tree(chunks, start, groups, nodes, depth, cross)
+    tokens, parents = plain_tree(chunks, start, groups, nodes, depth, cross)
+    assert (list(tree.tokens), list(tree.parents)) == (tokens, parents)
+
+
+def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
+    """The grippers 8 of neighbours 3 and 6 and 9 of neighbour 2 weigh 1/3 + 1/6 = 1/2; only the best neighbour, who
+    went another way, gave the 8 before."""
+    grippers = [8, 9, 8, 8, 8, 8]
+    chunks = np.array([[i in (1, 2, 5)] * 3 + [gripper] for i, gripper in enumerate(grippers)], dtype=np.int64)
+    tree = neighbour_tree(chunks, 0, kinematic_groups(4), cross=0.0)
+    assert [path[-1] for path in leaves(tree) if path[0] == 1] == [9, 8]
+    assert (list(tree.tokens), list(tree.parents)) == plain_tree(chunks, 0, kinematic_groups(4), 50, None, 0.0)

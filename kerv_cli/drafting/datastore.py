@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -24,17 +25,18 @@ import torch
 from torch import Tensor
 
 from kerv_cli.drafting.groups import Groups, segments
+from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.errors import CheckpointError, UnknownName
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of
-from kerv_cli.settings import EVALUATION_SEED, TargetSettings
+from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, TargetSettings
 
 FORMAT = 1
 FILES = ("vectors.npy", "payload.parquet")
 REQUIRED = ("key", "width", "rows", "chunk", "dofs", "actions", "target", "demos", "files", "tasks")
-ROUNDING = 1e-5  # bounds the rounding of a float32 product of unit vectors
 CROSS = 0.1  # probability that a path leaves the neighbours that it has followed
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
+BACKENDS = ("exact", "qdrant")
 
 
 def segments_of(settings: TargetSettings) -> dict[str, slice]:
@@ -56,8 +58,12 @@ def prompt_key(prompt: Tensor, settings: TargetSettings, segments: Sequence[str]
     for name in segments:
         if name not in known:
             raise UnknownName("part of the prompt", name, known)
-    pooled = [torch.nn.functional.normalize(prompt[:, known[name]].float().mean(1), dim=-1) for name in segments]
-    return torch.nn.functional.normalize(torch.cat(pooled, -1), dim=-1).cpu().numpy()
+    pooled = [_unit(prompt[:, known[name]].float().mean(1)) for name in segments]
+    return _unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1)).cpu().numpy()
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
@@ -101,27 +107,16 @@ class Datastore:
     left: np.ndarray
     shards: dict[str, slice]
 
+    index: Index | None = None  # who searches; None: ExactIndex
+
+    def __post_init__(self) -> None:
+        if self.index is None:
+            object.__setattr__(self, "index", ExactIndex(self.vectors, self.seeds, self.shards))
+
     @classmethod
     def open(cls, folder: Path, description: Mapping[str, Any]) -> Datastore:
-        """description: the target's, as `load_target` returns it.
-
-        Raises:
-            CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
-                statistics or another chunk length, or from evaluation seeds.
-        """
-        manifest = read_manifest(folder)
-        check_target(manifest, description, folder)
-        try:
-            vectors = np.load(folder / FILES[0])
-            payload = _read_payload(folder / FILES[1])
-            shards = {task: slice(*shard["rows"]) for task, shard in manifest["tasks"].items()}
-            rows, size = manifest["rows"], manifest["chunk"] * manifest["dofs"]
-            fits = vectors.shape == (rows, manifest["width"]) and payload["tokens"].shape == (rows, size)
-        except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
-            raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
-        if not fits:
-            raise CheckpointError(f"the datastore in {folder} is damaged: its files differ in length, build it again")
-        return cls(manifest, vectors, shards=shards, **payload)
+        """With exact search; see `open_datastore`."""
+        return cls(**_read(folder, description))
 
     def key(self, prompt: Tensor, settings: TargetSettings) -> np.ndarray:
         """prompt (1, P, E) of the target -> (d,) float32."""
@@ -137,20 +132,62 @@ class Datastore:
         """
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
-        shard = self.shards[task]
+        assert self.index is not None
         key = np.asarray(key, dtype=np.float32)
-        scores = self.vectors[shard] @ key
-        rows = np.arange(len(scores)) if without is None else np.flatnonzero(self.seeds[shard] != without)
-        if k < len(rows):
-            least = np.partition(scores[rows], len(rows) - k)[len(rows) - k]
-            rows = rows[scores[rows] >= least - ROUNDING]
-        # the product's last bit depends on a row's place in the shard: what is near is compared in float64
-        near = self.vectors[shard][rows].astype(np.float64)
-        similarity = np.einsum("ij,j->i", near, key.astype(np.float64)).astype(np.float32)
-        order = np.argsort(-similarity, kind="stable")[:k]
-        at = rows[order] + shard.start
-        chunks = self.tokens[at].astype(np.int64)
-        return Neighbours(similarity[order], chunks, self.seeds[at], self.steps[at], self.left[at])
+        at, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
+        return Neighbours(similarity, self.tokens[at].astype(np.int64), self.seeds[at], self.steps[at], self.left[at])
+
+
+def open_datastore(folder: Path, description: Mapping[str, Any], settings: DatastoreSettings) -> Datastore:
+    """A datastore, searched by the backend asked for; every backend finds the same neighbours.
+
+    description: the target's, as `load_target` returns it.
+
+    Raises:
+        CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
+            statistics or another chunk length, or from evaluation seeds.
+        UsageError: an unknown backend, one whose packages are not installed, a server that does not answer.
+    """
+    check_backend(settings)
+    parts = _read(folder, description)
+    if settings.backend == "exact":
+        return Datastore(**parts)
+    from kerv_cli.drafting.qdrant import QdrantIndex
+
+    digest = sha256_of(folder / "manifest.json")
+    index = QdrantIndex(parts["vectors"], parts["seeds"], parts["shards"], digest, settings.url)
+    return Datastore(**parts, index=index)
+
+
+def check_backend(settings: DatastoreSettings) -> None:
+    """Refuse a backend that cannot work here, before anything is loaded.
+
+    Raises:
+        UsageError: an unknown one, one whose packages are not installed, a server for a search in this process.
+    """
+    if settings.backend not in BACKENDS:
+        raise UnknownName("datastore.backend", settings.backend, BACKENDS)
+    if settings.backend == "exact" and settings.url is not None:
+        raise UsageError(f"datastore.url={settings.url}: exact search is in this process, use datastore.backend=qdrant")
+    if settings.backend == "qdrant" and find_spec("qdrant_client" if settings.url else "qdrant_edge") is None:
+        raise UsageError("datastore.backend=qdrant needs the extra: pip install 'kerv[qdrant]'")
+
+
+def _read(folder: Path, description: Mapping[str, Any]) -> dict[str, Any]:
+    """What a datastore's files hold, checked against each other and the target."""
+    manifest = read_manifest(folder)
+    check_target(manifest, description, folder)
+    try:
+        vectors = np.load(folder / FILES[0])
+        payload = _read_payload(folder / FILES[1])
+        shards = {task: slice(*shard["rows"]) for task, shard in manifest["tasks"].items()}
+        rows, size = manifest["rows"], manifest["chunk"] * manifest["dofs"]
+        fits = vectors.shape == (rows, manifest["width"]) and payload["tokens"].shape == (rows, size)
+    except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
+        raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
+    if not fits:
+        raise CheckpointError(f"the datastore in {folder} is damaged: its files differ in length, build it again")
+    return {"manifest": manifest, "vectors": vectors, "shards": shards, **payload}
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -229,22 +266,20 @@ def neighbour_tree(
     the neighbours that it has followed with probability `cross`; 0 keeps to the neighbours' own chunks.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
-    cuts = list(segments(start, stop, groups))
-    rows: list[list[int]] = chunks.tolist()
+    ways = _Ways(chunks.tolist(), list(segments(start, stop, groups)), cross)
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
+    waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
     order = count()
-    waiting: list[tuple[float, int, int, int, tuple[int, ...], Followed]] = []
 
-    def offer(parent: int, level: int, behind: Followed, cost: float) -> None:
-        if level < len(cuts):
-            for group, ahead, probability in _next_groups(rows, cuts[level], behind, cross):
-                heappush(waiting, (cost - math.log(probability), next(order), parent, level, group, ahead))
+    def offer(parent: int, level: int, gave: int, followed: int, cost: float) -> None:
+        for surprise, group, given, staying in ways.on(level, gave, followed):
+            heappush(waiting, (cost + surprise, next(order), parent, level, group, given, staying))
 
-    offer(ROOT, 0, (range(len(rows)), range(len(rows))), 0.0)
+    offer(ROOT, 0, ways.everyone, ways.everyone, 0.0)
     while waiting and len(tokens) < nodes:
-        cost, _, node, level, group, behind = heappop(waiting)
+        cost, _, node, level, group, gave, followed = heappop(waiting)
         if len(tokens) + len(group) - _shared(children, node, group) > nodes:
             continue  # a group is in the tree as a whole or not at all
         for token in group:
@@ -253,32 +288,51 @@ def neighbour_tree(
                 tokens.append(token)
                 parents.append(node)
             node = children[node, token]
-        offer(node, level + 1, behind, cost)
+        offer(node, level + 1, gave, followed, cost)
     return TokenTree.build(tokens, parents)
 
 
-Followed = tuple[Sequence[int], Sequence[int]]
-"""Behind a path: the neighbours that gave its last group, and those of them that gave the groups before it, too."""
+class _Weights(dict[int, float]):
+    """Of a set of neighbours, bit i for the i-th: the sum of their weights 1 / i, counted from 1."""
+
+    def __missing__(self, members: int) -> float:
+        weight = sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
+        self[members] = weight
+        return weight
 
 
-def _next_groups(
-    rows: list[list[int]], cut: tuple[int, int, bool], behind: Followed, cross: float
-) -> Iterator[tuple[tuple[int, ...], Followed, float]]:
-    """The groups that a path may go on with: tokens, what then lies behind it, probability."""
-    (first, last, gripper), (gave, followed) = cut, behind
-    pool = gave if gripper else range(len(rows))
-    givers: dict[tuple[int, ...], list[int]] = {}
-    for i in pool:
-        givers.setdefault(tuple(rows[i][first:last]), []).append(i)
-    for group, given in givers.items():
-        staying = [i for i in given if i in followed]
-        probability = (1 - cross) * _weight(staying) / _weight(followed) + cross * _weight(given) / _weight(pool)
-        if probability > 0:
-            yield group, (given, staying or given), probability
+class _Ways:
+    """The groups that a path may go on with. Behind a path lie two sets of neighbours: those that gave its last group,
+    and those of them that gave the groups before it, too."""
 
+    def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
+        self.everyone = (1 << len(rows)) - 1
+        self.cross, self.weights = cross, _Weights()
+        self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
+        for first, last, gripper in cuts:
+            givers: dict[tuple[int, ...], int] = {}
+            for i, row in enumerate(rows):
+                group = tuple(row[first:last])
+                givers[group] = givers.get(group, 0) | 1 << i
+            self.levels.append((gripper, list(givers.items())))
 
-def _weight(neighbours: Sequence[int]) -> float:
-    return sum(1 / (1 + i) for i in neighbours)
+    def on(self, level: int, gave: int, followed: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
+        """Minus the logarithm of its probability, tokens, and the two sets behind the path then. Best giver first."""
+        if level == len(self.levels):
+            return
+        gripper, givers = self.levels[level]
+        pool = self.everyone
+        if gripper:
+            pool = gave
+            givers = [(group, given & gave) for group, given in givers if given & gave]
+            givers.sort(key=lambda way: way[1] & -way[1])
+        weights, cross = self.weights, self.cross
+        of_followed, of_pool = weights[followed], weights[pool]
+        for group, given in givers:
+            staying = given & followed
+            probability = (1 - cross) * weights[staying] / of_followed + cross * weights[given] / of_pool
+            if probability > 0:
+                yield -math.log(probability), group, given, staying or given
 
 
 def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
