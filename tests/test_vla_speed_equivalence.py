@@ -199,6 +199,7 @@ def test_a_plan_never_outlives_its_weights() -> None:
         lambda m: m.load_state_dict(m.state_dict()),
         lambda m: m.to(torch.float64),
         lambda m: m.train(),
+        lambda m: m.requires_grad_(True),
     ):
         _, planned = both_targets("vision", 4)
         change(planned)

@@ -36,7 +36,8 @@ class Plan:
 
 
 class Planned(nn.Module):
-    """A module that may have a plan. Whatever could change its weights drops it."""
+    """A module that may have a plan. Moving it, loading weights, unfreezing or training it drops the plan; weights written
+    past these (`parameter.data`) need another `lay_out_for_inference`."""
 
     plan: Any = None
 
@@ -55,6 +56,12 @@ class Planned(nn.Module):
         if mode:
             self.plan = None
         return super().train(mode)
+
+    def requires_grad_(self, requires_grad: bool = True) -> Planned:
+        for part in self.modules():
+            if requires_grad and isinstance(part, Planned):
+                part.plan = None
+        return super().requires_grad_(requires_grad)
 
 
 def plain_path(x: Tensor) -> bool:
