@@ -339,6 +339,8 @@ class BuildDatastoreSettings:
     demos: str = "mt10"
     task: list[str] = field(default_factory=lambda: ["MT10"])
     episodes: int = 0  # per task, the first ones by seed; 0: all
+    stride: int = 1  # of an episode's observations every so many become entries
+    half: bool = False  # keys on disk in float16: half the size, for shipping
     key: list[str] = field(default_factory=lambda: ["scene"])  # pooled parts of the prompt; also vision, proprioception
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     results: str = "results"

@@ -270,6 +270,20 @@ def test_the_first_episodes_and_tasks_can_be_asked_for(copy: Path) -> None:
     assert 0 < figures["token_agreement"] <= figures["within_9"] <= 1
 
 
+@pytest.mark.parametrize(("name", "frames"), [("nano-state", 1), ("nano-vision", 2)])
+def test_a_thinned_datastore_of_half_the_bytes_holds_every_so_many_entry(copy: Path, name: str, frames: int) -> None:
+    whole, _, description = opened(copy, name)
+    DatastoreBuild(asked(copy, name, stride=3, half=True)).build()
+    thin = Datastore.open(folder_of(copy, name), description)
+    every = [(task, s, t) for task in TASKS for s, steps in LENGTHS.items() for t in range(0, steps, 3 * frames)]
+    assert entries(thin) == every
+    kept = [entries(whole).index(entry) for entry in every]
+    assert np.array_equal(thin.tokens, whole.tokens[kept])
+    assert thin.vectors.dtype == np.float32
+    assert thin.vectors == pytest.approx(whole.vectors[kept], abs=1e-3)
+    assert np.load(folder_of(copy, name) / "vectors.npy").dtype == np.float16
+
+
 def test_the_manifest_says_where_everything_comes_from(results: Path) -> None:
     store, _, description = opened(results)
     demos = read_json(results / "artifacts/demos/few/manifest.json")

@@ -6,7 +6,7 @@ together with hand and gripper. Measured on MT10, nearest neighbour in another e
 patch tokens agree worse and lower the agreement of what they are added to. The payload is the expert's next H actions
 as tokens.
 
-On disk: `vectors.npy` (rows, d) float32, `payload.parquet`, `manifest.json`; rows by task, seed, step.
+On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json`; rows by task, seed, step.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def _read(folder: Path, description: Mapping[str, Any]) -> dict[str, Any]:
     manifest = read_manifest(folder)
     check_target(manifest, description, folder)
     try:
-        vectors = np.load(folder / FILES[0])
+        vectors = np.load(folder / FILES[0]).astype(np.float32, copy=False)
         payload = _read_payload(folder / FILES[1])
         shards = {task: slice(*shard["rows"]) for task, shard in manifest["tasks"].items()}
         rows, size = manifest["rows"], manifest["chunk"] * manifest["dofs"]

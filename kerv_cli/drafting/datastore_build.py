@@ -74,13 +74,14 @@ def observed_steps(episode: DemoEpisode, settings: TargetSettings) -> np.ndarray
 
 
 @torch.inference_mode()
-def entries_of(target: Target, episode: DemoEpisode, segments: list[str]) -> Entries:
-    """The episode's observations as keys, and behind each the expert's next H clean actions. A chunk that begins near
-    the end takes the labels recorded beyond the success: it never reaches into another episode."""
+def entries_of(target: Target, episode: DemoEpisode, segments: list[str], stride: int = 1) -> Entries:
+    """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions. A
+    chunk that begins near the end takes the labels recorded beyond the success: it never reaches into another episode.
+    """
     settings = target.settings
-    steps = observed_steps(episode, settings)
+    steps = observed_steps(episode, settings)[::stride]
     states = torch.from_numpy(episode.states[steps])
-    frames = torch.from_numpy(episode.frames).permute(0, 3, 1, 2) if target.needs_frame else None
+    frames = torch.from_numpy(episode.frames[::stride]).permute(0, 3, 1, 2) if target.needs_frame else None
     words = target.words_of(task(episode.task).instruction)
     keys = []
     for rows in torch.arange(len(steps)).split(BATCH):
@@ -109,8 +110,11 @@ class DatastoreBuild:
         for name in settings.key:
             if name not in known:
                 raise UnknownName("key", name, known)
-        if not settings.key or settings.episodes < 0:
-            raise UsageError(f"key={settings.key} episodes={settings.episodes}: name a key, episodes from 0 on")
+        if not settings.key or settings.episodes < 0 or settings.stride < 1:
+            raise UsageError(
+                f"key={settings.key} episodes={settings.episodes} stride={settings.stride}: name a key, episodes from "
+                "0 on, stride from 1 on"
+            )
         beside = datastore_beside(self.target_folder)
         self.folder = artifact(settings.results, "datastore", settings.name) if settings.name else beside
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
@@ -148,14 +152,14 @@ class DatastoreBuild:
             first = rows
             for index in chosen:
                 episode = self.dataset.load(index)
-                parts.append(entries_of(target, episode, self.settings.key))
+                parts.append(entries_of(target, episode, self.settings.key, self.settings.stride))
                 seeds.append(np.full(len(parts[-1].steps), episode.seed))
                 rows += len(parts[-1].steps)
                 progress(len(parts), total)
             shards[name] = {"rows": [first, rows], "seeds": self.seeds[name]}
         manifest = self._manifest(target, description, shards, rows, device)
         with _new_folder(self.folder) as folder:
-            _write(folder, parts, np.concatenate(seeds), manifest)
+            _write(folder, parts, np.concatenate(seeds), manifest, np.float16 if self.settings.half else np.float32)
         return Datastore.open(self.folder, description)
 
     def _manifest(
@@ -207,7 +211,7 @@ def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
     }
 
 
-def _write(folder: Path, parts: list[Entries], seeds: np.ndarray, manifest: dict[str, Any]) -> None:
+def _write(folder: Path, parts: list[Entries], seeds: np.ndarray, manifest: dict[str, Any], dtype: type) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -223,7 +227,7 @@ def _write(folder: Path, parts: list[Entries], seeds: np.ndarray, manifest: dict
         "tokens": pa.FixedSizeListArray.from_arrays(pa.array(tokens.ravel()), tokens.shape[1]),
     }
     with atomic_path(folder / FILES[0]) as temporary, temporary.open("wb") as file:
-        np.save(file, np.concatenate([p.keys for p in parts]))
+        np.save(file, np.concatenate([p.keys for p in parts]).astype(dtype))
     with atomic_path(folder / FILES[1]) as temporary:
         pq.write_table(pa.table(columns), temporary, compression="zstd")
     files = {name: sha256_of(folder / name) for name in FILES}

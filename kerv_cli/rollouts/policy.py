@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration
-from kerv_cli.drafting.datastore import Datastore, check_target, read_manifest
+from kerv_cli.drafting.datastore import Datastore, check_backend, check_target, open_datastore, read_manifest
 from kerv_cli.drafting.datastore_build import datastore_beside
 from kerv_cli.drafting.drafter import Drafter, load_drafter, read_drafter
 from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
@@ -18,7 +18,7 @@ from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, early_folder, find_target
 from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import EVALUATION_SEED, MethodSettings, RolloutSettings
+from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
@@ -118,6 +118,7 @@ def check(settings: RolloutSettings) -> None:
     if needs_early(method):
         read_early(early_folder(settings.results, settings.policy.early, folder), description)
     if needs_datastore(method):
+        check_backend(settings.datastore)
         check_target(read_manifest(datastore_beside(folder)), description, datastore_beside(folder))
     if needs_calibration(method):
         calibration = load_calibration(
@@ -145,7 +146,7 @@ def _load(
         drafter=load_drafter(drafter, loaded, sha256)[0] if drafter is not None else None,
         early=load_early(early, loaded, description)[0] if early is not None else None,
         calibration=load_calibration(calibration_beside(target), sha256, chunk) if calibrated else None,
-        datastore=Datastore.open(at, description) if stored else None,
+        datastore=open_datastore(at, description, DatastoreSettings(*stored)) if stored else None,
         datastore_sha256=sha256_of(at / "manifest.json") if stored else "",
     )
 
