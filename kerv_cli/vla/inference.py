@@ -9,7 +9,7 @@ own path.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -36,15 +36,15 @@ class Plan:
 
 
 class Planned(nn.Module):
-    """A module that may have a plan. Moving it, loading weights, unfreezing or training it drops the plan; weights written
-    past these (`parameter.data`) need another `lay_out_for_inference`."""
+    """A module that may have a plan. Moving it, loading weights, unfreezing or training it drops the plan; weights
+    written past these (`parameter.data`) need another `lay_out_for_inference`."""
 
     plan: Any = None
 
     def make_plan(self) -> None:
         """Called with final weights, frozen float32 on a CPU; a module without one does nothing."""
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Planned:
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.plan = None
         return super()._apply(fn, recurse)
 
@@ -52,12 +52,12 @@ class Planned(nn.Module):
         self.plan = None
         super()._load_from_state_dict(*arguments, **keywords)
 
-    def train(self, mode: bool = True) -> Planned:
+    def train(self, mode: bool = True) -> Self:
         if mode:
             self.plan = None
         return super().train(mode)
 
-    def requires_grad_(self, requires_grad: bool = True) -> Planned:
+    def requires_grad_(self, requires_grad: bool = True) -> Self:
         for part in self.modules():
             if requires_grad and isinstance(part, Planned):
                 part.plan = None
