@@ -71,6 +71,7 @@ class Chunk:
     limits: tuple[int, ...] = ()  # bins per DoF that a draft may be off: what is worth drafting depends on it
     choice: Choice | None = None  # who drafts, where a boundary decides
     unverified: list[int] = field(default_factory=list)  # what the rejected draft had behind the rejected token
+    guesses: list[int] = field(default_factory=list)  # verdicts behind the rejected token: right if the draft was
     closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property

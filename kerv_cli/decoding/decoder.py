@@ -225,7 +225,9 @@ class Decoder:
         limits = limits_of(acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
         verdict = acceptance_rule(acceptance)(tree, verdicts, start, limits)
         path = verdict.path
-        chunk.unverified = [] if verdict.rejected is None else tree.tokens_behind(verdict.rejected)
+        behind = [] if verdict.rejected is None else tree.down_from(verdict.rejected)
+        chunk.unverified = [tree.tokens[i] for i in behind[1:]]
+        chunk.guesses = [verdicts[i + 1] for i in behind]
         judged = path if verdict.rejected is None else (*path, verdict.rejected)
         seen = [verdicts[tree.parents[i] + 1] for i in judged]
         drafted = [tree.tokens[i] for i in judged]

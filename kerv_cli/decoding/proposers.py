@@ -165,7 +165,8 @@ class HybridProposer:
 class JacobiProposer:
     """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
 
-    With strict acceptance the fixed point is AR's chunk. The first guess is the zero action.
+    With strict acceptance the fixed point is AR's chunk. The first guess is what an opening's verification left behind
+    its first rejection, else the zero action.
     """
 
     name = "jacobi"
@@ -175,7 +176,8 @@ class JacobiProposer:
         self.guess: list[int] = []
 
     def begin(self, chunk: Chunk) -> None:
-        self.guess = [VOCABULARY // 2] * chunk.left
+        known = chunk.guesses[: chunk.left]
+        self.guess = [*known, *[VOCABULARY // 2] * (chunk.left - len(known))]
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         return TokenTree.chain(self.guess[:depth])

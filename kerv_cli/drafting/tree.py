@@ -68,13 +68,12 @@ class TokenTree:
             tuple(self.depths[i] for i in keep),
         )
 
-    def tokens_behind(self, node: int) -> list[int]:
-        """Tokens below `node` along first children, down to a leaf."""
-        found: list[int] = []
+    def down_from(self, node: int) -> list[int]:
+        """`node` and what lies below it along first children, down to a leaf."""
+        found = [node]
         for i in range(node + 1, len(self)):
-            if self.parents[i] == node:
-                found.append(self.tokens[i])
-                node = i
+            if self.parents[i] == found[-1]:
+                found.append(i)
         return found
 
     def path_to(self, node: int) -> list[int]:
