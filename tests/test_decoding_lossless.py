@@ -25,11 +25,13 @@ from kerv_cli.settings import (
 from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
 from kerv_cli.vla.target import Target
 from kerv_cli.vla.text import WordTokenizer
+from kerv_cli.vla.trunk import lay_out_for_inference
 
 STRICT = AcceptanceSettings(kind="strict")
 
 
 def random_target(seed: int, layers: int, heads: int, chunk: int) -> Target:
+    """Odd seeds run on the plans that a shipped policy runs on, even ones on the modules' own path."""
     torch.manual_seed(seed)
     settings = TargetSettings(
         observation="state", width=16 * heads, layers=layers, heads=heads, feed_forward=48, chunk=chunk, scene_tokens=2
@@ -39,7 +41,10 @@ def random_target(seed: int, layers: int, heads: int, chunk: int) -> Target:
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.25)
     torch.nn.init.normal_(target.embedding.weight, std=1.0)
-    return target.eval().requires_grad_(False)
+    target = target.eval().requires_grad_(False)
+    if seed % 2:
+        lay_out_for_inference(target)
+    return target
 
 
 def random_prompt(target: Target, seed: int) -> torch.Tensor:
