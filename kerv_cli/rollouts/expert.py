@@ -1,4 +1,4 @@
-"""The scripted expert in the policy's place: the ceiling of every success table (METHODS §6)."""
+"""The scripted expert in the policy's place: what success tables are read against (METHODS §6)."""
 
 from __future__ import annotations
 

@@ -106,6 +106,8 @@ def check(settings: RolloutSettings) -> None:
     if settings.seed < EVALUATION_SEED:
         raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {EVALUATION_SEED}")
     if is_expert(settings):
+        if settings.deviation_every > 0:
+            raise UsageError(f"deviation_every={settings.deviation_every}: the scripted expert has no AR to differ from")
         return
     folder = find_target(settings.results, settings.policy.target)
     description = read_description(folder, "target")
