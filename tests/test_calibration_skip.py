@@ -245,7 +245,14 @@ def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
     app.command()(calibrate)
     done = CliRunner().invoke(app, words(copy, "epsilon=1.9", "confidence=0.5"))
     assert done.exit_code == 0, done.output
-    for word in ("ranges of the boundary's metric", "length D, minimum", "s_min", "would be skipped", "error ≤ 1.9", "144"):
+    for word in (
+        "ranges of the boundary's metric",
+        "length D, minimum",
+        "s_min",
+        "would be skipped",
+        "error ≤ 1.9",
+        "144",
+    ):
         assert word in done.output
     assert "skip levels from" in CliRunner().invoke(app, words(copy, "--plan")).output
     never = CliRunner().invoke(app, words(copy, "epsilon=0.0001"))

@@ -23,9 +23,9 @@ from kerv_cli.settings import (
     ThresholdSettings,
 )
 from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
+from kerv_cli.vla.layout import lay_out_for_inference
 from kerv_cli.vla.target import Target
 from kerv_cli.vla.text import WordTokenizer
-from kerv_cli.vla.trunk import lay_out_for_inference
 
 STRICT = AcceptanceSettings(kind="strict")
 

@@ -16,9 +16,10 @@ from kerv_cli.drafting.tree import ROOT, TokenTree, prefill_mask, verify_mask
 from kerv_cli.settings import DrafterSettings, TargetSettings
 from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
 from kerv_cli.vla.inference import FastLinear, has_blocked_layouts
+from kerv_cli.vla.layout import lay_out_for_inference
 from kerv_cli.vla.target import Inputs, Target
 from kerv_cli.vla.text import WordTokenizer
-from kerv_cli.vla.trunk import Trunk, lay_out_for_inference
+from kerv_cli.vla.trunk import Trunk
 
 
 def shaken(module: torch.nn.Module, seed: int) -> torch.nn.Module:

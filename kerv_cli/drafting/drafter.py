@@ -18,8 +18,9 @@ from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.vla.checkpoint import load_state, read_description, save_module
+from kerv_cli.vla.layout import lay_out_for_inference
 from kerv_cli.vla.target import Target
-from kerv_cli.vla.trunk import Cache, Layer, Rotary, lay_out_for_inference
+from kerv_cli.vla.trunk import Cache, Layer, Rotary
 
 
 class Drafter(nn.Module):

@@ -107,7 +107,7 @@ def check(settings: RolloutSettings) -> None:
         raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {EVALUATION_SEED}")
     if is_expert(settings):
         if settings.deviation_every > 0:
-            raise UsageError(f"deviation_every={settings.deviation_every}: the scripted expert has no AR to differ from")
+            raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
         return
     folder = find_target(settings.results, settings.policy.target)
     description = read_description(folder, "target")

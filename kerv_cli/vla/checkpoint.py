@@ -16,9 +16,9 @@ from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
 from kerv_cli.settings import TargetSettings
 from kerv_cli.vla.action_tokens import ActionTokenizer
+from kerv_cli.vla.layout import lay_out_for_inference
 from kerv_cli.vla.target import Target
 from kerv_cli.vla.text import WordTokenizer
-from kerv_cli.vla.trunk import lay_out_for_inference
 
 FORMAT = 1
 

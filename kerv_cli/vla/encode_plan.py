@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.vla.inference import Plan
-
-if TYPE_CHECKING:
-    from kerv_cli.vla.target import Inputs, Target
+from kerv_cli.vla.target import Inputs, Target
 
 Affine = tuple[Tensor, Tensor]  # bias (O,), weight (I, O)
 SATURATING = [10 + 6 * vector + 3 + axis for vector in range(3) for axis in range(3)]  # columns of `scene_features`

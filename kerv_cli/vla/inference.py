@@ -1,4 +1,4 @@
-"""What a frozen module keeps for fast CPU inference: a plan, made once from its weights by `lay_out_for_inference`.
+"""What a frozen module keeps for fast CPU inference: a plan, made once from its weights by `lay_out_for_inference` (layout.py).
 
 A plan holds the same numbers in other layouts (oneDNN's blocked one, which halves the time of 30 tokens; input-major
 for a single token) and with what is linear folded together: a norm's gain or a temperature into the weights behind it.
@@ -40,9 +40,6 @@ class Planned(nn.Module):
     written past these (`parameter.data`) need another `lay_out_for_inference`."""
 
     plan: Any = None
-
-    def make_plan(self) -> None:
-        """Called with final weights, frozen float32 on a CPU; a module without one does nothing."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         self.plan = None

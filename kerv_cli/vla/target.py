@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from kerv_cli.settings import TargetSettings
 from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
-from kerv_cli.vla.encode_plan import EncodePlan
 from kerv_cli.vla.inference import Planned
 from kerv_cli.vla.text import WordTokenizer
 from kerv_cli.vla.trunk import Cache, Trunk
@@ -122,10 +121,6 @@ class Target(Planned):
     def words_of(self, instruction: str) -> Tensor:
         """(1, L) int64."""
         return torch.tensor([self.words.encode(instruction, self.settings.instruction_tokens)], device=self.device)
-
-    def make_plan(self) -> None:
-        if self.needs_frame:
-            self.plan = EncodePlan(self)
 
     def encode(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Prompt embeddings (B, P, E) and the object and goal positions (B, 6) in metres they are built on."""

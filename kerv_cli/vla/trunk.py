@@ -13,8 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.vla.inference import Planned, frozen_on_cpu, plain_path
-from kerv_cli.vla.trunk_plan import LayerPlan, NormPlan, RotaryPlan
+from kerv_cli.vla.inference import Planned, plain_path
 
 Turn = tuple[Tensor, Tensor] | Tensor  # cosines and sines, or what a plan turns by
 
@@ -83,9 +82,6 @@ class Layer(Planned):
         self.gate_up = nn.Linear(width, 2 * feed_forward, bias=False)
         self.down = nn.Linear(feed_forward, width, bias=False)
 
-    def make_plan(self) -> None:
-        self.plan = LayerPlan(self)
-
     def forward(
         self,
         x: Tensor,
@@ -136,9 +132,6 @@ class Trunk(Planned):
                 if name.endswith(("out.weight", "down.weight")):
                     parameter.data /= (2 * layers) ** 0.5
 
-    def make_plan(self) -> None:
-        self.plan = NormPlan(self.norm)
-
     def new_cache(self, batch: int, capacity: int) -> Cache:
         like = self.norm.weight
         return Cache(len(self.layers), batch, self.heads, capacity, self.width // self.heads, like)
@@ -159,24 +152,3 @@ class Trunk(Planned):
         if cache is not None:
             cache.length = start + x.shape[1]
         return self.norm(x) if self.plan is None or plain_path(x) else self.plan(x)
-
-
-def lay_out_for_inference(module: nn.Module) -> None:
-    """Prepare a module whose weights are final: every linear weight input-major, shapes unchanged, and a plan for what
-    has one where it is frozen float32 on a CPU.
-
-    On a CPU one token times an output-major matrix is twice as slow (measured: 192 × 1024, 69 µs against 36 µs).
-    Every method runs on the same layouts.
-    """
-    for part in module.modules():
-        if isinstance(part, nn.Linear) and part.weight.device.type == "cpu":
-            part.weight.data = part.weight.data.t().contiguous().t()
-    if not frozen_on_cpu(module):
-        return
-    heads = next((part.heads for part in module.modules() if isinstance(part, Layer)), 0)
-    with torch.no_grad():
-        for part in module.modules():
-            if isinstance(part, Rotary) and heads:
-                part.plan = RotaryPlan(part, heads)
-            elif isinstance(part, Planned):
-                part.make_plan()

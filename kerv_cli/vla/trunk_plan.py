@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.vla.inference import FastLinear, Plan
-
-if TYPE_CHECKING:
-    from kerv_cli.vla.trunk import Layer, Rotary
+from kerv_cli.vla.trunk import Layer, Rotary
 
 EXPLICIT = range(24, 513)  # query tokens for which three plain calls beat the fused attention of a CPU (measured)
 

@@ -11,8 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.vla.inference import Planned, has_blocked_layouts
-from kerv_cli.vla.vision_plan import VisionPlan
+from kerv_cli.vla.inference import Planned
 
 
 class Residual(nn.Module):
@@ -46,10 +45,6 @@ class VisionEncoder(Planned):
         self.grid_position = nn.Parameter(torch.randn(grid * grid, width) * 0.02)
         self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
-
-    def make_plan(self) -> None:
-        if has_blocked_layouts():
-            self.plan = VisionPlan(self)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         if self.plan is not None and len(images) == 1:

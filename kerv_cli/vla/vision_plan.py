@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.vla.inference import FastConv, Plan
-
-if TYPE_CHECKING:
-    from kerv_cli.vla.vision import Residual, VisionEncoder
+from kerv_cli.vla.vision import Residual, VisionEncoder
 
 
 class StagePlan:
