@@ -173,7 +173,7 @@ def test_the_network_learns_what_the_teacher_says() -> None:
     run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
     before = run.validate(early)["score"]
     optimiser = torch.optim.AdamW(early.parameters(), lr=2e-3)
-    for step in range(120):
+    for step in range(240):
         optimiser.zero_grad()
         run.loss(torch.randint(256, (64,), generator=generator), step)[0].backward()
         optimiser.step()

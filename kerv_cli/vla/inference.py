@@ -1,4 +1,4 @@
-"""What a frozen module keeps for fast CPU inference: a plan, made once from its weights by `lay_out_for_inference` (layout.py).
+"""What a frozen module keeps for fast CPU inference: a plan, made once from its weights by `lay_out_for_inference`.
 
 A plan holds the same numbers in other layouts (oneDNN's blocked one, which halves the time of 30 tokens; input-major
 for a single token) and with what is linear folded together: a norm's gain or a temperature into the weights behind it.
