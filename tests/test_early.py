@@ -172,13 +172,13 @@ def test_the_network_learns_what_the_teacher_says() -> None:
     early = EarlyDrafter(SMALL, SHAPE)
     run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
     before = run.validate(early)["score"]
-    optimiser = torch.optim.AdamW(early.parameters(), lr=2e-3)
-    for step in range(240):
+    optimiser = torch.optim.AdamW(early.parameters(), lr=5e-3)
+    for step in range(350):
         optimiser.zero_grad()
         run.loss(torch.randint(256, (64,), generator=generator), step)[0].backward()
         optimiser.step()
     assert before < 2
-    assert run.validate(early)["score"] > 11  # of 8 strict + 8 relaxed
+    assert run.validate(early)["score"] > 15  # of 8 strict + 8 relaxed
 
 
 # what it is trained on
