@@ -11,6 +11,9 @@ from typing import Any
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
 
+SPARE = "?"
+"""Behind a source of an opening: it drafts only where the others are not sure of their chunk."""
+
 
 @dataclass
 class CameraSettings:
@@ -108,7 +111,7 @@ class SkipSettings:
 class OpeningSettings:
     """What is drafted before the prefill and verified inside it (METHODS §5, ours)."""
 
-    sources: list[str] = field(default_factory=list)  # early | retrieval | a predictor's name; each gives whole chunks
+    sources: list[str] = field(default_factory=list)  # early | retrieval | a predictor; with "?": a spare
     nodes: int = 64  # tree nodes at most; what is named last is dropped first
     neighbours: int = 3  # retrieval: stored chunks
 

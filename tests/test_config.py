@@ -88,8 +88,9 @@ def test_grids_expand_in_hydras_grammar() -> None:
 
 def test_the_threshold_study_is_the_one_that_is_promised() -> None:
     resolved = resolve(["study=threshold", "episodes=2"])
-    radii = [r.threshold.r for label, r in resolved.settings.items() if label != "ar"]
-    assert radii == [0, 3, 5, 9, 15, 20]
+    fixed = [r.threshold.r for r in resolved.settings.values() if r.method != "ar" and r.threshold.kind == "fixed"]
+    assert fixed == [0, 3, 5, 9, 15, 20]
+    assert {"kinematic", "change", "schedule"} < {r.threshold.kind for r in resolved.settings.values()}
     assert {r.episodes for r in resolved.settings.values()} == {2}
     with pytest.raises(UsageError, match=r"sets threshold\.r itself"):
         resolve(["study=threshold", "threshold.r=3"])

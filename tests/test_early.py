@@ -10,10 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from kerv_cli.config import compose
-from kerv_cli.drafting.early import EarlyDrafter, choose, load_early, padded, pool, pooled_width, read_early, save_early
+from kerv_cli.drafting.early import (
+    EarlyDrafter,
+    acceptance_odds,
+    choose,
+    load_early,
+    padded,
+    pool,
+    pooled_width,
+    read_early,
+    save_early,
+)
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.places import early_folder
@@ -141,6 +153,19 @@ def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted() -> None:
                 sums = [probability[b, j, max(0, t - radius) : t + radius + 1].sum() for t in range(255)]
                 assert sums[int(tokens[b, j])] > max(sums) - 0.15 * max(sums) - 1e-6
     assert choose(torch.eye(255)[None, [254] * 4] * 30, 9, 4).tolist() == [[254] * 4]  # not nine bins inside
+
+
+@given(st.integers(0, 10_000), st.integers(0, 20))
+def test_the_odds_are_those_of_independent_tokens(seed: int, radius: int) -> None:
+    logits = 3 * torch.randn(2, 8, 255, generator=torch.Generator().manual_seed(seed))
+    tokens = choose(logits, radius, 4)
+    for row in range(2):
+        odds = 1.0
+        for i, token in enumerate(tokens[row].tolist()):
+            r = 0 if i % 4 == 3 else radius
+            window = slice(max(0, token - r), token + r + 1)
+            odds *= float(logits[row, i].double().softmax(-1)[window].sum())
+        assert float(acceptance_odds(logits, tokens, radius, 4)[row]) == pytest.approx(odds, rel=1e-3)
 
 
 def test_plain_and_perturbed_episodes_count_alike() -> None:

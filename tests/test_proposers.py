@@ -47,10 +47,11 @@ class KnownDraft:
     """Stands for the early drafter: the truth with some tokens wrong."""
 
     def __init__(self, truth: list[int], random: np.random.Generator) -> None:
+        self.odds = random.random()
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def propose(self, prompt: torch.Tensor, history: np.ndarray, size: int, radius: int) -> list[int]:
-        return self.tokens
+    def drafted(self, prompt: torch.Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
+        return self.tokens, self.odds
 
 
 def stored(target: Target, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
@@ -95,7 +96,7 @@ def proposers(target: Target, prompt: torch.Tensor, truth: list[int], seed: int)
         "kalman": PredictionProposer(Kalman(Noise.uniform(D, 1.0), horizon=horizon)),
         "early": early,
         "retrieval": retrieval,
-        "merged": MergedProposer([early, retrieval, hold], int(random.integers(1, 80))),
+        "merged": MergedProposer([early, retrieval], int(random.integers(1, 80)), [hold]),
         "hybrid": HybridProposer(drafting, retrieval),
     }
 
@@ -156,7 +157,10 @@ def test_a_prediction_counts_committed_steps_as_executed() -> None:
 def test_merging_drops_what_is_named_last_and_cuts_the_last_branch() -> None:
     class Fixed:
         def __init__(self, name: str, chains: list[list[int]]) -> None:
-            self.name, self.found = name, chains
+            self.name, self.found, self.sure = name, chains, False
+
+        def is_sure(self, chunk: Chunk) -> bool:
+            return self.sure
 
         def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
             return [c[:depth] for c in self.found]
@@ -167,6 +171,11 @@ def test_merging_drops_what_is_named_last_and_cuts_the_last_branch() -> None:
     assert MergedProposer([one, two], 7).propose(chunk, 3).tokens == (1, 2, 3, 5, 6)
     assert MergedProposer([two, one], 2).propose(chunk, 3).tokens == (9, 9)
     assert (MergedProposer([one, two], 8).name, MergedProposer([two], 8).name) == ("merged", "two")
+    spared = MergedProposer([two], 8, [one])
+    assert spared.name == "merged"
+    assert spared.propose(chunk, 3).tokens == (9, 9, 9, 1, 2, 3, 5, 6)
+    two.sure = True
+    assert spared.propose(chunk, 3).tokens == (9, 9, 9)
 
 
 # --- HeiSD: choice and skip

@@ -89,6 +89,9 @@ class DraftsChunks(Protocol):
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Tokens behind the committed ones, at most `depth` each, the best first; none where nothing is known."""
 
+    def is_sure(self, chunk: Chunk) -> bool:
+        """Whether it expects its first chain to be accepted whole."""
+
 
 class Proposer(Protocol):
     """Drafts a tree behind the committed tokens. `name` goes into the record; `needs_states` says whether it reads the

@@ -20,6 +20,7 @@ from kerv_cli.vla.action_tokens import VOCABULARY, bins_of, values_of
 from kerv_cli.vla.target import Target
 
 EMPTY = TokenTree((), (), ())
+SURE = 0.05  # odds from which no spare draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
 
 
 class ChainProposer:
@@ -37,6 +38,9 @@ class ChainProposer:
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         raise NotImplementedError
+
+    def is_sure(self, chunk: Chunk) -> bool:
+        return False
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
         pass
@@ -67,13 +71,20 @@ class EarlyProposer(ChainProposer):
 
     def __init__(self, early: EarlyDrafter) -> None:
         self.early = early
-        self._drafted: tuple[Chunk, list[int]] | None = None
+        self._drafted: tuple[Chunk, list[int], float] | None = None
 
-    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+    def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
+        """Tokens, and the drafter's own odds that all of them are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
-            self._drafted = chunk, self.early.propose(chunk.prompt, history, chunk.size, radius)
-        return [self._drafted[1][len(chunk.tokens) : chunk.size][:depth]]
+            self._drafted = chunk, *self.early.drafted(chunk.prompt, history, radius)
+        return self._drafted[1], self._drafted[2]
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
+
+    def is_sure(self, chunk: Chunk) -> bool:
+        return self.drafted(chunk)[1] >= SURE
 
 
 class RetrievalProposer:
@@ -102,6 +113,9 @@ class RetrievalProposer:
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), self.groups, self.nodes, depth)
 
+    def is_sure(self, chunk: Chunk) -> bool:
+        return False
+
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         start = len(chunk.tokens)
         found: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
@@ -112,19 +126,26 @@ class RetrievalProposer:
 
 
 class MergedProposer:
-    """Whole drafts of several sources in one prefix tree, a branch each (METHODS §5)."""
+    """Whole drafts of several sources in one prefix tree, a branch each (METHODS §5).
+
+    spare: sources that draft only where none of the others is sure of its chunk: every node costs time.
+    """
 
     needs_states = False
 
-    def __init__(self, sources: Sequence[DraftsChunks], nodes: int) -> None:
-        self.name = sources[0].name if len(sources) == 1 else "merged"
-        self.sources, self.nodes = sources, nodes
+    def __init__(self, sources: Sequence[DraftsChunks], nodes: int, spare: Sequence[DraftsChunks] = ()) -> None:
+        every = [*sources, *spare]
+        self.name = every[0].name if len(every) == 1 else "merged"
+        self.sources, self.spare, self.nodes = sources, spare, nodes
 
     def begin(self, chunk: Chunk) -> None:
         pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        chains = [chain for source in self.sources for chain in source.chains(chunk, depth)]
+        sources = list(self.sources)
+        if not any(source.is_sure(chunk) for source in sources):
+            sources += self.spare
+        chains = [chain for source in sources for chain in source.chains(chunk, depth)]
         tree = merge(chains)
         while len(tree) > self.nodes:
             if len(chains) == 1:

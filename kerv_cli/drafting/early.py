@@ -111,12 +111,17 @@ class EarlyDrafter(nn.Module):
     def propose(self, prompt: Tensor, history: np.ndarray, size: int | None = None, radius: int = 0) -> list[int]:
         """prompt (1, P, E), history (m, D) normalised executed actions, oldest first -> the chunk's first `size`
         tokens (default all N). radius: how far from its verdict a draft token is accepted, see `choose`."""
+        return self.drafted(prompt, history, radius)[0][:size]
+
+    @torch.inference_mode()
+    def drafted(self, prompt: Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
+        """As `propose`: all N tokens, and how likely the drafter holds it that every one of them is accepted."""
         weight = self.head.weight
         actions, known = padded(history, self.settings.history, self.target.dofs)
         tensors = [torch.from_numpy(x).to(device=weight.device, dtype=weight.dtype)[None] for x in (actions, known)]
         logits = self(prompt.to(weight.dtype), *tensors)
-        drafted: list[int] = choose(logits, radius, self.target.dofs)[0].tolist()
-        return drafted[:size]
+        tokens = choose(logits, radius, self.target.dofs)
+        return tokens[0].tolist(), float(acceptance_odds(logits, tokens, radius, self.target.dofs)[0])
 
 
 def choose(logits: Tensor, radius: int, dofs: int) -> Tensor:
@@ -134,6 +139,17 @@ def choose(logits: Tensor, radius: int, dofs: int) -> Tensor:
     tokens = score.argmax(-1)
     tokens[:, GRIPPER::dofs] = best[:, GRIPPER::dofs]
     return tokens
+
+
+def acceptance_odds(logits: Tensor, tokens: Tensor, radius: int, dofs: int) -> Tensor:
+    """logits (B, N, V), tokens (B, N) -> (B,): probability that each token lies within `radius` of its verdict, the
+    gripper's exactly on it, if the tokens were independent. They are not, and labels that neighbouring bins share keep the
+    drafter unsure: the number is far too low, but it orders chunks well."""
+    probability = logits.float().softmax(-1)
+    exact = probability.gather(-1, tokens[..., None])[..., 0]
+    odds = _within(probability, radius).gather(-1, tokens[..., None])[..., 0]
+    odds[:, GRIPPER::dofs] = exact[:, GRIPPER::dofs]
+    return odds.prod(-1)
 
 
 def _within(probability: Tensor, radius: int) -> Tensor:

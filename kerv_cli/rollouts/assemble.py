@@ -25,7 +25,7 @@ from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, PREDICTORS, Predictor
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.policy import Policy
-from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings
+from kerv_cli.settings import SPARE, CameraSettings, MethodSettings, RolloutSettings
 from kerv_cli.vla.action_tokens import GRIPPER
 
 WARM_UP_DECODES = 6
@@ -67,10 +67,14 @@ def build_opening(policy: Policy, method: MethodSettings) -> Proposer | None:
     settings = method.opening
     if not settings.sources:
         return None
+    names = settings.sources
     if settings.nodes < 1:
         raise UsageError(f"opening.nodes={settings.nodes}: at least 1")
-    sources = [build_source(policy, name, settings.neighbours, settings.nodes) for name in settings.sources]
-    return MergedProposer(sources, settings.nodes)
+    built = {
+        name: build_source(policy, name.removesuffix(SPARE), settings.neighbours, settings.nodes) for name in names
+    }
+    first = [source for name, source in built.items() if not name.endswith(SPARE)]
+    return MergedProposer(first, settings.nodes, [source for source in built.values() if source not in first])
 
 
 def build_source(

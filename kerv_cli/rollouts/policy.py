@@ -18,7 +18,7 @@ from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, early_folder, find_target
 from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings
+from kerv_cli.settings import EVALUATION_SEED, SPARE, DatastoreSettings, MethodSettings, RolloutSettings
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
@@ -62,17 +62,22 @@ def is_expert(settings: RolloutSettings) -> bool:
     return settings.proposer.kind == "expert"
 
 
+def opening_sources(method: MethodSettings) -> set[str]:
+    """Names of the sources, spare ones included."""
+    return {name.removesuffix(SPARE) for name in method.opening.sources}
+
+
 def needs_drafter(method: MethodSettings) -> bool:
     return method.proposer.kind in ("drafter", "hybrid")
 
 
 def needs_early(method: MethodSettings) -> bool:
-    return method.proposer.kind == "early" or "early" in method.opening.sources
+    return method.proposer.kind == "early" or "early" in opening_sources(method)
 
 
 def needs_datastore(method: MethodSettings) -> bool:
     """Whether a part retrieves stored chunks."""
-    return method.proposer.kind in ("retrieval", "hybrid") or "retrieval" in method.opening.sources
+    return method.proposer.kind in ("retrieval", "hybrid") or "retrieval" in opening_sources(method)
 
 
 def observation_of(description: Mapping[str, Any]) -> str:
@@ -83,7 +88,7 @@ def observation_of(description: Mapping[str, Any]) -> str:
 
 def needs_calibration(method: MethodSettings) -> bool:
     """Whether a part reads what `kerv calibrate` fitted."""
-    predictors = {method.proposer.kind, *method.opening.sources}
+    predictors = {method.proposer.kind, *opening_sources(method)}
     if method.rectifier.kind == "compensate":
         predictors.add(method.rectifier.predictor)
     return (
