@@ -143,7 +143,7 @@ def choose(logits: Tensor, radius: int, dofs: int) -> Tensor:
 
 def acceptance_odds(logits: Tensor, tokens: Tensor, radius: int, dofs: int) -> Tensor:
     """logits (B, N, V), tokens (B, N) -> (B,): probability that each token lies within `radius` of its verdict, the
-    gripper's exactly on it, if the tokens were independent. They are not, and labels that neighbouring bins share keep the
+    gripper's exactly on it, if the tokens were independent. They are not, and soft labels keep the
     drafter unsure: the number is far too low, but it orders chunks well."""
     probability = logits.float().softmax(-1)
     exact = probability.gather(-1, tokens[..., None])[..., 0]
