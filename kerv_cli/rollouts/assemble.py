@@ -21,8 +21,8 @@ from kerv_cli.decoding.proposers import (
 from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.decoding.rectify import DRAFT, Compensation
 from kerv_cli.decoding.skipping import SkipLevels, VerifySkip
-from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, PREDICTORS, Predictor, build_predictor
-from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, Predictor, build_predictor
+from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.policy import Policy
 from kerv_cli.settings import SPARE, CameraSettings, MethodSettings, RolloutSettings
@@ -39,17 +39,13 @@ def build_decoder(policy: Policy, method: MethodSettings, task: str = "") -> Dec
 
 def build_parts(policy: Policy, method: MethodSettings, task: str = "") -> Parts:
     """task: whose calibrated levels hold, where a part has one per task."""
-    proposer, boundary = build_proposer(policy, method), build_part_boundary(policy, method)
-    if (method.proposer.kind == "hybrid") != (boundary is not None):
-        raise UsageError(
-            f"proposer={method.proposer.kind} with boundary={method.boundary.kind}: a boundary chooses between the "
-            "two sides of proposer=hybrid, which needs one other than always"
-        )
+    check_composition(method, policy.target.settings.chunk)
+    proposer = build_proposer(policy, method)
     return Parts(
         opening=build_opening(policy, method),
         proposer=proposer,
         compensation=build_compensation(policy, method),
-        boundary=boundary,
+        boundary=build_part_boundary(policy, method),
         skip=build_skip(policy, method, proposer, task),
     )
 
@@ -67,12 +63,8 @@ def build_opening(policy: Policy, method: MethodSettings) -> Proposer | None:
     settings = method.opening
     if not settings.sources:
         return None
-    names = settings.sources
-    if settings.nodes < 1:
-        raise UsageError(f"opening.nodes={settings.nodes}: at least 1")
-    built = {
-        name: build_source(policy, name.removesuffix(SPARE), settings.neighbours, settings.nodes) for name in names
-    }
+    counts = settings.neighbours, settings.nodes
+    built = {name: build_source(policy, name.removesuffix(SPARE), *counts) for name in settings.sources}
     first = [source for name, source in built.items() if not name.endswith(SPARE)]
     return MergedProposer(first, settings.nodes, [source for source in built.values() if source not in first])
 
@@ -86,12 +78,8 @@ def build_source(
         return EarlyProposer(policy.early)
     if name == "retrieval":
         assert policy.datastore is not None
-        if min(neighbours, nodes) < 1:
-            raise UsageError("retrieval needs at least one neighbour and one node")
         return RetrievalProposer(policy.datastore, policy.target, neighbours, nodes)
-    if name in PREDICTORS:
-        return PredictionProposer(predictor_of(policy, name))
-    raise UnknownName("source of drafts", name, ["early", "retrieval", *PREDICTORS])
+    return PredictionProposer(predictor_of(policy, name))
 
 
 def predictor_of(policy: Policy, name: str) -> Predictor:
@@ -104,8 +92,6 @@ def predictor_of(policy: Policy, name: str) -> Predictor:
 
 def build_compensation(policy: Policy, method: MethodSettings) -> Compensation | None:
     settings = method.rectifier
-    if settings.kind not in ("reinfer", "compensate"):
-        raise UnknownName("rectifier.kind", settings.kind, ["reinfer", "compensate"])
     if settings.kind == "reinfer":
         return None
     return Compensation(settings, predictor_of(policy, "hold" if settings.predictor == DRAFT else settings.predictor))
@@ -115,8 +101,6 @@ def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:
     settings = method.proposer
     if settings.kind == "none":
         return None
-    if min(settings.depth, settings.top_k, settings.nodes) < 1:
-        raise UsageError("proposer.depth, proposer.top_k and proposer.nodes must be at least 1")
     if settings.kind == "jacobi":
         return JacobiProposer()
     if settings.kind in ("drafter", "hybrid"):
@@ -127,23 +111,15 @@ def build_proposer(policy: Policy, method: MethodSettings) -> Proposer | None:
         retrieval = build_source(policy, "retrieval", settings.neighbours, settings.nodes)
         assert isinstance(retrieval, RetrievalProposer)
         return HybridProposer(drafter, retrieval)
-    if settings.kind in ("early", "retrieval", *PREDICTORS):
-        return build_source(policy, settings.kind, settings.neighbours, settings.nodes)
-    known = ["expert", "none", "drafter", "retrieval", "hybrid", "early", "jacobi", *PREDICTORS]
-    raise UnknownName("proposer.kind", settings.kind, known)
+    return build_source(policy, settings.kind, settings.neighbours, settings.nodes)
 
 
 def build_skip(policy: Policy, method: MethodSettings, proposer: Proposer | None, task: str) -> VerifySkip | None:
     settings = method.skip
-    if settings.kind not in ("none", "similarity"):
-        raise UnknownName("skip.kind", settings.kind, ["none", "similarity"])
     if settings.kind == "none":
         return None
     retrieval = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
-    if not isinstance(retrieval, RetrievalProposer):
-        raise UsageError(
-            f"skip=similarity with proposer={method.proposer.kind}: only retrieved chunks have a similarity"
-        )
+    assert isinstance(retrieval, RetrievalProposer)
     if settings.s_min is not None:
         return VerifySkip(settings, retrieval, SkipLevels(settings.s_min, settings.s_min, settings.s_min))
     assert policy.calibration is not None

@@ -17,6 +17,7 @@ from kerv_cli.drafting.kinematics import FILTERS
 from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, early_folder, find_target
+from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.runtime import DTYPES, set_up
 from kerv_cli.settings import EVALUATION_SEED, SPARE, DatastoreSettings, MethodSettings, RolloutSettings
 from kerv_cli.sim.tasks import resolve_tasks
@@ -120,6 +121,7 @@ def check(settings: RolloutSettings) -> None:
     if description["settings"]["observation"] == "vision" and camera.size != size:
         raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
     method = settings.parts()
+    check_composition(method, description["settings"]["chunk"])
     if needs_drafter(method):
         read_drafter(drafter_folder(settings.results, settings.policy.drafter, folder), description["sha256"])
     if needs_early(method):
