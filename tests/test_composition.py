@@ -27,7 +27,7 @@ def test_every_shipped_method_fits_together(method: str) -> None:
         ("proposer.kind=nope", "proposer.kind 'nope'"),
         ("boundary.kind=nope", "boundary.kind 'nope'"),
         ("rectifier.kind=nope", "rectifier.kind 'nope'"),
-        ("rectifier.predictor=nope", "rectifier.predictor 'nope'"),
+        ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
         ("skip.kind=nope", "skip.kind 'nope'"),
         ("method=spec_vla proposer.depth=0", "proposer.depth"),
         ("method=retrieval_only proposer.neighbours=0", "at least one neighbour"),
