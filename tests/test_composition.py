@@ -20,7 +20,7 @@ def test_every_shipped_method_fits_together(method: str) -> None:
     [
         ("method=heisd boundary=always", "proposer=hybrid with boundary=always"),
         ("method=spec_vla boundary=fused", "proposer=drafter with boundary=fused"),
-        ("method=spec_vla skip=similarity", "only retrieved chunks have a similarity"),
+        ("method=expert skip=similarity", "the expert verifies nothing"),
         ("opening.sources=[early,nope]", "source of an opening 'nope'"),
         ("opening.sources=[early] opening.nodes=0", "opening.nodes=0"),
         ("chunk=5", "trained for 4 control steps"),

@@ -119,7 +119,9 @@ def build_skip(policy: Policy, method: MethodSettings, proposer: Proposer | None
     if settings.kind == "none":
         return None
     retrieval = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
-    assert isinstance(retrieval, RetrievalProposer)
+    if not isinstance(retrieval, RetrievalProposer):  # nothing else of the method retrieves
+        assert policy.datastore is not None
+        retrieval = RetrievalProposer(policy.datastore, policy.target, 1, 1)
     if settings.s_min is not None:
         return VerifySkip(settings, retrieval, SkipLevels(settings.s_min, settings.s_min, settings.s_min))
     assert policy.calibration is not None

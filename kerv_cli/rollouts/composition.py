@@ -34,10 +34,8 @@ def check_composition(method: MethodSettings, chunk: int) -> None:
             f"proposer={method.proposer.kind} with boundary={method.boundary.kind}: a boundary chooses between the "
             "two sides of proposer=hybrid, which needs one other than always"
         )
-    if method.skip.kind != "none" and method.proposer.kind not in ("retrieval", "hybrid"):
-        raise UsageError(
-            f"skip={method.skip.kind} with proposer={method.proposer.kind}: only retrieved chunks have a similarity"
-        )
+    if method.skip.kind != "none" and method.proposer.kind == "expert":
+        raise UsageError("skip=similarity with proposer=expert: the expert verifies nothing")
     if method.opening.sources and method.opening.nodes < 1:
         raise UsageError(f"opening.nodes={method.opening.nodes}: at least 1")
     drafts = method.proposer.kind not in ("none", "expert")

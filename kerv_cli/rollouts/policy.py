@@ -78,7 +78,8 @@ def needs_early(method: MethodSettings) -> bool:
 
 def needs_datastore(method: MethodSettings) -> bool:
     """Whether a part retrieves stored chunks."""
-    return method.proposer.kind in ("retrieval", "hybrid") or "retrieval" in opening_sources(method)
+    retrieves = method.proposer.kind in ("retrieval", "hybrid") or "retrieval" in opening_sources(method)
+    return retrieves or method.skip.kind != "none"
 
 
 def observation_of(description: Mapping[str, Any]) -> str:
