@@ -7,6 +7,7 @@ import pytest
 from kerv_cli.config import compose, groups
 from kerv_cli.errors import KervError
 from kerv_cli.rollouts.composition import check_composition
+from kerv_cli.rollouts.policy import needs_calibration, needs_datastore, needs_drafter, needs_early
 from kerv_cli.settings import RolloutSettings
 
 
@@ -40,3 +41,29 @@ def test_what_does_not_belong_together_is_refused(overrides: str, says: str) -> 
         check_composition(method, 4)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "drafter", "early", "datastore", "calibration"),
+    [
+        ("method=ar", False, False, False, False),
+        ("method=spec_vla", True, False, False, False),
+        ("method=spec_vla threshold=kinematic", True, False, False, True),
+        ("method=kerv", True, False, False, True),
+        ("method=heisd", True, False, True, True),
+        ("method=heisd boundary=always_retrieval skip=none", True, False, True, False),
+        ("method=retrieval_only", False, False, True, False),
+        ("method=kalman_only", False, False, False, True),
+        ("method=one_pass", False, True, False, False),
+        ("method=one_pass opening.sources=[damped]", False, False, False, True),
+        ("method=one_pass opening=retrieval", False, False, True, False),
+        ("method=one_pass_skip", False, True, True, True),
+        ("method=one_pass_skip skip.s_min=0.99", False, True, True, False),
+    ],
+)
+def test_a_method_loads_what_it_needs_and_nothing_else(
+    overrides: str, drafter: bool, early: bool, datastore: bool, calibration: bool
+) -> None:
+    method = compose("rollout", overrides.split(), RolloutSettings).parts()
+    needs = (needs_drafter(method), needs_early(method), needs_datastore(method), needs_calibration(method))
+    assert needs == (drafter, early, datastore, calibration)
