@@ -58,7 +58,7 @@ def drafter_folder(results: str, name: str | None, target: Path) -> Path:
 
 def drafter_beside(target: Path) -> Path:
     """Shipped: pretrained/<name>/{target,drafter}; trained: artifacts/target/<name> and artifacts/drafter/<name>."""
-    return _beside(target, "drafter")
+    return beside(target, "drafter")
 
 
 def early_folder(results: str, name: str | None, target: Path) -> Path:
@@ -68,10 +68,11 @@ def early_folder(results: str, name: str | None, target: Path) -> Path:
 
 def early_beside(target: Path) -> Path:
     """As `drafter_beside`, in folders named early."""
-    return _beside(target, "early")
+    return beside(target, "early")
 
 
-def _beside(target: Path, kind: str) -> Path:
+def beside(target: Path, kind: str) -> Path:
+    """The folder of this kind that belongs to the target: among the shipped, among the artifacts, or inside it."""
     if target.name == "target":
         return target.parent / kind
     return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind

@@ -5,6 +5,7 @@ Nothing heavy is imported here: a wrong override must be answered before torch o
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -13,6 +14,11 @@ EVALUATION_SEED = 100_000
 
 SPARE = "?"
 """Behind a source of an opening: it drafts only where the others are not sure of their chunk."""
+
+
+def opening_sources(sources: Iterable[str]) -> list[str]:
+    """Names of an opening's sources, spare ones included, in their order."""
+    return [name.removesuffix(SPARE) for name in sources]
 
 
 @dataclass

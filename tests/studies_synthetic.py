@@ -6,7 +6,7 @@ import hashlib
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +25,25 @@ def settings_of(method: str, r: int = 0, episodes: int = 4, proposer: str = "dra
     settings.acceptance.kind = "relaxed" if r else "strict"
     settings.threshold.r = r
     return settings
+
+
+def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord]) -> EpisodeRecord:
+    """An episode of one control step per decode in which nothing moves: for what is measured of its decodes."""
+    steps = len(decodes)
+    return EpisodeRecord(
+        task=task,
+        instruction="",
+        seed=seed,
+        success=success,
+        steps=steps,
+        decodes=tuple(decodes),
+        decode_steps=tuple(range(steps)),
+        actions=np.zeros((steps, 4), np.float32),
+        path=np.zeros((steps + 1, 3), np.float32),
+        gripper=np.zeros(steps + 1, np.float32),
+        rand_vec=np.array([float(seed)]),
+        wall_seconds=1.0,
+    )
 
 
 def threshold_study(tasks: list[str], episodes: int = 4, radii: tuple[int, ...] = (3, 9)) -> list[Cell]:

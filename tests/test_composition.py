@@ -27,6 +27,7 @@ def test_every_shipped_method_fits_together(method: str) -> None:
         ("chunk=5", "trained for 4 control steps"),
         ("proposer.kind=nope", "proposer.kind 'nope'"),
         ("boundary.kind=nope", "boundary.kind 'nope'"),
+        ("method=heisd boundary.window=2", "boundary.window=2"),
         ("rectifier.kind=nope", "rectifier.kind 'nope'"),
         ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
         ("skip.kind=nope", "skip.kind 'nope'"),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from studies_synthetic import IDENTITY, settings_of
+from studies_synthetic import IDENTITY, settings_of, still_episode
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.settings import RolloutSettings, StudySettings
@@ -74,20 +74,7 @@ def record(cell: Cell, seed: int, slower: float = 1.0) -> EpisodeRecord:
         replace(d, seconds=slower * d.seconds, phases={name: slower * s for name, s in d.phases.items()})
         for d in DECODES[cell.label.split()[0]]
     ]
-    steps = len(decodes)
-    return EpisodeRecord(
-        task=cell.task,
-        instruction="",
-        seed=seed,
-        success=True,
-        steps=steps,
-        decodes=tuple(decodes),
-        decode_steps=tuple(range(steps)),
-        actions=np.zeros((steps, 4), np.float32),
-        path=np.zeros((steps + 1, 3), np.float32),
-        gripper=np.zeros(steps + 1, np.float32),
-        rand_vec=np.array([float(seed)]),
-    )
+    return still_episode(cell.task, seed, True, decodes)
 
 
 def write(

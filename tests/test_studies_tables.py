@@ -13,7 +13,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
-from studies_synthetic import IDENTITY, run_cell, settings_of, threshold_settings, threshold_study
+from studies_synthetic import (
+    IDENTITY,
+    run_cell,
+    settings_of,
+    still_episode,
+    threshold_settings,
+    threshold_study,
+)
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.errors import UsageError
@@ -46,24 +53,6 @@ def ar(seconds: float) -> DecodeRecord:
     return decode(seconds, [PREFILL, *(Round("decode", "none", i, (), (1,), 0, 1, 0, ()) for i in (1, 2, 3))])
 
 
-def record(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord]) -> EpisodeRecord:
-    steps = len(decodes)
-    return EpisodeRecord(
-        task=task,
-        instruction="",
-        seed=seed,
-        success=success,
-        steps=steps,
-        decodes=tuple(decodes),
-        decode_steps=tuple(range(steps)),
-        actions=np.zeros((steps, 4), np.float32),
-        path=np.zeros((steps + 1, 3), np.float32),
-        gripper=np.zeros(steps + 1, np.float32),
-        rand_vec=np.array([float(seed)]),
-        wall_seconds=1.0,
-    )
-
-
 ALL_ACCEPTED = decode(0.2, [PREFILL, verify(1, (5, 6, 7), accepted=3, committed=3)])
 SECOND_REJECTED = decode(
     0.3,
@@ -84,7 +73,7 @@ EPISODES: dict[tuple[str, str], list[tuple[bool, list[DecodeRecord]]]] = {
 
 def records_of(cell: Cell) -> list[EpisodeRecord]:
     episodes = EPISODES[cell.task, cell.label]
-    return [record(cell.task, seed, *episode) for seed, episode in zip(cell.seeds, episodes, strict=True)]
+    return [still_episode(cell.task, seed, *episode) for seed, episode in zip(cell.seeds, episodes, strict=True)]
 
 
 def hand_cells() -> list[Cell]:

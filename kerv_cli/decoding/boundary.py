@@ -157,12 +157,8 @@ class Fused:
         return Choice("retrieval" if metric >= self.f_star else "drafter", metric)
 
 
-def build_boundary(settings: BoundarySettings, ranges: BoundaryRanges | None = None) -> Boundary | None:
-    """The boundary of these settings; None for `always`, where the method has one proposer and nothing is chosen.
-
-    Raises:
-        UnknownName: no such kind. UsageError: a number out of range. CheckpointError: `fused` without ranges.
-    """
+def check_boundary(settings: BoundarySettings) -> None:
+    """Raises UnknownName for a kind that does not exist, UsageError for a number out of range."""
     if settings.kind not in KINDS:
         raise UnknownName("boundary.kind", settings.kind, KINDS)
     for name in ("alpha", "p"):
@@ -170,6 +166,15 @@ def build_boundary(settings: BoundarySettings, ranges: BoundaryRanges | None = N
             raise UsageError(f"boundary.{name}={getattr(settings, name)}: from 0 to 1")
     if settings.window < LEAST:
         raise UsageError(f"boundary.window={settings.window}: at least {LEAST} positions")
+
+
+def build_boundary(settings: BoundarySettings, ranges: BoundaryRanges | None = None) -> Boundary | None:
+    """The boundary of these settings; None for `always`, where the method has one proposer and nothing is chosen.
+
+    Raises:
+        UnknownName: no such kind. UsageError: a number out of range. CheckpointError: `fused` without ranges.
+    """
+    check_boundary(settings)
     if settings.kind == "random":
         return Random(settings.p)
     if settings.kind == "fused":

@@ -15,6 +15,7 @@ from kerv_cli.decoding.boundary import Choice
 from kerv_cli.decoding.record import PHASES, Round
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree
+from kerv_cli.errors import UsageError
 from kerv_cli.vla.trunk import Cache
 
 
@@ -40,6 +41,17 @@ class Clock:
     def stop(self) -> float:
         self.lap("other")
         return self.last - self.began
+
+
+def steps_of(asked: int, trained: int) -> int:
+    """Control steps of a chunk: as many as asked for, 0 for as many as the target was trained for.
+
+    Raises:
+        UsageError: more than it was trained for.
+    """
+    if not 0 <= asked <= trained:
+        raise UsageError(f"chunk={asked}: the target was trained for {trained} control steps")
+    return asked or trained
 
 
 @dataclass(frozen=True)

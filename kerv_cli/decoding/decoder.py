@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kerv_cli.decoding.acceptance import acceptance_rule, judging, limits_of
 from kerv_cli.decoding.boundary import Boundary, episode_generator
-from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Situation
+from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Situation, steps_of
 from kerv_cli.decoding.proposers import EMPTY
 from kerv_cli.decoding.record import DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
@@ -51,9 +51,7 @@ class Decoder:
         self.target, self.method, self.parts = target, method, parts or Parts()
         if self.parts.opening is not None and self.parts.opening.needs_states:
             raise UsageError(f"opening '{self.parts.opening.name}' needs the target's states, which come after it")
-        if not 0 <= method.chunk <= target.settings.chunk:
-            raise UsageError(f"chunk={method.chunk}: the target was trained for {target.settings.chunk} control steps")
-        self.size = (method.chunk or target.settings.chunk) * target.settings.dofs
+        self.size = steps_of(method.chunk, target.settings.chunk) * target.settings.dofs
         acceptance_rule(method.acceptance)
         self.threshold: Threshold = build_threshold(method.threshold)
         nodes = max(method.proposer.nodes, method.opening.nodes, self.size)

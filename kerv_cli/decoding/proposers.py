@@ -23,8 +23,8 @@ EMPTY = TokenTree((), (), ())
 SURE = 0.05  # odds from which no spare draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
 
 
-class ChainProposer:
-    """A proposer whose draft is one chain of the chunk's remaining tokens."""
+class Stateless:
+    """A proposer that reads nothing of the target but the committed tokens, and keeps nothing between rounds."""
 
     name = ""
     needs_states = False
@@ -32,18 +32,22 @@ class ChainProposer:
     def begin(self, chunk: Chunk) -> None:
         pass
 
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+        pass
+
+    def is_sure(self, chunk: Chunk) -> bool:
+        return False
+
+
+class ChainProposer(Stateless):
+    """A proposer whose draft is one chain of the chunk's remaining tokens."""
+
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         chains = self.chains(chunk, depth)
         return TokenTree.chain(chains[0]) if chains else EMPTY
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         raise NotImplementedError
-
-    def is_sure(self, chunk: Chunk) -> bool:
-        return False
-
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
-        pass
 
 
 class PredictionProposer(ChainProposer):
@@ -87,11 +91,10 @@ class EarlyProposer(ChainProposer):
         return self.drafted(chunk)[1] >= SURE
 
 
-class RetrievalProposer:
+class RetrievalProposer(Stateless):
     """The nearest stored chunks of the task, merged by kinematic group (METHODS §4.2)."""
 
     name = "retrieval"
-    needs_states = False
 
     def __init__(self, datastore: Datastore, target: Target, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
@@ -106,40 +109,26 @@ class RetrievalProposer:
             chunk.similarity = float(self._found[1].similarity[0])
         return self._found[1]
 
-    def begin(self, chunk: Chunk) -> None:
-        pass
-
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), self.groups, self.nodes, depth)
-
-    def is_sure(self, chunk: Chunk) -> bool:
-        return False
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         start = len(chunk.tokens)
         found: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
         return found
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
-        pass
 
-
-class MergedProposer:
+class MergedProposer(Stateless):
     """Whole drafts of several sources in one prefix tree, a branch each (METHODS §5).
 
     spare: sources that draft only where none of the others is sure of its chunk: every node costs time.
     """
 
-    needs_states = False
-
     def __init__(self, sources: Sequence[DraftsChunks], nodes: int, spare: Sequence[DraftsChunks] = ()) -> None:
         every = [*sources, *spare]
         self.name = every[0].name if len(every) == 1 else "merged"
         self.sources, self.spare, self.nodes = sources, spare, nodes
-
-    def begin(self, chunk: Chunk) -> None:
-        pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         sources = list(self.sources)
@@ -153,9 +142,6 @@ class MergedProposer:
             del chains[-1]
             tree = merge(chains)
         return tree
-
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
-        pass
 
 
 class HybridProposer:

@@ -18,7 +18,7 @@ import torch
 from kerv_cli.drafting.datastore import FILES, FORMAT, Datastore, check_seeds, prompt_key, segments_of
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, write_json
-from kerv_cli.places import artifact, find_target
+from kerv_cli.places import artifact, beside, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, TargetSettings
@@ -34,11 +34,7 @@ WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relax
 
 def datastore_beside(target: Path) -> Path:
     """Shipped: pretrained/<name>/{target,datastore}; built: artifacts/target/<name> and artifacts/datastore/<name>."""
-    if target.name == "target":
-        return target.parent / "datastore"
-    if target.parent.name == "target":
-        return target.parent.parent / "datastore" / target.name
-    return target / "datastore"
+    return beside(target, "datastore")
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from kerv_cli.decoding.boundary import KINDS as BOUNDARIES
+from kerv_cli.decoding.boundary import check_boundary
+from kerv_cli.decoding.chunk import steps_of
 from kerv_cli.decoding.rectify import DRAFT
 from kerv_cli.drafting.kinematics import PREDICTORS
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.settings import SPARE, MethodSettings
+from kerv_cli.settings import MethodSettings, opening_sources
 
 SOURCES = ("early", "retrieval", *PREDICTORS)
 PROPOSERS = ("none", "drafter", "hybrid", "jacobi", "expert", *SOURCES)
@@ -21,14 +22,13 @@ def check_composition(method: MethodSettings, chunk: int) -> None:
         UnknownName: no such part. UsageError: parts that do not belong together, or a number out of range.
     """
     _known("proposer.kind", method.proposer.kind, PROPOSERS)
-    _known("boundary.kind", method.boundary.kind, BOUNDARIES)
+    check_boundary(method.boundary)
     _known("rectifier.kind", method.rectifier.kind, RECTIFIERS)
     _known("rectifier.predictor", method.rectifier.predictor, (DRAFT, *PREDICTORS))
     _known("skip.kind", method.skip.kind, SKIPS)
-    for source in method.opening.sources:
-        _known("source of an opening", source.removesuffix(SPARE), SOURCES)
-    if not 0 <= method.chunk <= chunk:
-        raise UsageError(f"chunk={method.chunk}: the target was trained for {chunk} control steps")
+    for source in opening_sources(method.opening.sources):
+        _known("source of an opening", source, SOURCES)
+    steps_of(method.chunk, chunk)
     if (method.proposer.kind == "hybrid") != (method.boundary.kind != "always"):
         raise UsageError(
             f"proposer={method.proposer.kind} with boundary={method.boundary.kind}: a boundary chooses between the "
@@ -41,7 +41,7 @@ def check_composition(method: MethodSettings, chunk: int) -> None:
     drafts = method.proposer.kind not in ("none", "expert")
     if drafts and min(method.proposer.depth, method.proposer.top_k, method.proposer.nodes) < 1:
         raise UsageError("proposer.depth, proposer.top_k and proposer.nodes must be at least 1")
-    retrieves = {method.proposer.kind, *method.opening.sources} & {"retrieval", "hybrid", f"retrieval{SPARE}"}
+    retrieves = {method.proposer.kind, *opening_sources(method.opening.sources)} & {"retrieval", "hybrid"}
     if retrieves and min(method.proposer.neighbours, method.opening.neighbours) < 1:
         raise UsageError("retrieval needs at least one neighbour")
 

@@ -19,7 +19,7 @@ from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, early_folder, find_target
 from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import EVALUATION_SEED, SPARE, DatastoreSettings, MethodSettings, RolloutSettings
+from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings, opening_sources
 from kerv_cli.sim.tasks import resolve_tasks
 from kerv_cli.vla.checkpoint import load_target, read_description
 from kerv_cli.vla.target import Target
@@ -63,23 +63,19 @@ def is_expert(settings: RolloutSettings) -> bool:
     return settings.proposer.kind == "expert"
 
 
-def opening_sources(method: MethodSettings) -> set[str]:
-    """Names of the sources, spare ones included."""
-    return {name.removesuffix(SPARE) for name in method.opening.sources}
-
-
 def needs_drafter(method: MethodSettings) -> bool:
     return method.proposer.kind in ("drafter", "hybrid")
 
 
 def needs_early(method: MethodSettings) -> bool:
-    return method.proposer.kind == "early" or "early" in opening_sources(method)
+    return method.proposer.kind == "early" or "early" in opening_sources(method.opening.sources)
 
 
 def needs_datastore(method: MethodSettings) -> bool:
     """Whether a part retrieves stored chunks."""
-    retrieves = method.proposer.kind in ("retrieval", "hybrid") or "retrieval" in opening_sources(method)
-    return retrieves or method.skip.kind != "none"
+    if method.proposer.kind in ("retrieval", "hybrid") or method.skip.kind != "none":
+        return True
+    return "retrieval" in opening_sources(method.opening.sources)
 
 
 def observation_of(description: Mapping[str, Any]) -> str:
@@ -90,7 +86,7 @@ def observation_of(description: Mapping[str, Any]) -> str:
 
 def needs_calibration(method: MethodSettings) -> bool:
     """Whether a part reads what `kerv calibrate` fitted."""
-    predictors = {method.proposer.kind, *opening_sources(method)}
+    predictors = {method.proposer.kind, *opening_sources(method.opening.sources)}
     if method.rectifier.kind == "compensate":
         predictors.add(method.rectifier.predictor)
     return (

@@ -21,6 +21,7 @@ from kerv_cli.drafting.kinematics import PREDICTORS
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of
 from kerv_cli.places import find_target
+from kerv_cli.settings import opening_sources
 from kerv_cli.studies.drawing import INK, STYLE, colour, entitle, new_figure
 from kerv_cli.vla.action_tokens import DOF_NAMES, GRIPPER
 
@@ -91,7 +92,7 @@ def predicting_targets(settings: Iterable[Mapping[str, Any]]) -> list[str]:
 
 def _predicts(settings: Mapping[str, Any]) -> bool:
     opening = (settings.get("opening") or {}).get("sources") or []
-    drafts = {settings["proposer"]["kind"], *opening} & set(PREDICTORS)
+    drafts = {settings["proposer"]["kind"], *opening_sources(opening)} & set(PREDICTORS)
     return bool(drafts or settings["rectifier"]["kind"] == "compensate")
 
 

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.drafting.early import EarlyDrafter, choose, padded, pool
-from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings, TrainSettings
 from kerv_cli.sim.demo_dataset import DemoDataset
 from kerv_cli.sim.demo_file import DemoEpisode
 from kerv_cli.sim.tasks import task
 from kerv_cli.training.distillation import greedy
-from kerv_cli.training.imitation import soft_labels, token_loss
+from kerv_cli.training.imitation import held_out_of, soft_labels, token_loss
 from kerv_cli.training.loop import Job, Metrics
 from kerv_cli.vla.action_tokens import GRIPPER
 from kerv_cli.vla.target import Inputs, Target
@@ -48,13 +48,7 @@ class EarlySamples:
 
     def split(self, share: float) -> tuple[EarlySamples, EarlySamples]:
         """(training, held out): the same episodes as `imitation.split`, which the target was not trained on either."""
-        episodes = int(self.episodes.max()) + 1
-        if episodes < 2:
-            raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-        if not 0 < share <= 0.5:
-            raise UsageError(f"train.held_out={share}: more than 0, at most 0.5")
-        every = min(max(2, round(1 / share)), episodes)
-        held = self.episodes % every == every - 1
+        held = held_out_of(self.episodes, share)
         return self.where(~held), self.where(held)
 
 

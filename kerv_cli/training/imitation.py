@@ -107,15 +107,20 @@ def _frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[n
 
 
 def split(samples: Samples, share: float) -> tuple[Samples, Samples]:
-    """(training, held out), by whole episodes: every k-th, so that each task and both kinds are in both."""
-    episodes = int(samples.episodes.max()) + 1
-    if episodes < 2:
+    """(training, held out), by whole episodes."""
+    held = held_out_of(samples.episodes, share)
+    return samples.where(~held), samples.where(held)
+
+
+def held_out_of(episodes: Tensor, share: float) -> Tensor:
+    """episodes (n,) -> (n,) bool: every k-th episode, so that each task and both kinds are on both sides."""
+    count = int(episodes.max()) + 1
+    if count < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
     if not 0 < share <= 0.5:
         raise UsageError(f"train.held_out={share}: more than 0, at most 0.5")
-    every = min(max(2, round(1 / share)), episodes)
-    held = samples.episodes % every == every - 1
-    return samples.where(~held), samples.where(held)
+    every = min(max(2, round(1 / share)), count)
+    return episodes % every == every - 1
 
 
 def soft_labels(sigma: float) -> Tensor:
