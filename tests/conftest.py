@@ -16,12 +16,12 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     import torch
 
     from kerv_cli.config import compose
-    from kerv_cli.drafting.drafter import Drafter, save_drafter
+    from kerv_cli.drafting.eagle import Drafter, save_drafter
     from kerv_cli.settings import DrafterSettings, TrainTargetSettings
+    from kerv_cli.spaces import ActionTokenizer
+    from kerv_cli.targets.checkpoint import save_target
+    from kerv_cli.targets.compact.target import Target
     from kerv_cli.training.imitation import vocabulary
-    from kerv_cli.vla.action_tokens import ActionTokenizer
-    from kerv_cli.vla.checkpoint import save_target
-    from kerv_cli.vla.target import Target
 
     torch.manual_seed(seed)
     settings = compose("train_target", ["target=nano", f"target.observation={observation}"], TrainTargetSettings)

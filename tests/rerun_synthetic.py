@@ -14,9 +14,13 @@ def prefill(token: int) -> Round:
 
 
 def verify(
-    start: int, drafted: tuple[int, ...], verdicts: tuple[int, ...], accepted: int, r: tuple[int, ...] = (9, 9, 9, 0)
+    start: int,
+    drafted: tuple[int, ...],
+    target_tokens: tuple[int, ...],
+    accepted: int,
+    r: tuple[int, ...] = (9, 9, 9, 0),
 ) -> Round:
-    return Round("verify", "drafter", start, drafted, verdicts, accepted, accepted + 1, 20, r)
+    return Round("verify", "drafter", start, drafted, target_tokens, accepted, accepted + 1, 20, r)
 
 
 def decode_of(tokens: tuple[int, ...], rounds: tuple[Round, ...], steps: int, **extra: object) -> DecodeRecord:
@@ -41,7 +45,7 @@ def ar_decode(random: np.random.Generator, chunk: int = 4) -> DecodeRecord:
 
 
 def drafted_decode(random: np.random.Generator, chunk: int = 4, compensate: bool = False) -> DecodeRecord:
-    """Drafts of up to five tokens against random verdicts; a rejection ends a round, and maybe the chunk."""
+    """Drafts of up to five tokens against random target_tokens; a rejection ends a round, and maybe the chunk."""
     size = chunk * DOFS
     verdict = random.integers(20, 235, size)
     tokens, rounds, compensated = [int(verdict[0])], [prefill(int(verdict[0]))], 0

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kerv_cli.errors import UsageError
-from kerv_cli.vla.action_tokens import CENTRES, EDGES, VOCABULARY, ActionTokenizer, bins_of, values_of
-from kerv_cli.vla.text import PAD, UNKNOWN, WordTokenizer
+from kerv_cli.spaces import CENTRES, EDGES, VOCABULARY, ActionTokenizer, bins_of, values_of
+from kerv_cli.targets.compact.text import PAD, UNKNOWN, WordTokenizer
 
 WIDTH = 2 / 255  # of a bin
 

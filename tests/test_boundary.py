@@ -19,8 +19,8 @@ from kerv_cli.decoding.boundary import (
     radius_of_curvature,
 )
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.reporting.curvature import pseudo_radius
 from kerv_cli.settings import BoundarySettings
-from kerv_cli.studies.curvature import pseudo_radius
 
 WINDOW = 15
 RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)

@@ -17,17 +17,19 @@ from typer.testing import CliRunner
 
 from kerv_cli.commands.calibrate import calibrate
 from kerv_cli.config import compose
-from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration, save_calibration
+from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration, save_calibration
 from kerv_cli.decoding.thresholds import build_threshold
 from kerv_cli.drafting.kinematics import PREDICTORS, Noise
+from kerv_cli.environments.demos.dataset import DemoDataset, dataset_hash, episode_path
+from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, save_episode
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.places import find_target
 from kerv_cli.settings import CalibrateSettings, ThresholdSettings
-from kerv_cli.sim.demo_dataset import DemoDataset, dataset_hash, episode_path
-from kerv_cli.sim.demo_file import FORMAT, DemoEpisode, save_episode
+from kerv_cli.spaces import CENTRES, ActionTokenizer
+from kerv_cli.targets.checkpoint import read_description
 from kerv_cli.training.calibration import CalibrationRun, kinematic_variability, reference_level
-from kerv_cli.training.prediction import (
+from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
     episode_windows,
@@ -35,8 +37,6 @@ from kerv_cli.training.prediction import (
     position_errors,
     prediction_errors,
 )
-from kerv_cli.vla.action_tokens import CENTRES, ActionTokenizer
-from kerv_cli.vla.checkpoint import read_description
 
 TASKS = ("reach-v3", "drawer-close-v3")
 UNIT = ActionTokenizer(-np.ones(4), np.ones(4))
@@ -179,12 +179,12 @@ def test_both_kinds_of_episodes_are_held_out(results: Path) -> None:
 
 
 def test_variability_is_the_summed_difference_of_the_actions() -> None:
-    drafted, verdicts = np.array([[10, 20, 30], [0, 0, 254]]), np.array([[10, 22, 27], [0, 0, 0]])
+    drafted, target_tokens = np.array([[10, 20, 30], [0, 0, 254]]), np.array([[10, 22, 27], [0, 0, 0]])
     bin_width = 2 / 255
-    np.testing.assert_allclose(kinematic_variability(drafted, verdicts), [5 * bin_width, 254 * bin_width])
+    np.testing.assert_allclose(kinematic_variability(drafted, target_tokens), [5 * bin_width, 254 * bin_width])
     assert kinematic_variability(np.array([], dtype=int), np.array([], dtype=int)) == 0
     with pytest.raises(ValueError, match="cannot be compared"):
-        kinematic_variability(drafted, verdicts[:1])
+        kinematic_variability(drafted, target_tokens[:1])
 
 
 def test_the_reference_level_is_the_median_and_can_divide() -> None:
@@ -225,9 +225,9 @@ def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
     episode = run.dataset.load(0)
     decoder.reset(episode.task, "reach")
     record = decoder.decode(None, episode.states[0])
-    pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.verdicts, strict=False)]
-    drafted, verdicts = np.array(pairs).T
-    assert record.variability == pytest.approx(float(kinematic_variability(drafted, verdicts)))
+    pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.target_tokens, strict=False)]
+    drafted, target_tokens = np.array(pairs).T
+    assert record.variability == pytest.approx(float(kinematic_variability(drafted, target_tokens)))
 
 
 def test_the_tasks_reference_level_reaches_the_threshold(results: Path) -> None:

@@ -19,16 +19,16 @@ from typer.testing import CliRunner
 from kerv_cli.commands.calibrate import calibrate
 from kerv_cli.config import compose
 from kerv_cli.decoding.boundary import BoundaryRanges
-from kerv_cli.decoding.calibration import NEVER, Calibration, load_calibration, save_calibration
+from kerv_cli.decoding.calibration_file import NEVER, Calibration, load_calibration, save_calibration
 from kerv_cli.drafting.datastore import Datastore
-from kerv_cli.drafting.datastore_build import DatastoreBuild
+from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError, UnknownName
 from kerv_cli.files import sha256_of, write_json
 from kerv_cli.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
-from kerv_cli.sim.demo_file import DemoEpisode
+from kerv_cli.spaces import CENTRES
 from kerv_cli.training.calibration import CalibrationRun
-from kerv_cli.training.skipping import LEAST, Matches, lowest_level, match, skip_section, task_levels
-from kerv_cli.vla.action_tokens import CENTRES
+from kerv_cli.training.datastore import DatastoreBuild
+from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels
 
 BIN = float(CENTRES[1] - CENTRES[0])
 

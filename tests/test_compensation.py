@@ -14,7 +14,7 @@ from kerv_cli.drafting.kinematics import ActionHistory, Hold, Linear
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import AcceptanceSettings, MethodSettings, OpeningSettings, RectifierSettings
-from kerv_cli.vla.action_tokens import values_of
+from kerv_cli.spaces import values_of
 
 D, N = 4, 16
 

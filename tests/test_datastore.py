@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from kerv_cli.commands import build as command
-from kerv_cli.drafting import datastore_build
 from kerv_cli.drafting.datastore import (
     Datastore,
     check_seeds,
@@ -30,15 +29,16 @@ from kerv_cli.drafting.datastore import (
     prompt_key,
     segments_of,
 )
-from kerv_cli.drafting.datastore_build import DatastoreBuild, leave_one_out
 from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge
+from kerv_cli.environments.demos.dataset import dataset_hash, episode_path
+from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, save_episode
 from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, DatastoreSettings, PolicySettings
-from kerv_cli.sim.demo_dataset import dataset_hash, episode_path
-from kerv_cli.sim.demo_file import FORMAT, DemoEpisode, save_episode
-from kerv_cli.vla.checkpoint import load_target
+from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.training import datastore as datastore_build
+from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
 
 TASKS = ("drawer-close-v3", "reach-v3")
 LENGTHS = {0: 9, 1: 6, 7: 11}  # seed -> control steps
@@ -224,7 +224,7 @@ def test_a_chunk_is_what_follows_in_its_own_episode(results: Path) -> None:
 
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
 def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> None:
-    from kerv_cli.sim.tasks import task as task_of
+    from kerv_cli.environments.metaworld.tasks import task as task_of
 
     store, target, _ = opened(results, name)
     shown = episode("reach-v3", 1, LENGTHS[1])

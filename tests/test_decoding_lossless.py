@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
-from kerv_cli.drafting.drafter import Drafter
+from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import (
     AcceptanceSettings,
@@ -22,10 +22,10 @@ from kerv_cli.settings import (
     TargetSettings,
     ThresholdSettings,
 )
-from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
-from kerv_cli.vla.layout import lay_out_for_inference
-from kerv_cli.vla.target import Target
-from kerv_cli.vla.text import WordTokenizer
+from kerv_cli.spaces import VOCABULARY, ActionTokenizer
+from kerv_cli.targets.compact.layout import lay_out_for_inference
+from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.text import WordTokenizer
 
 STRICT = AcceptanceSettings(kind="strict")
 
@@ -37,7 +37,7 @@ def random_target(seed: int, layers: int, heads: int, chunk: int) -> Target:
         observation="state", width=16 * heads, layers=layers, heads=heads, feed_forward=48, chunk=chunk, scene_tokens=2
     )
     target = Target(settings, ActionTokenizer(-np.ones(4), np.ones(4)), WordTokenizer.build(["open the drawer"]))
-    for parameter in target.trunk.parameters():  # far from initialisation, so that verdicts depend on the context
+    for parameter in target.trunk.parameters():  # far from initialisation, so that target_tokens depend on the context
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.25)
     torch.nn.init.normal_(target.embedding.weight, std=1.0)
@@ -75,7 +75,7 @@ class RandomTrees:
     def begin(self, chunk: Chunk) -> None:
         pass
 
-    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, verdicts: list[int]) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, target_tokens: list[int]) -> None:
         assert hidden.shape[1] == len(chunk.tokens) - first - 1
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:

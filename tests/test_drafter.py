@@ -6,10 +6,10 @@ import pytest
 import torch
 from test_decoding_lossless import random_prompt, random_target
 
-from kerv_cli.drafting.drafter import Drafter, DraftState, grow_tree, observe
+from kerv_cli.drafting.eagle import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import DrafterSettings
-from kerv_cli.vla.target import Target
+from kerv_cli.targets.compact.target import Target
 
 
 def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, Target, DraftState, TokenTree]:

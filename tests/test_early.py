@@ -27,14 +27,16 @@ from kerv_cli.drafting.early import (
     save_early,
 )
 from kerv_cli.drafting.kinematics import ActionHistory
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.demos.recording import DemoConfig, record
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.places import early_folder
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
-from kerv_cli.sim.camera import CameraConfig
-from kerv_cli.sim.demo_dataset import DemoDataset
-from kerv_cli.sim.demo_file import DemoEpisode
-from kerv_cli.sim.demos import DemoConfig, record
-from kerv_cli.training.early import (
+from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.targets.compact.target import Target
+from kerv_cli.training.early_distillation import (
     EarlyDistillation,
     EarlySamples,
     accepted_tokens,
@@ -44,8 +46,6 @@ from kerv_cli.training.early import (
 )
 from kerv_cli.training.imitation import load_samples, split
 from kerv_cli.training.runs import EarlyRun, drafter_run
-from kerv_cli.vla.checkpoint import load_target
-from kerv_cli.vla.target import Target
 
 SMALL = DrafterSettings(kind="early", layers=2, width=32, rank=8, history=2, samples=1000)
 SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10

@@ -9,11 +9,11 @@ import pytest
 
 from kerv_cli.config import compose
 from kerv_cli.decoding.record import PHASES, EpisodeRecord
+from kerv_cli.environments.metaworld.world import World
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.rollouts import policy as policies_of
 from kerv_cli.rollouts import run
 from kerv_cli.settings import EVALUATION_SEED, RolloutSettings
-from kerv_cli.sim.world import World
 
 
 def settings(results: Path, *overrides: str) -> RolloutSettings:

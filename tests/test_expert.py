@@ -14,16 +14,16 @@ import pyarrow.parquet as pq
 import pytest
 
 from kerv_cli.decoding.record import PHASES, EpisodeRecord
+from kerv_cli.environments.metaworld.tasks import task
+from kerv_cli.environments.metaworld.world import Expert, World
 from kerv_cli.errors import KervError, UnknownName
+from kerv_cli.reporting.measures import MACRO, MICRO, measure
 from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.expert import ExpertDecoder
-from kerv_cli.rollouts.rerun_log import save_episode, summary
-from kerv_cli.rollouts.viewer import read_back
 from kerv_cli.settings import EVALUATION_SEED
-from kerv_cli.sim.tasks import task
-from kerv_cli.sim.world import Expert, World
-from kerv_cli.studies.measures import MACRO, MICRO, measure
 from kerv_cli.studies.rows import DECODE_SCHEMA, EPISODE_SCHEMA, decode_record, decode_rows, episode_row, parquet_bytes
+from kerv_cli.viewing.rerun_log import save_episode, summary
+from kerv_cli.viewing.viewer import read_back
 
 NAME = "window-close-v3"
 STAMPS = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}

@@ -22,9 +22,9 @@ from kerv_cli.decoding.proposers import (
     PredictionProposer,
     RetrievalProposer,
 )
-from kerv_cli.decoding.skipping import SkipLevels, VerifySkip
+from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
 from kerv_cli.drafting.datastore import Datastore, prompt_key
-from kerv_cli.drafting.drafter import Drafter
+from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import (
@@ -36,8 +36,8 @@ from kerv_cli.settings import (
     ProposerSettings,
     SkipSettings,
 )
-from kerv_cli.vla.action_tokens import bins_of
-from kerv_cli.vla.target import Target
+from kerv_cli.spaces import bins_of
+from kerv_cli.targets.compact.target import Target
 
 D = 4
 STRICT = AcceptanceSettings("strict")

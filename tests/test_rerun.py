@@ -18,10 +18,10 @@ from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, v
 
 from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
 from kerv_cli.errors import KervError, StorageError, UsageError
-from kerv_cli.rollouts import rerun_log, viewer
-from kerv_cli.rollouts.rerun_log import readable, save_episode
-from kerv_cli.rollouts.token_fates import chunk_size, fates_of
-from kerv_cli.rollouts.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
+from kerv_cli.viewing import rerun_log, viewer
+from kerv_cli.viewing.rerun_log import readable, save_episode
+from kerv_cli.viewing.token_outcomes import chunk_size, fates_of
+from kerv_cli.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
 
 
 def saved(record: EpisodeRecord, folder: Path, method: str = "spec_vla") -> Path:
@@ -102,7 +102,7 @@ def test_values_survive_to_the_last_digit(tmp_path: Path) -> None:
     first = next(r for r in record.decodes[0].rounds if r.drafted)
     table = column(path, "/decode/table", "text")[0][0]
     assert str(first.drafted[0]) in table
-    assert str(first.verdicts[0]) in table
+    assert str(first.target_tokens[0]) in table
 
 
 def test_series_have_names(tmp_path: Path) -> None:
@@ -158,8 +158,8 @@ def test_finding_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_every_place_of_a_chunk_has_its_fate() -> None:
-    verdicts = (60, 70, 80, 90, 100, 110, 120)
-    rounds = (prefill(50), verify(1, (60, 73, 99), verdicts[:3], 2), verify(4, (90, 101), verdicts[3:6], 2))
+    target_tokens = (60, 70, 80, 90, 100, 110, 120)
+    rounds = (prefill(50), verify(1, (60, 73, 99), target_tokens[:3], 2), verify(4, (90, 101), target_tokens[3:6], 2))
     decode = decode_of((50, 60, 73, 80, 90, 101, 110, 128), rounds, 2, compensated=1)
     fates = fates_of(decode, 12, DOFS)
     names = ["target", "accepted", "relaxed", "rejected", "accepted", "relaxed", "bonus", "compensated"]

@@ -16,9 +16,9 @@ from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import AcceptanceSettings, MethodSettings, ProposerSettings, TargetSettings
-from kerv_cli.vla.action_tokens import ActionTokenizer
-from kerv_cli.vla.target import Target
-from kerv_cli.vla.text import WordTokenizer
+from kerv_cli.spaces import ActionTokenizer
+from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.text import WordTokenizer
 
 POSITION_GRIPPER = kinematic_groups(4)
 LIMITS = (15, 15, 15, 0)
@@ -34,7 +34,7 @@ def bushes(draw: st.DrawFn, most: int = 16, vocabulary: int = 6) -> TokenTree:
 
 
 def slow_acceptance(
-    tree: TokenTree, verdicts: list[int], start: int, limits: list[int], group_limit: int, groups: Groups
+    tree: TokenTree, target_tokens: list[int], start: int, limits: list[int], group_limit: int, groups: Groups
 ) -> tuple[int, int, int]:
     """(−length, distance, node) of the best path, by the definition: every root path of whole groups, judged group by
     group."""
@@ -43,7 +43,7 @@ def slow_acceptance(
     best = (0, 0, ROOT)
     for node in range(len(tree)):
         path = tree.path_to(node)
-        bias = [abs(tree.tokens[i] - verdicts[tree.parents[i] + 1]) for i in path]
+        bias = [abs(tree.tokens[i] - target_tokens[tree.parents[i] + 1]) for i in path]
         where = [(start + d) // dofs * len(groups) + name[(start + d) % dofs] for d in range(len(path))]
         behind = start + len(path)
         whole = behind % dofs == 0 or name[behind % dofs] != name[(behind - 1) % dofs]
@@ -63,9 +63,9 @@ def test_the_sequence_rule_is_its_definition(
 ) -> None:
     dofs = sum(map(len, groups))
     limits = data.draw(st.lists(st.integers(0, 4), min_size=dofs, max_size=dofs))
-    verdicts = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
-    found = accept_by_group(tree, verdicts, start, limits, group_limit=group_limit, groups=groups)
-    _, _, node = slow_acceptance(tree, verdicts, start, limits, group_limit, groups)
+    target_tokens = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
+    found = accept_by_group(tree, target_tokens, start, limits, group_limit=group_limit, groups=groups)
+    _, _, node = slow_acceptance(tree, target_tokens, start, limits, group_limit, groups)
     assert list(found.path) == (tree.path_to(node) if node != ROOT else [])
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     assert (found.rejected is None) == (not children)
@@ -78,13 +78,13 @@ def test_the_sequence_rule_is_its_definition(
 def test_no_limits_on_single_dofs_is_acceptance_by_distance(tree: TokenTree, data: st.DataObject, start: int) -> None:
     """Groups of one DoF and a loose sum leave only the token limits: Spec-VLA's rule."""
     limits = data.draw(st.lists(st.integers(0, 4), min_size=4, max_size=4))
-    verdicts = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
-    single = accept_by_group(tree, verdicts, start, limits, group_limit=99, groups=((0,), (1,), (2,), (3,)))
-    assert single == accept_by_distance(tree, verdicts, start, limits)
+    target_tokens = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
+    single = accept_by_group(tree, target_tokens, start, limits, group_limit=99, groups=((0,), (1,), (2,), (3,)))
+    assert single == accept_by_distance(tree, target_tokens, start, limits)
 
 
 def judge(tokens: list[int], start: int = 0, verdict: int = 100) -> int:
-    """Accepted length of a chain whose verdicts are all `verdict`."""
+    """Accepted length of a chain whose target_tokens are all `verdict`."""
     tree = TokenTree.chain(tokens)
     return len(accept_by_group(tree, [verdict] * (len(tokens) + 1), start, LIMITS, group_limit=30).path)
 
@@ -167,7 +167,7 @@ class Shifted:
     def begin(self, chunk: Chunk) -> None:
         pass
 
-    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, verdicts: list[int]) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, target_tokens: list[int]) -> None:
         pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:

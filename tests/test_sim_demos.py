@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
+from kerv_cli.environments.demos.recording import DemoConfig, DemoDataset, record
+from kerv_cli.environments.metaworld.world import Expert, World
 from kerv_cli.errors import CheckpointError, KervError, UsageError
-from kerv_cli.sim.camera import CameraConfig
-from kerv_cli.sim.demos import DemoConfig, DemoDataset, record
-from kerv_cli.sim.perturbation import Perturbation, is_perturbed
-from kerv_cli.sim.world import Expert, World
 
 CONFIG = DemoConfig(
     tasks=("reach",), episodes=6, frame_stride=10, camera=CameraConfig(size=24, supersample=1), workers=1, tail=5

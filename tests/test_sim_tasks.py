@@ -7,12 +7,12 @@ from collections import Counter
 
 import pytest
 
+from kerv_cli.environments.metaworld.tasks import DIFFICULTIES, SUITES, TASKS, resolve_tasks, task
 from kerv_cli.errors import UnknownName
-from kerv_cli.sim.tasks import DIFFICULTIES, SUITES, TASKS, resolve_tasks, task
 
 
 def test_the_names_are_those_of_metaworld():
-    from kerv_cli.sim.world import load_simulator
+    from kerv_cli.environments.metaworld.world import load_simulator
 
     load_simulator()
     from metaworld.policies import ENV_POLICY_MAP
@@ -62,5 +62,6 @@ def test_suites_expand_in_order_without_duplicates():
 
 
 def test_importing_the_table_loads_nothing_heavy():
-    code = "import sys, kerv_cli.sim.tasks; sys.exit(any(m in sys.modules for m in ('numpy', 'mujoco', 'metaworld')))"
+    heavy = "('numpy', 'mujoco', 'metaworld')"
+    code = f"import sys, kerv_cli.environments.metaworld.tasks; sys.exit(any(m in sys.modules for m in {heavy}))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

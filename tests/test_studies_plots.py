@@ -13,14 +13,14 @@ import pytest
 from matplotlib.figure import Figure
 from studies_synthetic import IDENTITY, run_cell, settings_of
 
+from kerv_cli.reporting.drawing import STYLE, new_figure
+from kerv_cli.reporting.measures import MICRO
+from kerv_cli.reporting.plots import series_of, study_figures
+from kerv_cli.reporting.scatter import place_labels
+from kerv_cli.reporting.tables import load_study, study_table
 from kerv_cli.settings import RolloutSettings, StudySettings
-from kerv_cli.studies.drawing import STYLE, new_figure
-from kerv_cli.studies.measures import MICRO
 from kerv_cli.studies.plan import plan
-from kerv_cli.studies.plots import series_of, study_figures
-from kerv_cli.studies.scatter import place_labels
 from kerv_cli.studies.store import StudyStore
-from kerv_cli.studies.tables import load_study, study_table
 
 
 def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:

@@ -9,14 +9,12 @@ import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, run_cell, settings_of
 
-from kerv_cli.decoding.calibration import Calibration, save_calibration
+from kerv_cli.decoding.calibration_file import Calibration, save_calibration
 from kerv_cli.drafting.kinematics import FILTERS, Noise
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.settings import StudySettings
-from kerv_cli.studies.curvature import RADII, radius_table
-from kerv_cli.studies.plan import plan
-from kerv_cli.studies.prediction import (
+from kerv_cli.reporting.curvature import RADII, radius_table
+from kerv_cli.reporting.prediction import (
     calibrated_targets,
     predicting_targets,
     prediction_figure,
@@ -24,7 +22,9 @@ from kerv_cli.studies.prediction import (
     prediction_table,
     read_predictions,
 )
-from kerv_cli.studies.report import report
+from kerv_cli.reporting.report import report
+from kerv_cli.settings import StudySettings
+from kerv_cli.studies.plan import plan
 from kerv_cli.studies.store import StudyStore
 
 DOFS = ("dx", "dy", "dz", "gripper")

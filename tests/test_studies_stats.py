@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from kerv_cli.studies.stats import PairedCounts, macro_wilson, mcnemar, paired_counts, speedup, wilson
+from kerv_cli.reporting.statistics import PairedCounts, macro_wilson, mcnemar, paired_counts, speedup, wilson
 
 Z = 1.959963984540054  # 97.5th percentile of the normal distribution
 

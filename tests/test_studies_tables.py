@@ -24,14 +24,14 @@ from studies_synthetic import (
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.errors import UsageError
+from kerv_cli.reporting.measures import MACRO, MICRO
+from kerv_cli.reporting.report import report
+from kerv_cli.reporting.summary import summary_frame, summary_table
+from kerv_cli.reporting.tables import StudyData, csv_text, load_study, per_task_table, study_table
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies.execute import execute
-from kerv_cli.studies.measures import MACRO, MICRO
 from kerv_cli.studies.plan import Cell, plan
-from kerv_cli.studies.report import report
 from kerv_cli.studies.store import StudyStore
-from kerv_cli.studies.summary import summary_frame, summary_table
-from kerv_cli.studies.tables import StudyData, csv_text, load_study, per_task_table, study_table
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
 STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip", "torch_version": "2", "git_commit": "c"}
@@ -342,7 +342,7 @@ def test_the_page_stands_alone(results: Path) -> None:
 
 
 def test_figures_show_the_axis_and_the_references(results: Path) -> None:
-    from kerv_cli.studies.plots import series_of, study_figures
+    from kerv_cli.reporting.plots import series_of, study_figures
 
     table = study_table(load_study(StudyStore(results, "threshold")))
     rows = table[table["averaging"] == MICRO]

@@ -16,15 +16,15 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.recording import DemoConfig, record
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainSettings
-from kerv_cli.sim.camera import CameraConfig
-from kerv_cli.sim.demos import DemoConfig, record
+from kerv_cli.spaces import ActionTokenizer
+from kerv_cli.targets.compact.target import Target
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, schedule
-from kerv_cli.vla.action_tokens import ActionTokenizer
-from kerv_cli.vla.target import Target
 
 TINY = TrainSettings(steps=12, batch=4, lr=0.01, warmup=2, validate_every=4, ema=0.9)
 

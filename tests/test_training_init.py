@@ -13,16 +13,16 @@ import torch
 from safetensors.torch import load_file
 
 from kerv_cli.config import compose
+from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry
+from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TrainDrafterSettings, TrainTargetSettings
-from kerv_cli.sim.demo_dataset import DemoDataset, DemoEntry
-from kerv_cli.sim.demo_file import DemoEpisode
+from kerv_cli.spaces import ActionTokenizer
+from kerv_cli.targets.checkpoint import load_target, read_description, save_target
+from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training import runs
 from kerv_cli.training.runs import TargetRun
-from kerv_cli.vla.action_tokens import ActionTokenizer
-from kerv_cli.vla.checkpoint import load_target, read_description, save_target
-from kerv_cli.vla.target import Target
-from kerv_cli.vla.text import WordTokenizer
 
 LOW, HIGH = np.array([-0.5, -1.0, -1.0, -1.0]), np.array([0.5, 1.0, 2.0, 1.0])
 WORDS = WordTokenizer.build(["pull the drawer open", "jump"])

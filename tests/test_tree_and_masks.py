@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.decoding.acceptance import accept_by_distance
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge, verify_mask
-from kerv_cli.vla.trunk import Cache, Trunk
+from kerv_cli.targets.compact.trunk import Cache, Trunk
 
 
 @st.composite
@@ -75,12 +75,12 @@ def test_truncation_keeps_the_nodes_above_the_depth(tree: TokenTree, depth: int)
     assert sorted(tuple(short.tokens[i] for i in short.path_to(n)) for n in range(len(short))) == paths
 
 
-def slow_acceptance(tree: TokenTree, verdicts: list[int], start: int, limits: list[int]) -> tuple[int, int]:
+def slow_acceptance(tree: TokenTree, target_tokens: list[int], start: int, limits: list[int]) -> tuple[int, int]:
     """METHODS §2.1 read aloud: the longest root path whose tokens are all within their limits, then the nearest."""
     best = (0, 0)
     for node in range(len(tree)):
         path = tree.path_to(node)
-        gaps = [abs(tree.tokens[i] - verdicts[tree.parents[i] + 1]) for i in path]
+        gaps = [abs(tree.tokens[i] - target_tokens[tree.parents[i] + 1]) for i in path]
         allowed = [limits[(start + d) % len(limits)] for d in range(len(path))]
         if all(gap <= limit for gap, limit in zip(gaps, allowed, strict=True)):
             best = min(best, (-len(path), sum(gaps)))
@@ -90,10 +90,10 @@ def slow_acceptance(tree: TokenTree, verdicts: list[int], start: int, limits: li
 @settings(max_examples=200)
 @given(trees(), st.data(), st.integers(0, 7), st.lists(st.integers(0, 5), min_size=1, max_size=4))
 def test_acceptance_is_its_definition(tree: TokenTree, data: st.DataObject, start: int, limits: list[int]) -> None:
-    verdicts = [data.draw(st.integers(0, 11)) for _ in range(len(tree) + 1)]
-    found = accept_by_distance(tree, verdicts, start, limits)
-    gaps = [abs(tree.tokens[i] - verdicts[tree.parents[i] + 1]) for i in found.path]
-    assert (-len(found.path), sum(gaps)) == slow_acceptance(tree, verdicts, start, limits)
+    target_tokens = [data.draw(st.integers(0, 11)) for _ in range(len(tree) + 1)]
+    found = accept_by_distance(tree, target_tokens, start, limits)
+    gaps = [abs(tree.tokens[i] - target_tokens[tree.parents[i] + 1]) for i in found.path]
+    assert (-len(found.path), sum(gaps)) == slow_acceptance(tree, target_tokens, start, limits)
     assert list(found.path) == (tree.path_to(found.path[-1]) if found.path else [])
     end = found.path[-1] if found.path else ROOT
     children = [i for i, parent in enumerate(tree.parents) if parent == end]

@@ -11,15 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.drafting.drafter import Drafter
+from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree, prefill_mask, verify_mask
 from kerv_cli.settings import DrafterSettings, TargetSettings
-from kerv_cli.vla.action_tokens import VOCABULARY, ActionTokenizer
-from kerv_cli.vla.inference import FastLinear, has_blocked_layouts
-from kerv_cli.vla.layout import lay_out_for_inference
-from kerv_cli.vla.target import Inputs, Target
-from kerv_cli.vla.text import WordTokenizer
-from kerv_cli.vla.trunk import Trunk
+from kerv_cli.spaces import VOCABULARY, ActionTokenizer
+from kerv_cli.targets.compact.inference import FastLinear, has_blocked_layouts
+from kerv_cli.targets.compact.layout import lay_out_for_inference
+from kerv_cli.targets.compact.target import Inputs, Target
+from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.trunk import Trunk
 
 
 def shaken(module: torch.nn.Module, seed: int) -> torch.nn.Module:

@@ -27,7 +27,7 @@ def datastore(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPl
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         return
-    from kerv_cli.drafting.datastore_build import DatastoreBuild, leave_one_out
+    from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
 
     run = DatastoreBuild(settings)
     if plan:

@@ -11,7 +11,7 @@ from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, e
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from kerv_cli.decoding.calibration import Calibration
+    from kerv_cli.decoding.calibration_file import Calibration
 
 
 @edge
@@ -55,7 +55,7 @@ def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPl
 def _tasks(calibration: Calibration, path: Path) -> None:
     from rich.table import Table
 
-    from kerv_cli.training.prediction import position_errors
+    from kerv_cli.training.predictor_fit import position_errors
 
     columns = ("task", "fitted on", "tested on", "decodes", "K_S", "K p25", "K p75", "Kalman, h=1", "hold, h=1")
     table = Table(*columns, title=f"calibration in {path}")
@@ -71,7 +71,7 @@ def _tasks(calibration: Calibration, path: Path) -> None:
 def _noise(calibration: Calibration) -> None:
     from rich.table import Table
 
-    from kerv_cli.vla.action_tokens import DOF_NAMES, GRIPPER
+    from kerv_cli.spaces import DOF_NAMES, GRIPPER
 
     table = Table("filter", *DOF_NAMES[:GRIPPER], title="fitted q / r (damping)")
     for kind, noise in calibration.noise.items():
@@ -83,7 +83,7 @@ def _noise(calibration: Calibration) -> None:
 def _errors(calibration: Calibration) -> None:
     from rich.table import Table
 
-    from kerv_cli.training.prediction import position_errors
+    from kerv_cli.training.predictor_fit import position_errors
 
     hold = position_errors(calibration.errors, "hold")
     horizon = hold.shape[1]

@@ -28,7 +28,7 @@ def complete_overrides(incomplete: str) -> list[str]:
         group = incomplete.split("=", 1)[0]
         words = [f"{group}={name}" for name in known.get(group, [])]
         if group == "task":
-            from kerv_cli.sim.tasks import SUITES, TASKS
+            from kerv_cli.environments.metaworld.tasks import SUITES, TASKS
 
             words = [f"task={name}" for name in [*SUITES, *TASKS]]
     else:

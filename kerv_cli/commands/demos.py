@@ -11,8 +11,8 @@ from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, e
 def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset."""
     from kerv_cli.config import compose, to_yaml
+    from kerv_cli.environments.metaworld.tasks import resolve_tasks
     from kerv_cli.settings import DemosSettings, as_plain
-    from kerv_cli.sim.tasks import resolve_tasks
 
     settings = compose("demos", overrides or [], DemosSettings)
     tasks = resolve_tasks(settings.task)
@@ -27,8 +27,8 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
         typer.echo(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
         return
-    from kerv_cli.sim.camera import CameraConfig
-    from kerv_cli.sim.demos import DemoConfig, record
+    from kerv_cli.environments.camera import CameraConfig
+    from kerv_cli.environments.demos.recording import DemoConfig, record
 
     config = DemoConfig(
         tasks=tasks,

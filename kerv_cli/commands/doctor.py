@@ -52,9 +52,9 @@ def _rendering(settings: object) -> Finding:
 
     assert isinstance(settings, DoctorSettings)
     try:
+        from kerv_cli.environments.camera import choose_backend
+        from kerv_cli.environments.metaworld.world import World
         from kerv_cli.rollouts.run import camera_config
-        from kerv_cli.sim.camera import choose_backend
-        from kerv_cli.sim.world import World
 
         backend = choose_backend()
         with World("reach-v3", camera_config(settings.world.camera)) as world:
@@ -92,7 +92,7 @@ def _policies(settings: object) -> list[Finding]:
     from kerv_cli.errors import KervError
     from kerv_cli.places import find_target, shipped_dir
     from kerv_cli.settings import DoctorSettings
-    from kerv_cli.vla.checkpoint import read_description
+    from kerv_cli.targets.checkpoint import read_description
 
     assert isinstance(settings, DoctorSettings)
     findings = []
@@ -130,7 +130,7 @@ def _disk(settings: object) -> Finding:
 
 
 def _display() -> Finding:
-    from kerv_cli.rollouts.viewer import has_display
+    from kerv_cli.viewing.viewer import has_display
 
     says = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
     return Finding("display", True, says)

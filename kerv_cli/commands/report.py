@@ -20,10 +20,10 @@ def report(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
         typer.echo(to_yaml(settings), nl=False)
         return
     from kerv_cli.places import results_dir
-    from kerv_cli.studies.report import report as write_report
+    from kerv_cli.reporting.report import report as write_report
+    from kerv_cli.reporting.summary import summary_table
+    from kerv_cli.reporting.tables import load_study, study_table
     from kerv_cli.studies.store import StudyStore, list_studies
-    from kerv_cli.studies.summary import summary_table
-    from kerv_cli.studies.tables import load_study, study_table
 
     results = results_dir(settings.results)
     written = write_report(results, settings.only)

@@ -37,7 +37,7 @@ def rollout(
 
 
 def _run(settings: RolloutSettings, plan: bool) -> None:
-    from kerv_cli.sim.tasks import resolve_tasks
+    from kerv_cli.environments.metaworld.tasks import resolve_tasks
 
     tasks = resolve_tasks(settings.task)
     from kerv_cli.rollouts.policy import check
@@ -70,7 +70,7 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
 
 
 def _save(record: EpisodeRecord, folder: Path, settings: RolloutSettings) -> Path:
-    from kerv_cli.rollouts.rerun_log import save_episode
+    from kerv_cli.viewing.rerun_log import save_episode
 
     path = folder / f"{record.task}-{record.seed}.rrd"
     return save_episode(record, path, method=settings.method, tokens_per_step=4)

@@ -20,7 +20,7 @@ SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core take
 def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Run a study: every setting on every task with the same seeds. Complete cells are reused."""
     from kerv_cli.config import to_yaml
-    from kerv_cli.sim.tasks import resolve_tasks
+    from kerv_cli.environments.metaworld.tasks import resolve_tasks
     from kerv_cli.studies.resolve import resolve
 
     resolved = resolve(overrides or [])
@@ -63,11 +63,11 @@ def _print_plan(cells: list[Cell], store: StudyStore, workers: int) -> None:
 
 
 def _run(resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, workers: int) -> None:
+    from kerv_cli.reporting.summary import summary_table
+    from kerv_cli.reporting.tables import load_study, study_table
     from kerv_cli.rollouts.cells import CellRunner
     from kerv_cli.studies.execute import execute
     from kerv_cli.studies.progress import ProgressDisplay
-    from kerv_cli.studies.summary import summary_table
-    from kerv_cli.studies.tables import load_study, study_table
 
     study = resolved.study
     store.write_plan(study, cells)

@@ -28,7 +28,7 @@ def view(
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         return
-    from kerv_cli.rollouts.viewer import find_recordings, open_recording, read_summary
+    from kerv_cli.viewing.viewer import find_recordings, open_recording, read_summary
 
     places = [Path(w) for w in words if w not in overrides] or [Path(settings.results)]
     recordings = find_recordings(places)

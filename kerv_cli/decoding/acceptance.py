@@ -23,10 +23,10 @@ class Verdict:
     rejected: int | None
 
 
-def accept_by_distance(tree: TokenTree, verdicts: Sequence[int], start: int, limits: Sequence[int]) -> Verdict:
+def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Verdict:
     """Accept a node when abs(token − verdict at its parent) ≤ the limit of its DoF and its parent was accepted.
 
-    verdicts: 1 + n target tokens, the first for the position after the last committed token, then after each node.
+    target_tokens: 1 + n target tokens, the first for the position after the last committed token, then after each node.
     start: index in the chunk of the nodes of depth 0. limits: r per DoF, in bins; all zero is strict.
     """
     dofs = len(limits)
@@ -36,19 +36,19 @@ def accept_by_distance(tree: TokenTree, verdicts: Sequence[int], start: int, lim
     for i, (token, parent, depth) in enumerate(zip(tree.tokens, tree.parents, tree.depths, strict=True)):
         if parent != ROOT and not lengths[parent]:
             continue
-        distance = abs(token - verdicts[parent + 1])
+        distance = abs(token - target_tokens[parent + 1])
         if distance > limits[(start + depth) % dofs]:
             continue
         lengths[i] = depth + 1
         distances[i] = distance + (distances[parent] if parent != ROOT else 0)
         if lengths[i] > best_length or (lengths[i] == best_length and distances[i] < best_distance):
             best, best_length, best_distance = i, lengths[i], distances[i]
-    return Verdict(tuple(tree.path_to(best)), nearest_child(tree, best, verdicts))
+    return Verdict(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
 
 
 def accept_by_group(
     tree: TokenTree,
-    verdicts: Sequence[int],
+    target_tokens: Sequence[int],
     start: int,
     limits: Sequence[int],
     *,
@@ -61,9 +61,9 @@ def accept_by_group(
     at most `group_limit`. A rejected group ends the path at its first token. So does an incomplete one: where a path
     leaves the tree inside a group, that group's tokens are not accepted. `start` may lie inside a group: its remaining
     tokens are then judged as a group of their own, the committed ones' biases being unknown. In the decode loop nothing
-    is lost by that: accepted paths end with a group, so what is committed of a begun group are verdicts, with bias 0.
+    is lost by that: accepted paths end with a group, so what is committed of a begun group are target_tokens, with bias 0.
 
-    verdicts, start, limits: as in `accept_by_distance`. groups: default `kinematic_groups(D)`. `rejected` is the first
+    target_tokens, start, limits: as in `accept_by_distance`. groups: default `kinematic_groups(D)`. `rejected` is the first
     token of the group that ended the path.
     """
     dofs = len(limits)
@@ -77,7 +77,7 @@ def accept_by_group(
             continue
         dof = (start + depth) % dofs
         first, end = group_of[dof]
-        bias = abs(token - verdicts[parent + 1])
+        bias = abs(token - target_tokens[parent + 1])
         biases[i] = bias if parent == ROOT or dof == first else bias + biases[parent]
         alive[i] = bias <= limits[dof] and biases[i] <= group_limit
         distances[i] = bias if parent == ROOT else bias + distances[parent]
@@ -85,13 +85,13 @@ def accept_by_group(
             continue
         if depth + 1 > best_length or (depth + 1 == best_length and distances[i] < best_distance):
             best, best_length, best_distance = i, depth + 1, distances[i]
-    return Verdict(tuple(tree.path_to(best)), nearest_child(tree, best, verdicts))
+    return Verdict(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
 
 
-def nearest_child(tree: TokenTree, node: int, verdicts: Sequence[int]) -> int | None:
+def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
     """The child of `node` that is closest to the verdict there."""
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
-    return min(children, key=lambda i: abs(tree.tokens[i] - verdicts[node + 1]), default=None)
+    return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
 
 def limits_of(settings: AcceptanceSettings, r: int, dofs: int, gripper: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from kerv_cli.decoding.record import PHASES, Round
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
-from kerv_cli.vla.trunk import Cache
+from kerv_cli.targets.compact.trunk import Cache
 
 
 class Clock:
@@ -83,7 +83,7 @@ class Chunk:
     limits: tuple[int, ...] = ()  # bins per DoF that a draft may be off: what is worth drafting depends on it
     choice: Choice | None = None  # who drafts, where a boundary decides
     unverified: list[int] = field(default_factory=list)  # what the rejected draft had behind the rejected token
-    guesses: list[int] = field(default_factory=list)  # verdicts behind the rejected token: right if the draft was
+    guesses: list[int] = field(default_factory=list)  # target_tokens behind the rejected token: right if the draft was
     closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property
@@ -120,7 +120,7 @@ class Proposer(Protocol):
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         """A tree of depth ≤ `depth`; an empty one means that nothing is drafted this round."""
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
-        target's states at chunk indices first … first + T − 1. verdicts: the round's 1 + n argmax tokens, those behind
+        target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those behind
         rejected nodes included."""

@@ -15,14 +15,14 @@ from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Situation, steps_of
 from kerv_cli.decoding.proposers import EMPTY
 from kerv_cli.decoding.record import DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
-from kerv_cli.decoding.skipping import VerifySkip
 from kerv_cli.decoding.thresholds import Threshold, build_threshold
+from kerv_cli.decoding.verify_skip import VerifySkip
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree, prefill_mask, verify_mask
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import MethodSettings
-from kerv_cli.vla.action_tokens import GRIPPER, values_of
-from kerv_cli.vla.target import Target
+from kerv_cli.spaces import GRIPPER, values_of
+from kerv_cli.targets.compact.target import Target
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,9 @@ class Decoder:
         chunk.cache.length = 0
         mask = None if tree.is_chain else prefill_mask(tree, length, prompt)
         hidden = target.trunk(x, positions, chunk.cache, mask)
-        verdicts = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
+        target_tokens = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
         clock.lap("prefill")
-        path = self.accept(chunk, tree, verdicts, self.parts.opening)
+        path = self.accept(chunk, tree, target_tokens, self.parts.opening)
         clock.lap("accept")
         rows = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
         chunk.cache.keep(length, rows)
@@ -184,10 +184,10 @@ class Decoder:
             # one token less than is left: the bonus fills the last place whether or not everything is accepted
             tree = proposer.propose(chunk, min(self.method.proposer.depth, chunk.left - 1))
             clock.lap("propose")
-        hidden, verdicts = self.verify(chunk, tree)
+        hidden, target_tokens = self.verify(chunk, tree)
         clock.lap("verify")
         first = len(chunk.tokens) - 1
-        path = self.accept(chunk, tree, verdicts, proposer)
+        path = self.accept(chunk, tree, target_tokens, proposer)
         clock.lap("accept")
         rows = torch.tensor([0, *(i + 1 for i in path)], device=hidden.device)
         if len(tree):
@@ -196,7 +196,7 @@ class Decoder:
             self.rectify(chunk)
             clock.lap("rectify")
         if proposer is not None and chunk.left > 1:
-            proposer.committed(chunk, first, hidden[:, rows], verdicts)
+            proposer.committed(chunk, first, hidden[:, rows], target_tokens)
             clock.lap("propose")
 
     def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:
@@ -211,25 +211,25 @@ class Decoder:
         return hidden, self.target.head(hidden)[0].argmax(-1).tolist()
 
     def accept(
-        self, chunk: Chunk, tree: TokenTree, verdicts: Sequence[int], proposer: Proposer | None
+        self, chunk: Chunk, tree: TokenTree, target_tokens: Sequence[int], proposer: Proposer | None
     ) -> tuple[int, ...]:
         """Commit the best accepted path and, where a place is left, the bonus; record the round -> the path's nodes."""
         start = len(chunk.tokens)
         if not len(tree) or proposer is None:
-            chunk.tokens.append(verdicts[0])
-            chunk.rounds.append(Round("decode", "none", start, (), (verdicts[0],), 0, 1, 0, ()))
+            chunk.tokens.append(target_tokens[0])
+            chunk.rounds.append(Round("decode", "none", start, (), (target_tokens[0],), 0, 1, 0, ()))
             return ()
         acceptance = judging(self.method.acceptance, proposer.name)
         limits = limits_of(acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
-        verdict = acceptance_rule(acceptance)(tree, verdicts, start, limits)
+        verdict = acceptance_rule(acceptance)(tree, target_tokens, start, limits)
         path = verdict.path
         behind = [] if verdict.rejected is None else tree.down_from(verdict.rejected)
         chunk.unverified = [tree.tokens[i] for i in behind[1:]]
-        chunk.guesses = [verdicts[i + 1] for i in behind]
+        chunk.guesses = [target_tokens[i + 1] for i in behind]
         judged = path if verdict.rejected is None else (*path, verdict.rejected)
-        seen = [verdicts[tree.parents[i] + 1] for i in judged]
+        seen = [target_tokens[tree.parents[i] + 1] for i in judged]
         drafted = [tree.tokens[i] for i in judged]
-        bonus = [verdicts[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
+        bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
         chunk.tokens += [tree.tokens[i] for i in path] + bonus
         chunk.variability += float(np.abs(values_of(np.array(drafted)) - values_of(np.array(seen))).sum())
         chunk.rounds.append(
@@ -238,7 +238,7 @@ class Decoder:
                 proposer=proposer.name,
                 start=start,
                 drafted=tuple(drafted),
-                verdicts=tuple(seen) if verdict.rejected is not None else (*seen, *bonus),
+                target_tokens=tuple(seen) if verdict.rejected is not None else (*seen, *bonus),
                 accepted=len(path),
                 committed=len(path) + len(bonus),
                 tree_size=len(tree),

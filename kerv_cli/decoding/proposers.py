@@ -10,14 +10,14 @@ from torch import Tensor
 
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
-from kerv_cli.drafting.drafter import Drafter, DraftState, grow_tree, observe
+from kerv_cli.drafting.eagle import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.early import EarlyDrafter
 from kerv_cli.drafting.groups import kinematic_groups
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.settings import ProposerSettings
-from kerv_cli.vla.action_tokens import VOCABULARY, bins_of, values_of
-from kerv_cli.vla.target import Target
+from kerv_cli.spaces import VOCABULARY, bins_of, values_of
+from kerv_cli.targets.compact.target import Target
 
 EMPTY = TokenTree((), (), ())
 SURE = 0.05  # odds from which no spare draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
@@ -32,7 +32,7 @@ class Stateless:
     def begin(self, chunk: Chunk) -> None:
         pass
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         pass
 
     def is_sure(self, chunk: Chunk) -> bool:
@@ -165,8 +165,8 @@ class HybridProposer:
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         return self.chosen.propose(chunk, depth)
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
-        self.chosen.committed(chunk, first, hidden, verdicts)
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
 class JacobiProposer:
@@ -189,9 +189,9 @@ class JacobiProposer:
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         return TokenTree.chain(self.guess[:depth])
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         accepted = len(chunk.tokens) - first - 2
-        self.guess = [*verdicts[accepted + 1 :], *self.guess[len(verdicts) - 1 :]]
+        self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
 
 
 class DrafterProposer:
@@ -214,7 +214,7 @@ class DrafterProposer:
         s = self.settings
         return grow_tree(self.drafter, self.target, self.state, min(s.depth, depth), s.top_k, s.nodes)
 
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, verdicts: Sequence[int]) -> None:
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         following = self.embed(chunk.tokens[first + 1 :])
         observe(self.drafter, self.state, following, hidden, self.target.prompt_length + first)
 

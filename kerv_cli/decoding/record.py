@@ -16,10 +16,10 @@ PHASES = ("preprocess", "vision", "prefill", "propose", "verify", "accept", "rec
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a decode: a draft judged against the target's verdicts.
+    """One round of a decode: a draft judged against the target's target_tokens.
 
     `drafted` is the judged path: the accepted tokens followed, where there was a rejection, by the best rejected
-    candidate at the next position. `verdicts` are the target's argmax tokens at the same positions and, when the
+    candidate at the next position. `target_tokens` are the target's argmax tokens at the same positions and, when the
     whole path was accepted and tokens remain, one more: the bonus.
     """
 
@@ -27,7 +27,7 @@ class Round:
     proposer: str  # which proposer drafted: "none", "drafter", "retrieval", "early", "hold", "kalman", ...
     start: int  # tokens committed before this round
     drafted: tuple[int, ...]
-    verdicts: tuple[int, ...]
+    target_tokens: tuple[int, ...]
     accepted: int  # draft tokens accepted
     committed: int  # tokens committed by this round: accepted + bonus
     tree_size: int  # nodes verified

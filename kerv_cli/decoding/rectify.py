@@ -10,7 +10,7 @@ from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import RectifierSettings
-from kerv_cli.vla.action_tokens import values_of
+from kerv_cli.spaces import values_of
 
 DRAFT = "draft"
 """The one filling that no predictor of `drafting/kinematics.py` gives."""

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.settings import ThresholdSettings
-from kerv_cli.vla.action_tokens import VOCABULARY
+from kerv_cli.spaces import VOCABULARY
 
 
 class Threshold(Protocol):

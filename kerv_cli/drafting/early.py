@@ -20,10 +20,10 @@ from torch import Tensor, nn
 from kerv_cli.drafting.datastore import segments_of
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import DrafterSettings, TargetSettings
-from kerv_cli.vla.action_tokens import GRIPPER, VOCABULARY
-from kerv_cli.vla.checkpoint import load_state, read_description, save_module
-from kerv_cli.vla.layout import lay_out_for_inference
-from kerv_cli.vla.target import Target
+from kerv_cli.spaces import GRIPPER, VOCABULARY
+from kerv_cli.targets.checkpoint import load_state, read_description, save_module
+from kerv_cli.targets.compact.layout import lay_out_for_inference
+from kerv_cli.targets.compact.target import Target
 
 
 def pool(prompt: Tensor, settings: TargetSettings) -> Tensor:

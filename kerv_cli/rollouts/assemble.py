@@ -20,13 +20,13 @@ from kerv_cli.decoding.proposers import (
 )
 from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.decoding.rectify import DRAFT, Compensation
-from kerv_cli.decoding.skipping import SkipLevels, VerifySkip
+from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
 from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, Predictor, build_predictor
 from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.policy import Policy
 from kerv_cli.settings import SPARE, CameraSettings, MethodSettings, RolloutSettings
-from kerv_cli.vla.action_tokens import GRIPPER
+from kerv_cli.spaces import GRIPPER
 
 WARM_UP_DECODES = 6
 PREDICTED_FROM = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: see kinematics

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.rollouts.rerun_log import save_episode
 from kerv_cli.rollouts.run import run_task
 from kerv_cli.settings import RolloutSettings
+from kerv_cli.viewing.rerun_log import save_episode
 
 
 class CellLike(Protocol):

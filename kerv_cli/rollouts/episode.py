@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
-from kerv_cli.sim.camera import CameraConfig
-from kerv_cli.sim.world import World
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.metaworld.world import World
 
 
 class ActionDecoder(Protocol):

@@ -7,8 +7,8 @@ import torch
 
 from kerv_cli.decoding.chunk import Clock
 from kerv_cli.decoding.record import DecodeRecord
+from kerv_cli.environments.metaworld.world import ACTION_SIZE, Expert, Observation
 from kerv_cli.errors import KervError
-from kerv_cli.sim.world import ACTION_SIZE, Expert, Observation
 
 MODE = "expert"
 

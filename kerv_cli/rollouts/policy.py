@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration
+from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration
 from kerv_cli.drafting.datastore import Datastore, check_backend, check_target, open_datastore, read_manifest
-from kerv_cli.drafting.datastore_build import datastore_beside
-from kerv_cli.drafting.drafter import Drafter, load_drafter, read_drafter
+from kerv_cli.drafting.eagle import Drafter, load_drafter, read_drafter
 from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
 from kerv_cli.drafting.kinematics import FILTERS
+from kerv_cli.environments.metaworld.tasks import resolve_tasks
 from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, early_folder, find_target
 from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.runtime import DTYPES, set_up
 from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings, opening_sources
-from kerv_cli.sim.tasks import resolve_tasks
-from kerv_cli.vla.checkpoint import load_target, read_description
-from kerv_cli.vla.target import Target
+from kerv_cli.targets.checkpoint import load_target, read_description
+from kerv_cli.targets.compact.target import Target
+from kerv_cli.training.datastore import datastore_beside
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ import numpy as np
 
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.metaworld.world import World
 from kerv_cli.rollouts.assemble import episode_decoder, warm_up
 from kerv_cli.rollouts.episode import Recording, run_episode
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.rollouts.policy import is_expert, load_policy
 from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings, WorldSettings
-from kerv_cli.sim.camera import CameraConfig
-from kerv_cli.sim.world import World
-from kerv_cli.vla.target import Target
+from kerv_cli.targets.compact.target import Target
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:

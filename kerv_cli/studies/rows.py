@@ -51,7 +51,7 @@ _ROUND = pa.struct(
         ("proposer", pa.string()),
         ("start", pa.int32()),
         ("drafted", _TOKENS),
-        ("verdicts", _TOKENS),
+        ("target_tokens", _TOKENS),
         ("accepted", pa.int32()),
         ("committed", pa.int32()),
         ("tree_size", pa.int32()),

@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
-from kerv_cli.decoding.calibration import Calibration, calibration_beside, load_calibration, save_calibration
+from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration, save_calibration
 from kerv_cli.drafting.kinematics import MINIMUM
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.metaworld.tasks import resolve_tasks, task
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, MethodSettings, RolloutSettings, as_plain
-from kerv_cli.sim.demo_dataset import DemoDataset
-from kerv_cli.sim.tasks import resolve_tasks, task
-from kerv_cli.training.prediction import (
+from kerv_cli.spaces import CENTRES, ActionTokenizer, values_of
+from kerv_cli.training.predictor_fit import (
     HISTORIES,
     Windows,
     choose_episodes,
@@ -29,27 +30,28 @@ from kerv_cli.training.prediction import (
     prediction_errors,
     read_windows,
 )
-from kerv_cli.vla.action_tokens import CENTRES, ActionTokenizer, values_of
 
 if TYPE_CHECKING:
+    from kerv_cli.environments.demos.episode_file import DemoEpisode
     from kerv_cli.rollouts.episode import ActionDecoder
-    from kerv_cli.sim.demo_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # episodes per task that pre-sampling spreads its decodes over, where there are so many
 
 
-def kinematic_variability(drafted: np.ndarray, verdicts: np.ndarray) -> np.ndarray:
-    """K (METHODS §3.2): drafted tokens (..., k) and the verdicts at the same places (..., k) -> (...,).
+def kinematic_variability(drafted: np.ndarray, target_tokens: np.ndarray) -> np.ndarray:
+    """K (METHODS §3.2): drafted tokens (..., k) and the target_tokens at the same places (..., k) -> (...,).
 
     The sum over the compared places of the absolute difference, in normalised action units.
 
     Raises:
         ValueError: the shapes differ.
     """
-    if np.shape(drafted) != np.shape(verdicts):
-        raise ValueError(f"{np.shape(drafted)} drafted tokens cannot be compared with {np.shape(verdicts)} verdicts")
-    return np.abs(values_of(drafted) - values_of(verdicts)).sum(-1)
+    if np.shape(drafted) != np.shape(target_tokens):
+        raise ValueError(
+            f"{np.shape(drafted)} drafted tokens cannot be compared with {np.shape(target_tokens)} target_tokens"
+        )
+    return np.abs(values_of(drafted) - values_of(target_tokens)).sum(-1)
 
 
 def reference_level(levels: Sequence[float]) -> float:
@@ -104,8 +106,8 @@ class CalibrationRun:
 
     def __init__(self, settings: CalibrateSettings) -> None:
         from kerv_cli.drafting.datastore import check_target, read_manifest
-        from kerv_cli.drafting.datastore_build import datastore_beside
-        from kerv_cli.vla.checkpoint import read_description
+        from kerv_cli.targets.checkpoint import read_description
+        from kerv_cli.training.datastore import datastore_beside
 
         self.settings = settings
         _check_settings(settings)
@@ -167,7 +169,7 @@ class CalibrationRun:
     def skip(self, progress: Progress) -> dict[str, Any]:
         """The tasks' skip levels, from the datastore beside the target; empty where there is none."""
         from kerv_cli.drafting.datastore import Datastore
-        from kerv_cli.training.skipping import skip_section
+        from kerv_cli.training.skip_levels import skip_section
 
         if not self.stored:
             return {}

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer
-from kerv_cli.drafting.drafter import Drafter
+from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.settings import (
     AcceptanceSettings,
     DrafterSettings,
@@ -23,9 +23,9 @@ from kerv_cli.settings import (
     ProposerSettings,
     ThresholdSettings,
 )
+from kerv_cli.targets.compact.target import Target
 from kerv_cli.training.imitation import Samples
 from kerv_cli.training.loop import Job, Metrics
-from kerv_cli.vla.target import Target
 
 
 @dataclass(frozen=True)

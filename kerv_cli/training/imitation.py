@@ -17,15 +17,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.metaworld.tasks import TASKS, task
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
-from kerv_cli.sim.demo_dataset import DemoDataset
-from kerv_cli.sim.demo_file import DemoEpisode
-from kerv_cli.sim.tasks import TASKS, task
+from kerv_cli.spaces import DOF_NAMES, VOCABULARY, ActionTokenizer, values_of
+from kerv_cli.targets.compact.target import GOAL, OBJECT, Inputs, Target
+from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Job, Metrics
-from kerv_cli.vla.action_tokens import DOF_NAMES, VOCABULARY, ActionTokenizer, values_of
-from kerv_cli.vla.target import GOAL, OBJECT, Inputs, Target
-from kerv_cli.vla.text import WordTokenizer
 
 WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from kerv_cli.errors import CheckpointError, KervError
 from kerv_cli.files import atomic_path, read_json, write_json
 from kerv_cli.settings import TrainSettings
-from kerv_cli.vla.checkpoint import load_tensors, save_tensors
+from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 
 Metrics = dict[str, float]
 

@@ -12,17 +12,19 @@ from typing import Any
 import torch
 from torch import nn
 
-from kerv_cli.drafting.drafter import Drafter, save_drafter
+from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.metaworld.tasks import resolve_tasks
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.places import artifact, drafter_folder, early_folder, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
-from kerv_cli.sim.demo_dataset import DemoDataset
-from kerv_cli.sim.tasks import resolve_tasks
+from kerv_cli.targets.checkpoint import load_target, read_description, save_target
+from kerv_cli.targets.compact.target import Target
 from kerv_cli.training.distillation import Distillation, distillation_job, teach
-from kerv_cli.training.early import EarlyDistillation, early_job, teach_early
+from kerv_cli.training.early_distillation import EarlyDistillation, early_job, teach_early
 from kerv_cli.training.imitation import (
     Imitation,
     Samples,
@@ -35,8 +37,6 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
-from kerv_cli.vla.checkpoint import load_target, read_description, save_target
-from kerv_cli.vla.target import Target
 
 Progress = Callable[[int, int], None]
 VALIDATION_SEED = EVALUATION_SEED // 2

@@ -1,0 +1,176 @@
+"""The EAGLE-style drafter and its dynamic tree (METHODS §2.2; EAGLE-2; Spec-VLA §3).
+
+Input at position i: concat(embedding of what stands at i + 1, the target's last hidden state at i) → width → decoder
+layers → predicted hidden state of i + 1; the target's frozen head turns it into logits for position i + 2. The prompt,
+vision tokens included, is in the drafter's cache. Position i is rotated by i, in training and at inference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.drafting.tree import ROOT, TokenTree
+from kerv_cli.errors import CheckpointError
+from kerv_cli.settings import DrafterSettings
+from kerv_cli.targets.checkpoint import load_state, read_description, save_module
+from kerv_cli.targets.compact.layout import lay_out_for_inference
+from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.trunk import Cache, Layer, Rotary
+
+
+class Drafter(nn.Module):
+    """One decoder layer (or a few) of the target's shape; the head and the token embeddings are the target's own."""
+
+    def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
+        super().__init__()
+        self.settings, self.width, self.heads, self.feed_forward = settings, width, heads, feed_forward
+        self.fuse = nn.Linear(2 * width, width)
+        self.rotary = Rotary(width // heads)
+        self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(settings.layers))
+        self.norm = nn.RMSNorm(width, eps=1e-5)
+
+    @classmethod
+    def beside(cls, settings: DrafterSettings, target: Target) -> Drafter:
+        shape = target.settings
+        return cls(settings, shape.width, shape.heads, shape.feed_forward)
+
+    def new_cache(self, capacity: int) -> Cache:
+        return Cache(len(self.layers), 1, self.heads, capacity, self.width // self.heads, self.norm.weight)
+
+    def forward(
+        self,
+        following: Tensor,
+        hidden: Tensor,
+        positions: Tensor,
+        cache: Cache | None = None,
+        mask: Tensor | None = None,
+    ) -> Tensor:
+        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); mask as in `Trunk`."""
+        x = self.fuse(torch.cat([following, hidden], -1))
+        rotary = self.rotary(positions)
+        start = cache.length if cache is not None else 0
+        for i, layer in enumerate(self.layers):
+            x = layer(x, rotary, cache.layers[i] if cache is not None else None, start, mask)
+        if cache is not None:
+            cache.length = start + x.shape[1]
+        return self.norm(x)
+
+
+@dataclass
+class DraftState:
+    """What the drafter carries from round to round: its cache holds every committed position but the last, and
+    `hidden` (E,) is its prediction behind the last committed token."""
+
+    cache: Cache
+    hidden: Tensor
+
+
+def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
+    """Feed true states: hidden (1, T, E) of the target at positions first, first + 1, … and what follows each of them
+    (1, T, E). Entries of an earlier draft tree behind `first` are dropped."""
+    state.cache.length = first
+    tokens = hidden.shape[1]
+    positions = torch.arange(first, first + tokens, device=hidden.device)
+    mask = None
+    if first and tokens > 1:
+        mask = torch.full((tokens, first + tokens), -torch.inf, dtype=hidden.dtype, device=hidden.device).triu(
+            first + 1
+        )
+    state.hidden = drafter(following, hidden, positions, state.cache, mask)[0, -1]
+
+
+def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> TokenTree:
+    """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
+    `nodes` of all. A child is never more probable than its parent, so what is kept is a tree.
+    """
+    if top_k == 1:
+        return TokenTree.chain(draft_chain(drafter, target, state, min(depth, nodes)))
+    scores = torch.log_softmax(target.head(state.hidden).float(), -1)
+    values, tokens = scores.topk(min(top_k, nodes))
+    level = list(range(len(tokens)))
+    all_tokens, parents, cumulative = tokens.tolist(), [ROOT] * len(tokens), values.tolist()
+    base = state.cache.length
+    hidden = state.hidden.expand(1, len(tokens), -1)
+    seen = torch.eye(len(tokens), dtype=torch.bool, device=values.device)
+    for reached in range(1, depth):
+        mask = _level_mask(base, seen, hidden)
+        following = target.embedding(tokens)[None]
+        position = torch.full((len(level),), base + reached - 1, device=tokens.device)
+        hidden = drafter(following, hidden, position, state.cache, mask)
+        logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
+        child_values, child_tokens = logp.topk(top_k, -1)
+        values, flat = child_values.flatten().topk(top_k)
+        # every child competes for a place in the tree, only the best top_k are expanded further
+        offset = len(all_tokens)
+        all_tokens += child_tokens.flatten().tolist()
+        cumulative += child_values.flatten().tolist()
+        parents += [node for node in level for _ in range(top_k)]
+        chosen = flat.tolist()
+        level = [offset + c for c in chosen]
+        tokens = child_tokens.flatten()[flat]
+        rows = flat // top_k
+        hidden = hidden[:, rows]
+        seen = torch.cat([seen[rows], torch.eye(top_k, dtype=torch.bool, device=seen.device)], -1)
+    state.cache.length = base
+    return _keep_best(all_tokens, parents, cumulative, nodes)
+
+
+def draft_chain(drafter: Drafter, target: Target, state: DraftState, depth: int) -> list[int]:
+    """The greedy draft: the tree of one branch, without probabilities, ranks or masks."""
+    base = state.cache.length
+    positions = torch.arange(base, base + depth, device=state.hidden.device).split(1)
+    hidden = state.hidden[None, None]
+    drafted = [target.head(hidden[0]).argmax(-1)]
+    for reached in range(depth - 1):
+        following = target.embedding(drafted[-1])[None]
+        hidden = drafter(following, hidden, positions[reached], state.cache)
+        drafted.append(target.head(hidden[0]).argmax(-1))
+    state.cache.length = base
+    return torch.cat(drafted).tolist()
+
+
+def _level_mask(base: int, seen: Tensor, like: Tensor) -> Tensor:
+    """Additive (k, base + drafted so far): the committed part is seen by all, drafted entries by their descendants."""
+    mask = torch.zeros((seen.shape[0], base + seen.shape[1]), dtype=like.dtype, device=like.device)
+    mask[:, base:].masked_fill_(~seen, -torch.inf)
+    return mask
+
+
+def _keep_best(tokens: list[int], parents: list[int], scores: list[float], nodes: int) -> TokenTree:
+    # sorted is stable and children stand behind their parents: on equal scores the parent is kept first
+    best = sorted(sorted(range(len(tokens)), key=lambda i: -scores[i])[:nodes])
+    index = {old: new for new, old in enumerate(best)} | {ROOT: ROOT}
+    return TokenTree.build([tokens[i] for i in best], [index[parents[i]] for i in best])
+
+
+def save_drafter(folder: Path, drafter: Drafter, target_sha256: str, provenance: dict[str, Any]) -> str:
+    """The description names the target by the hash of its weights: a drafter imitates exactly one."""
+    description = {"settings": asdict(drafter.settings), "target": target_sha256, "provenance": provenance}
+    return save_module(folder, "drafter", drafter, description)
+
+
+def read_drafter(folder: Path, target_sha256: str) -> dict[str, Any]:
+    """Its description. Raises CheckpointError where the drafter was trained for another target."""
+    description = read_description(folder, "drafter")
+    if description["target"] != target_sha256:
+        raise CheckpointError(
+            f"the drafter in {folder} was trained for target {description['target'][:12]}, not for "
+            f"{target_sha256[:12]}: train one with 'kerv train drafter policy.target=…'"
+        )
+    return description
+
+
+def load_drafter(folder: Path, target: Target, target_sha256: str) -> tuple[Drafter, dict[str, Any]]:
+    """The drafter, ready for inference, and its description; errors as `read_drafter`."""
+    description = read_drafter(folder, target_sha256)
+    drafter = Drafter.beside(DrafterSettings(**description["settings"]), target)
+    load_state(drafter, folder, "drafter")
+    weight = target.head.weight
+    drafter = drafter.to(device=weight.device, dtype=weight.dtype).eval().requires_grad_(False)
+    lay_out_for_inference(drafter)
+    return drafter, description

@@ -1,0 +1,155 @@
+"""One demonstration episode in memory and as a file: safetensors with PNG frames, lossless and compact."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kerv_cli.environments.metaworld.world import ACTION_SIZE, STATE_SIZE
+from kerv_cli.errors import CheckpointError
+from kerv_cli.files import atomic_path
+
+FORMAT = 1
+_LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
+
+
+@dataclass(frozen=True)
+class DemoEpisode:
+    """One successful episode of T control steps (up to and including the first success).
+
+    Attributes:
+        task, seed, perturbed: which episode, and whether its execution was noisy.
+        steps: T.
+        frames: (n, size, size, 3) uint8, the frames before the actions of `frame_steps`.
+        frame_steps: (n,) int64.
+        states: (T, 39) float32, privileged state before each action.
+        labels: (T + tail, 4) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
+        executed: (T, 4) float32, the actions that moved the robot.
+        rand_vec: (3,) or (6,) float64, object and goal placement.
+    """
+
+    task: str
+    seed: int
+    perturbed: bool
+    steps: int
+    frames: NDArray[np.uint8]
+    frame_steps: NDArray[np.int64]
+    states: NDArray[np.float32]
+    labels: NDArray[np.float32]
+    executed: NDArray[np.float32]
+    rand_vec: NDArray[np.float64]
+
+    @property
+    def end_effector(self) -> NDArray[np.float32]:
+        """(T, 3) float32: the hand's position in metres before each action."""
+        return self.states[:, :3]
+
+
+def save_episode(path: Path, episode: DemoEpisode) -> None:
+    """Writes one episode, atomically; frames as PNG bytes, end to end, with n + 1 offsets.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    from safetensors.numpy import save
+
+    pictures = [_encode_png(frame) for frame in episode.frames]
+    tensors = {
+        "png": np.frombuffer(b"".join(pictures), dtype=np.uint8),
+        "png_offsets": np.cumsum([0, *map(len, pictures)], dtype=np.int64),
+        "frame_steps": episode.frame_steps,
+        "states": episode.states,
+        "labels": episode.labels,
+        "executed": episode.executed,
+        "rand_vec": episode.rand_vec,
+    }
+    metadata = {
+        "format": str(FORMAT),
+        "task": episode.task,
+        "seed": str(episode.seed),
+        "perturbed": str(episode.perturbed).lower(),
+        "steps": str(episode.steps),
+        "frame_size": str(episode.frames.shape[1]),
+    }
+    # save_file would hide a full disk behind an error type of its own.
+    data = _with_sorted_metadata(save(tensors, metadata=metadata))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def _with_sorted_metadata(data: bytes) -> bytes:
+    """The same safetensors bytes with the metadata's keys in order.
+
+    safetensors writes them in random order, and two recordings of one episode would differ in their hash.
+    """
+    start = _LENGTH.size + _LENGTH.unpack_from(data)[0]
+    header = json.loads(data[_LENGTH.size : start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
+    return _LENGTH.pack(len(text)) + text + data[start:]
+
+
+def load_episode(path: Path) -> DemoEpisode:
+    """Reads one episode.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or of another format.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != str(FORMAT):
+                raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        return _episode_from(arrays, metadata)
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise CheckpointError(f"{path} is missing or damaged: {error}") from error
+
+
+def _episode_from(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> DemoEpisode:
+    offsets, png = arrays["png_offsets"], arrays["png"].tobytes()
+    frames = [_decode_png(png[start:end]) for start, end in itertools.pairwise(offsets)]
+    steps = int(metadata["steps"])
+    if arrays["states"].shape != (steps, STATE_SIZE) or arrays["executed"].shape != (steps, ACTION_SIZE):
+        raise ValueError(f"the arrays do not hold {steps} steps")
+    if len(arrays["labels"]) < steps or len(arrays["frame_steps"]) != len(frames):
+        raise ValueError("labels or frames are too few")
+    return DemoEpisode(
+        task=metadata["task"],
+        seed=int(metadata["seed"]),
+        perturbed=metadata["perturbed"] == "true",
+        steps=steps,
+        frames=np.stack(frames),
+        frame_steps=arrays["frame_steps"],
+        states=arrays["states"],
+        labels=arrays["labels"],
+        executed=arrays["executed"],
+        rand_vec=arrays["rand_vec"],
+    )
+
+
+def _encode_png(frame: NDArray[np.uint8]) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
+    return buffer.getvalue()
+
+
+def _decode_png(data: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data)) as image:
+        return np.asarray(image)

@@ -1,0 +1,325 @@
+"""Demonstrations: scripted experts, recorded to disk with clean labels, and read back.
+
+Half of the episodes (by default) are executed with noise, so that states beside the expert's path are visited; the
+labels are the clean expert's actions at the visited states all the same. Only successful episodes are kept.
+
+On disk: `recording.json` (what is being recorded), `episodes/<task>/<seed:06d>.safetensors`,
+`failed/<task>/<seed:06d>.json` and, when all is done, `manifest.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kerv_cli.environments.camera import CameraConfig, choose_backend
+from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry, dataset_hash, episode_path
+from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, load_episode, save_episode
+from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
+from kerv_cli.environments.metaworld.tasks import resolve_tasks
+from kerv_cli.environments.metaworld.world import MAX_HORIZON, Expert, Observation, World
+from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.files import read_json, sha256_of, write_json
+
+__all__ = ["DemoConfig", "DemoDataset", "DemoEntry", "DemoEpisode", "record", "run_expert"]
+
+MAX_TRAINING_SEED = 99_999
+"""Demonstrations use seeds up to this one; evaluation starts at 100000, so the two never meet."""
+_SEEDS_PER_JOB = 5
+_EXTRA_ATTEMPTS = 20
+"""Seeds tried beyond the requested range: this many, plus one per requested episode."""
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """What to record.
+
+    Attributes:
+        tasks: tasks and suites.
+        episodes: successful episodes per task.
+        first_seed: seeds start here, per task.
+        perturbed: fraction of episodes executed with noise; which ones follows from the seed.
+        noise_low, noise_high: range of the Gaussian noise's standard deviation on xyz, drawn once per episode.
+        burst_probability: chance per step that a burst starts: 3 to 8 steps in one random direction.
+        camera: the frames' view.
+        frame_stride: control steps per recorded frame.
+        tail: labels recorded beyond success, so that an action chunk that starts near the end has true labels.
+        workers: processes; changes nothing in the result.
+        horizon: control steps within which the expert must succeed.
+    """
+
+    tasks: tuple[str, ...]
+    episodes: int
+    first_seed: int = 0
+    perturbed: float = 0.5
+    noise_low: float = 0.2
+    noise_high: float = 0.6
+    burst_probability: float = 0.02
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    frame_stride: int = 1
+    tail: int = 8
+    workers: int = 2
+    horizon: int = MAX_HORIZON
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
+        last = self.first_seed + self.episodes - 1
+        checks = {
+            "name at least one task": bool(self.tasks),
+            f"episodes must be 1 or more, not {self.episodes}": self.episodes >= 1,
+            f"the first seed must be 0 or more, not {self.first_seed}": self.first_seed >= 0,
+            f"seeds from {MAX_TRAINING_SEED + 1} on are for evaluation: {last} is too high": last <= MAX_TRAINING_SEED,
+            f"perturbed must lie between 0 and 1, not {self.perturbed}": 0.0 <= self.perturbed <= 1.0,
+            "noise must satisfy 0 <= noise_low <= noise_high": 0.0 <= self.noise_low <= self.noise_high,
+            "burst_probability must lie between 0 and 1": 0.0 <= self.burst_probability <= 1.0,
+            f"frame_stride must be 1 or more, not {self.frame_stride}": self.frame_stride >= 1,
+            f"tail must lie between 0 and {MAX_HORIZON - 1}, not {self.tail}": 0 <= self.tail < MAX_HORIZON,
+            f"workers must be 1 or more, not {self.workers}": self.workers >= 1,
+            f"horizon must lie between 1 and {MAX_HORIZON}": 1 <= self.horizon <= MAX_HORIZON,
+        }
+        wrong = [message for message, holds in checks.items() if not holds]
+        if wrong:
+            raise UsageError(f"demonstrations: {wrong[0]}")
+
+    @property
+    def seed_limit(self) -> int:
+        """One past the last seed that may be tried when experts fail."""
+        return min(self.first_seed + 2 * self.episodes + _EXTRA_ATTEMPTS, MAX_TRAINING_SEED + 1)
+
+
+def run_expert(world: World, seed: int, config: DemoConfig) -> DemoEpisode | None:
+    """Runs one episode; None when the expert did not succeed within the horizon.
+
+    An episode also counts as failed when its tail would not fit the simulator's 500 steps.
+    """
+    expert = Expert(world.task)
+    perturbed = is_perturbed(seed, config.perturbed)
+    noise = (config.noise_low, config.noise_high)
+    perturb = Perturbation(world.task, seed, noise, config.burst_probability) if perturbed else None
+    observation = world.reset(seed)
+    states, labels, executed, frames, frame_steps = [], [], [], [], []
+    last_step = min(config.horizon, MAX_HORIZON - config.tail)
+    while not observation.success:
+        if observation.step >= last_step:
+            return None
+        if observation.step % config.frame_stride == 0:
+            frames.append(world.frame())
+            frame_steps.append(observation.step)
+        label = expert(observation)
+        action = perturb(label) if perturb else label
+        states.append(observation.state)
+        labels.append(label)
+        executed.append(action)
+        observation = world.step(action)
+    labels += _tail_labels(world, expert, observation, config.tail)
+    return DemoEpisode(
+        task=world.task,
+        seed=seed,
+        perturbed=perturbed,
+        steps=len(states),
+        frames=np.stack(frames),
+        frame_steps=np.array(frame_steps, dtype=np.int64),
+        states=np.array(states, dtype=np.float32),
+        labels=np.array(labels, dtype=np.float32),
+        executed=np.array(executed, dtype=np.float32),
+        rand_vec=world.rand_vec,
+    )
+
+
+def _tail_labels(world: World, expert: Expert, observation: Observation, tail: int) -> list[NDArray[np.float64]]:
+    labels = []
+    for _ in range(tail):
+        labels.append(expert(observation))
+        observation = world.step(labels[-1])
+    return labels
+
+
+def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
+    """Records demonstrations into the folder `out`; a killed run goes on where it stopped.
+
+    A seed whose expert fails is replaced by the next one beyond the range, up to `config.seed_limit`. Which episodes
+    come out does not depend on the number of workers.
+
+    Args:
+        config: what to record.
+        out: the dataset's folder.
+        on_progress: called with (episodes done, episodes wanted).
+
+    Returns:
+        The manifest, as written to `out/manifest.json`. Where a task's expert failed too often, fewer episodes than
+        requested are kept, and the manifest's `missing` says how many are not there.
+
+    Raises:
+        UsageError: `out` holds demonstrations of another configuration.
+        RenderingUnavailable: no frame can be drawn here.
+        StorageError: the disk refused.
+        KervError: a task's expert never succeeded.
+    """
+    out = Path(out)
+    choose_backend()
+    identity = _identity(config)
+    _claim_folder(out, identity)
+    try:
+        kept, failed = _collect(config, out, on_progress)
+    finally:
+        _release_world()
+    manifest = {**identity, **_summary(config, kept, failed)}
+    write_json(out / "manifest.json", manifest)
+    return manifest
+
+
+_Entries = dict[str, list[dict[str, Any]]]  # task -> the manifest's entries
+_Failures = dict[str, list[int]]  # task -> seeds
+
+
+def _collect(
+    config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None
+) -> tuple[_Entries, _Failures]:
+    kept: _Entries = {task: [] for task in config.tasks}
+    failed: _Failures = {task: [] for task in config.tasks}
+    wanted = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
+    while any(wanted.values()):
+        for task, outcomes in _run_jobs(config, out, _jobs(wanted)):
+            kept[task] += [entry for entry in outcomes.values() if entry is not None]
+            failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
+            if on_progress is not None:
+                on_progress(sum(map(len, kept.values())), config.episodes * len(config.tasks))
+        wanted = {task: _next_seeds(config, len(kept[task]), wanted[task]) for task in config.tasks}
+    return kept, failed
+
+
+def _jobs(wanted: Mapping[str, range]) -> list[tuple[str, range]]:
+    return [
+        (task, seeds[start : start + _SEEDS_PER_JOB])
+        for task, seeds in wanted.items()
+        for start in range(0, len(seeds), _SEEDS_PER_JOB)
+    ]
+
+
+def _next_seeds(config: DemoConfig, kept: int, tried: range) -> range:
+    # One new seed per failure, in order: the outcome does not depend on how the work was divided.
+    return range(tried.stop, min(tried.stop + config.episodes - kept, config.seed_limit))
+
+
+def _identity(config: DemoConfig) -> dict[str, Any]:
+    settings = json.loads(json.dumps(asdict(config)))
+    del settings["workers"]
+    versions = {name: version(name) for name in ("metaworld", "mujoco", "numpy")}
+    return {"format": FORMAT, "config": settings, "versions": {**versions, "python": platform.python_version()}}
+
+
+def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
+    path = out / "recording.json"
+    if not path.exists():
+        write_json(path, identity)
+        return
+    there = read_json(path)
+    try:
+        here, before = _comparable(identity), _comparable(there)
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged: {error} is not in it") from error
+    if here != before:
+        key = next(key for key in [*here, *before] if here.get(key) != before.get(key))
+        raise UsageError(
+            f"{out} holds demonstrations with {key}={before.get(key)}, not {here.get(key)}: choose another folder"
+        )
+
+
+def _comparable(identity: Mapping[str, Any]) -> dict[str, Any]:
+    # Another Python or numpy may go on with a recording; another simulator would be another world.
+    versions = identity["versions"]
+    simulator = {name: versions[name] for name in ("metaworld", "mujoco")}
+    return {"format": identity["format"], **identity["config"], **simulator}
+
+
+_Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, None where the expert failed
+
+
+def _run_jobs(config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]]) -> Iterator[tuple[str, _Outcomes]]:
+    if config.workers == 1 or len(jobs) == 1:
+        yield from (_record_seeds(config, out, task, seeds) for task, seeds in jobs)
+        return
+    from joblib import Parallel, delayed, parallel_config
+
+    # loky starts fresh interpreters: a fork after this process has drawn would deadlock in the GL driver.
+    with parallel_config(backend="loky", n_jobs=min(config.workers, len(jobs)), inner_max_num_threads=1):
+        work = (delayed(_record_seeds)(config, out, task, seeds) for task, seeds in jobs)
+        yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
+
+
+_world: World | None = None
+
+
+def _record_seeds(config: DemoConfig, out: Path, task: str, seeds: Sequence[int]) -> tuple[str, _Outcomes]:
+    """In a worker: brings each seed's outcome to disk, unless it is there already."""
+    return task, {seed: _record_seed(config, out, task, seed) for seed in seeds}
+
+
+def _record_seed(config: DemoConfig, out: Path, task: str, seed: int) -> dict[str, Any] | None:
+    path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
+    if failure.exists():
+        return None
+    episode = _valid_episode(path, task, seed)
+    if episode is None:
+        episode = run_expert(_world_for(task, config), seed, config)
+        if episode is None:
+            write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
+            return None
+        save_episode(path, episode)
+    return {
+        "seed": seed,
+        "perturbed": episode.perturbed,
+        "steps": episode.steps,
+        "bytes": path.stat().st_size,
+        "sha256": sha256_of(path),
+    }
+
+
+def _world_for(task: str, config: DemoConfig) -> World:
+    global _world
+    if _world is None or (_world.task, _world.camera) != (task, config.camera):
+        _release_world()
+        _world = World(task, config.camera)
+    return _world
+
+
+def _release_world() -> None:
+    global _world
+    if _world is not None:
+        _world.close()
+    _world = None
+
+
+def _valid_episode(path: Path, task: str, seed: int) -> DemoEpisode | None:
+    try:
+        episode = load_episode(path)
+    except CheckpointError:
+        return None
+    return episode if (episode.task, episode.seed) == (task, seed) else None
+
+
+def _summary(config: DemoConfig, kept: _Entries, failed: _Failures) -> dict[str, Any]:
+    empty = [task for task, entries in kept.items() if not entries]
+    if empty:
+        raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
+    tasks = {}
+    for task in config.tasks:
+        entries = sorted(kept[task], key=lambda entry: entry["seed"])
+        mean = sum(entry["steps"] for entry in entries) / len(entries)
+        tasks[task] = {"mean_steps": round(mean, 2), "failed_seeds": sorted(failed[task]), "episodes": entries}
+    seeds = [entry["seed"] for entries in kept.values() for entry in entries]
+    return {
+        "seeds": {"first": min(seeds), "last": max(seeds)},
+        "episodes": len(seeds),
+        "missing": config.episodes * len(config.tasks) - len(seeds),
+        "sha256": dataset_hash(tasks),
+        "tasks": tasks,
+    }

@@ -1,0 +1,7 @@
+"""kerv's own parts: their settings and what each needs. Nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from kerv_cli.registry import Part, register
+
+register(Part("environment", "metaworld", "kerv_cli.environments.metaworld.spec:SPEC"))

@@ -1,0 +1,228 @@
+"""Figures of a study, from its table. Drawn without a display; the same table gives the same file."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from kerv_cli.decoding.record import PHASES
+from kerv_cli.reporting.drawing import COLOURS, DASHES, INK, MUTED, STYLE, colour, entitle, new_figure
+from kerv_cli.reporting.measures import MICRO
+from kerv_cli.reporting.scatter import tradeoff_figure
+from kerv_cli.reporting.tables import is_number
+
+_PHASE_COLOURS = ("#b8c4d0", "#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
+_PANELS = (
+    ("speedup", "Speedup", "time per step, baseline ÷ setting", 1.0),
+    ("success", "Success", "episodes, % and 95 % interval", 100.0),
+    ("AL", "Acceptance length", "tokens committed per verification", 1.0),
+)
+
+
+def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
+    """Name suffix -> figure: measures against the axis, and inference time by phase; without an axis the measures by
+    setting, and success against speedup.
+
+    Args:
+        table: `study_table`.
+        axis: column for the x axis, e.g. `threshold.r`; empty, or without two numbers in it: one row per setting.
+        title: the study's.
+        averaging: the rows that are drawn; named in the figure.
+    """
+    rows = table[table["averaging"] == averaging].reset_index(drop=True)
+    numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
+    with mpl.rc_context(STYLE):
+        figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
+        figures["_phases"] = _phases(rows)
+        for figure in figures.values():
+            entitle(figure, title, _about(rows, averaging))
+        if not numbers:
+            figures["_tradeoff"] = tradeoff_figure(rows, title, _about(rows, averaging))
+    return figures
+
+
+def _about(rows: pd.DataFrame, averaging: str) -> str:
+    first = rows.iloc[0]
+    counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
+    return f"{counts} · {averaging} · {first['device_name']}, {first['dtype']}"
+
+
+def _is_baseline(rows: pd.DataFrame) -> pd.Series:
+    return rows["label"] == rows["baseline"]
+
+
+def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
+    """Rows by everything that varies besides the axis: legend text -> rows along the axis, with its number as `x`.
+
+    A row on which the axis has no number is a series of its own. The baseline is left out, unless it is one point of a
+    series of others.
+    """
+    own = rows[~_is_baseline(rows)]
+    varying = _varying(own, axis)
+    numbers = axis_numbers(own, axis)
+    series: dict[str, pd.DataFrame] = {}
+    keys = [own[name].astype(str) for name in varying] + [own["label"].where(numbers.isna(), "")]
+    for _, group in own.groupby(keys, sort=False):
+        stems = {_stem(str(label), axis) for label in group["label"]}
+        name = str(group["label"].iloc[0]) if len(group) == 1 else stems.pop()
+        if len(group) > 1 and (stems or name in series):
+            shared = [f"{key.split('.')[-1]} {group[key].iloc[0]}" for key in varying if "sha256" not in key]
+            name = ", ".join([str(group["method"].iloc[0]), *shared])
+        if len(group) > 1:
+            group = pd.concat([group, rows[_is_baseline(rows) & (rows["label"].map(lambda x: _stem(x, axis)) == name)]])
+        series[name] = group.assign(x=axis_numbers(group, axis)).sort_values("x")
+    return series
+
+
+def _varying(own: pd.DataFrame, axis: str) -> list[str]:
+    first, last = list(own.columns).index("overrides") + 1, list(own.columns).index("horizon")
+    candidates = ["method", *own.columns[first:last]]
+    return [name for name in candidates if name != axis and own[name].astype(str).nunique() > 1]
+
+
+def axis_numbers(rows: pd.DataFrame, axis: str) -> pd.Series:
+    """The axis's values; NaN where they are no numbers (text, switches, nothing)."""
+    values = rows[axis] if axis in rows else pd.Series(math.nan, index=rows.index)
+    values = values.map(lambda value: math.nan if isinstance(value, bool | np.bool_) else value)
+    return pd.to_numeric(values, errors="coerce")
+
+
+def _stem(label: str, axis: str) -> str:
+    """A grid's label without the axis: `fused f_star=0.3` -> `fused`."""
+    return re.sub(rf"\s+{re.escape(axis.rsplit('.', 1)[-1])}=\S+", "", label)
+
+
+def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
+    series = series_of(rows, axis)
+    names = [*series, str(rows["baseline"].iloc[0])]
+    columns = max(1, min(6, int(12.0 / (0.7 + 0.08 * max(map(len, names))))))
+    figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns))
+    axes = figure.subplots(1, len(_PANELS))
+    ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
+    for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
+        for place, (label, group) in enumerate(series.items()):
+            _draw_series(panel, group, measure, scale, place, label)
+        _draw_baseline(panel, rows, measure, scale)
+        panel.set(title=name, ylabel=unit, xlabel=axis)
+        if len(ticks) <= 9:
+            panel.set_xticks(ticks, [f"{value:g}" for value in ticks])
+        _limit(panel, measure)
+    shown = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in shown}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+    return figure
+
+
+def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, place: int, label: str) -> None:
+    if len(group) == 1:  # a setting that the axis does not touch: a level to compare with
+        level = group[measure].iloc[0] * scale
+        if is_number(level):
+            dashes = DASHES[place % len(DASHES)]
+            panel.axhline(level, color=colour(place), linestyle=dashes, linewidth=1.4, label=label)
+        return
+    x, y = group["x"].to_numpy(float), group[measure].to_numpy(float) * scale
+    panel.plot(x, y, color=colour(place), marker="o", markersize=5, linewidth=1.8, label=label)
+    if f"{measure}_low" in group:
+        low, high = group[f"{measure}_low"].to_numpy(float) * scale, group[f"{measure}_high"].to_numpy(float) * scale
+        panel.fill_between(x, low, high, color=colour(place), alpha=0.15, linewidth=0)
+
+
+def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) -> None:
+    own = rows[_is_baseline(rows)]
+    if not len(own):
+        return
+    row = own.iloc[0]
+    value = 1.0 / scale if measure in ("speedup", "AL") else row[measure]  # AR commits one token per forward
+    panel.axhline(value * scale, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
+    if measure == "success":
+        panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=INK, alpha=0.06, linewidth=0)
+
+
+def _limit(panel: Axes, measure: str) -> None:
+    """Success on its whole scale; ratios on theirs, which has no meaningful zero, with room above."""
+    if measure == "success":
+        panel.set_ylim(0, 104)
+    else:
+        panel.margins(y=0.12)
+
+
+def _by_setting(rows: pd.DataFrame) -> Figure:
+    figure = new_figure(12.0, 2.0 + 0.38 * len(rows))
+    axes = figure.subplots(1, len(_PANELS), sharey=True)
+    places = range(len(rows))
+    for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
+        for place, row in zip(places, rows.to_dict("records"), strict=True):
+            _draw_dot(panel, place, {str(k): v for k, v in row.items()}, measure, scale)
+        reference = rows[_is_baseline(rows)]
+        if len(reference) and measure != "AL":
+            level = 1.0 if measure == "speedup" else reference.iloc[0][measure] * scale
+            panel.axvline(level, color=INK, linewidth=1.2, linestyle=":")
+        panel.set(title=name, xlabel=unit)
+        panel.grid(axis="y", visible=False)
+        if measure == "speedup":
+            _draw_ceilings(panel, rows)
+        panel.set_xlim(0, 104 if measure == "success" else 1.08 * panel.get_xlim()[1])
+    axes[0].set_yticks(list(places), list(rows["label"]), color=INK)
+    axes[0].set_ylim(len(rows) - 0.5, -0.5)
+    return figure
+
+
+def _draw_ceilings(panel: Axes, rows: pd.DataFrame) -> None:
+    known = rows["ceiling"].notna()
+    if known.any():
+        panel.plot(rows.loc[known, "ceiling"], rows.index[known], "|", color=MUTED, markersize=13, markeredgewidth=1.6)
+        panel.set_xlabel(f"{panel.get_xlabel()}; | ceiling")
+
+
+def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale: float) -> None:
+    if not is_number(row[measure]):
+        return
+    colour = INK if row["label"] == row["baseline"] else COLOURS[0]
+    value = row[measure] * scale
+    low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
+    if is_number(low):
+        panel.plot([low * scale, high * scale], [place, place], color=colour, linewidth=2.2, alpha=0.45)
+    panel.plot(value, place, "o", color=colour, markersize=7)
+    text = f"{value:.1f}".removesuffix(".0") if measure == "success" else f"{value:.2f}"
+    panel.annotate(
+        text,
+        (value, place),
+        xytext=(0, 8),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4},
+    )
+
+
+def _phases(rows: pd.DataFrame) -> Figure:
+    figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
+    panel = figure.subplots()
+    places = list(range(len(rows)))
+    left = [0.0] * len(rows)
+    for phase, shade in zip(PHASES, _phase_colours(len(PHASES)), strict=True):
+        widths = rows[f"ms.{phase}"].fillna(0.0).to_list()
+        if any(widths):
+            panel.barh(places, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
+        left = [a + b for a, b in zip(left, widths, strict=True)]
+    for place, total in zip(places, rows["time_per_step_ms"], strict=True):
+        panel.text(total, place, f"  {total:.3g}", va="center", fontsize=9)
+    panel.set_yticks(places, list(rows["label"]), color=INK)
+    panel.set_ylim(len(rows) - 0.5, -0.5)
+    panel.set(title="Inference time by phase", xlabel="ms per control step")
+    panel.grid(axis="y", visible=False)
+    panel.margins(x=0.08)
+    figure.legend(loc="outside lower center", ncols=len(PHASES))
+    return figure
+
+
+def _phase_colours(count: int) -> Sequence[str]:
+    return [_PHASE_COLOURS[i % len(_PHASE_COLOURS)] for i in range(count)]

@@ -1,0 +1,189 @@
+"""How well the Kalman filter predicts the next actions, beside holding the last one and prolonging the last two: the
+errors that `kerv calibrate` measured on held-out demonstrations (METHODS §3.1)."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from kerv_cli.decoding.calibration_file import FORMAT, Errors, calibration_beside
+from kerv_cli.drafting.kinematics import PREDICTORS
+from kerv_cli.errors import CheckpointError
+from kerv_cli.files import read_json, sha256_of
+from kerv_cli.places import find_target
+from kerv_cli.reporting.drawing import INK, STYLE, colour, entitle, new_figure
+from kerv_cli.settings import opening_sources
+from kerv_cli.spaces import DOF_NAMES, GRIPPER
+
+REFERENCE = "hold"
+_POSITION = DOF_NAMES[:GRIPPER]
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """The predictors' errors of one target's calibration."""
+
+    target: str
+    errors: Errors
+    window: int  # control steps that predictions were made from
+    target_sha256: str
+    demos: Mapping[str, Any]  # {"sha256", "tasks": {task: {"training": episodes, "held_out": episodes}}}
+    provenance: Mapping[str, Any]
+    sha256: str  # of the calibration's file
+
+    @property
+    def name(self) -> str:
+        """Of its files; a target that is given as a folder is called by the folder's last names."""
+        return "prediction_" + re.sub(r"[^A-Za-z0-9_.-]+", "-", self.target.removesuffix("/target")).strip("-.")
+
+
+def read_predictions(results: Path, target: str) -> Predictions | None:
+    """The errors of the target `target`; None where there is no such target, or nothing calibrated for it.
+
+    Raises:
+        CheckpointError: the calibration is damaged or of another format.
+    """
+    try:
+        path = calibration_beside(find_target(str(results), target))
+    except CheckpointError:
+        return None
+    if not path.is_file():
+        return None
+    value = read_json(path)
+    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, "calibration"):
+        raise CheckpointError(f"{path} is not a calibration of format {FORMAT}: run 'kerv calibrate' again")
+    # only what the report shows: the rest may be of another version, and the target another since, the errors are
+    # the demonstrations'
+    try:
+        found = Predictions(
+            target,
+            errors=value["errors"],
+            window=value["window"],
+            target_sha256=value["target"]["sha256"],
+            demos=value["demos"],
+            provenance=value.get("provenance", {}),
+            sha256=sha256_of(path),
+        )
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged ({error} is missing): run 'kerv calibrate' again") from error
+    return found if found.errors else None
+
+
+def calibrated_targets(results: Path) -> list[str]:
+    """Names of the targets that have a calibration in this results folder."""
+    places = [*results.glob("artifacts/calibration/*/calibration.json"), *results.glob("pretrained/*/calibration.json")]
+    return sorted({path.parent.name for path in places})
+
+
+def predicting_targets(settings: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The targets of those settings whose method predicts: to fill what was rejected, or to draft."""
+    return list(dict.fromkeys(s["policy"]["target"] for s in settings if _predicts(s)))
+
+
+def _predicts(settings: Mapping[str, Any]) -> bool:
+    opening = (settings.get("opening") or {}).get("sources") or []
+    drafts = {settings["proposer"]["kind"], *opening_sources(opening)} & set(PREDICTORS)
+    return bool(drafts or settings["rectifier"]["kind"] == "compensate")
+
+
+def prediction_table(predictions: Predictions) -> pd.DataFrame:
+    """One row per predictor, task, DoF and step ahead; errors in normalised action units."""
+    errors = predictions.errors
+    origin = {
+        "window": predictions.window,
+        "calibration_sha256": predictions.sha256,
+        "target_sha256": predictions.target_sha256,
+        "demos_sha256": predictions.demos.get("sha256", ""),
+        "git_commit": predictions.provenance.get("git_commit", ""),
+    }
+    rows = []
+    for predictor, tasks in errors.items():
+        for task, dofs in tasks.items():
+            counts = predictions.demos.get("tasks", {}).get(task, {})
+            held_out = {"held_out_episodes": counts.get("held_out"), "training_episodes": counts.get("training")}
+            for dof, steps in dofs.items():
+                for step, error in enumerate(steps):
+                    hold = errors.get(REFERENCE, {}).get(task, {}).get(dof, [])
+                    head = {"target": predictions.target, "predictor": predictor, "task": task, "dof": dof}
+                    rows.append(head | {"steps_ahead": step + 1} | _against(error, hold[step : step + 1]) | held_out)
+    return pd.DataFrame(rows).assign(**origin)
+
+
+def _against(error: float, hold: list[float]) -> dict[str, float]:
+    reference = hold[0] if hold else math.nan
+    ratio = error / reference if reference else math.nan  # the gripper is held by all of them, often without an error
+    return {"error": error, "hold_error": reference, "ratio_to_hold": ratio}
+
+
+def position_means(table: pd.DataFrame) -> pd.DataFrame:
+    """Mean error over dx, dy, dz: columns predictor, task, steps_ahead, error."""
+    position = table[table["dof"].isin(_POSITION)]
+    return position.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
+
+
+def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Texts: one row per predictor, the mean error over dx, dy, dz and all tasks by steps ahead; beside it, as a share
+    of hold's."""
+    means = position_means(table).groupby(["predictor", "steps_ahead"], sort=False)["error"].mean().reset_index()
+    errors = {(str(p), int(s)): float(e) for p, s, e in means.itertuples(index=False)}
+    rows: dict[str, dict[str, str]] = {}
+    for (predictor, step), error in errors.items():
+        hold = errors.get((REFERENCE, step), 0.0)
+        text = f" ({100 * error / hold:.0f} %)" if hold and predictor != REFERENCE else ""
+        rows.setdefault(predictor, {"predictor": predictor})[f"{step} ahead"] = f"{error:.4f}{text}"
+    return pd.DataFrame(rows.values())
+
+
+def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
+    """Error against steps ahead, one line per predictor, and every task's error one step ahead."""
+    means = position_means(table)
+    predictors, tasks = list(dict.fromkeys(means["predictor"])), list(dict.fromkeys(means["task"]))
+    with mpl.rc_context(STYLE):
+        figure = new_figure(11.5, max(4.8, 1.9 + len(tasks) * (0.1 + 0.085 * len(predictors))))
+        ahead, by_task = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+        colours = {name: INK if name == REFERENCE else colour(i) for i, name in enumerate(predictors)}
+        _draw_ahead(ahead, means, colours)
+        _draw_tasks(by_task, means[means["steps_ahead"] == 1], tasks, colours)
+        handles, labels = ahead.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        held_out = table.drop_duplicates("task")["held_out_episodes"].sum()
+        about = f"mean of dx, dy, dz · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
+        about += f" · from the last {table['window'][0]} steps"
+        entitle(figure, f"Prediction of the next actions, {predictions.target}", about)
+    return figure
+
+
+def _draw_ahead(panel: Axes, means: pd.DataFrame, colours: Mapping[str, str]) -> None:
+    for name, shade in colours.items():
+        by_step = means[means["predictor"] == name].groupby("steps_ahead")["error"]
+        middle, low, high = by_step.mean(), by_step.quantile(0.25), by_step.quantile(0.75)
+        steps = middle.index.to_numpy()
+        style = (0, (4, 2)) if name == REFERENCE else "-"
+        panel.plot(steps, middle, color=shade, marker="o", markersize=5, linewidth=1.8, linestyle=style, label=name)
+        panel.fill_between(steps, low, high, color=shade, alpha=0.1, linewidth=0)
+        panel.set_xticks(steps)
+    panel.set(title="Steps ahead", xlabel="control steps ahead", ylabel="mean abs error, normalised action units")
+    panel.set_ylim(bottom=0)
+    panel.text(0.02, 0.97, "band: quartiles of the tasks", transform=panel.transAxes, fontsize=8, va="top")
+
+
+def _draw_tasks(panel: Axes, first: pd.DataFrame, tasks: list[str], colours: Mapping[str, str]) -> None:
+    places, thickness = np.arange(len(tasks)), 0.84 / len(colours)
+    for i, (name, shade) in enumerate(colours.items()):
+        errors = first[first["predictor"] == name].set_index("task")["error"].reindex(tasks)
+        offset = (i - (len(colours) - 1) / 2) * thickness
+        panel.barh(places + offset, errors, 0.9 * thickness, color=shade, linewidth=0)
+    panel.set_yticks(places, tasks, color=INK)
+    panel.set_ylim(len(tasks) - 0.5, -0.5)
+    panel.grid(axis="y", visible=False)
+    panel.set(title="One step ahead, by task", xlabel="mean abs error, normalised action units")

@@ -1,0 +1,107 @@
+"""The few columns that people read first, as text: for the terminal and for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from kerv_cli.reporting.measures import MICRO
+from kerv_cli.reporting.tables import is_number
+
+_ALWAYS = {"AL": "AL", "AFEP": "AFEP", "forwards_per_step": "forwards / step"}
+_WHERE_USED = {
+    "skip_rate": "skipped",
+    "compensation_rate": "compensated",
+    "retrieval_share": "retrieved",
+    "deviation": "deviation",
+}
+_PERCENT = frozenset({"skip_rate", "compensation_rate", "retrieval_share"})
+
+
+def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
+    """The rows of one averaging of `study_table`, for the terminal: 80 columns hold labels of 16 characters."""
+    frame = _narrow(summary_frame(table, averaging))
+    title = Text(_title(table, averaging), style="bold")
+    caption = f"brackets: 95 % intervals; p: exact McNemar test against {table['baseline'].iloc[0]}"
+    if "ceiling" in frame:
+        caption += "\nceiling: speedup if every chunk were accepted whole at once"
+    printed = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD)
+    printed.padding, printed.show_edge = 0, False
+    for name in frame.columns:
+        left = name == "setting"
+        head = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
+        interval = name in ("success %", "speedup")  # better a label in two lines than an interval
+        printed.add_column(head, justify="left" if left else "right", overflow="fold", no_wrap=interval)
+    for row in frame.itertuples(index=False):
+        printed.add_row(*(escape(str(value)) for value in row))
+    return printed
+
+
+def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
+    """Without what only a wide page has room for; the shares of decodes in one column."""
+    frame = frame.drop(columns=["AFEP", "lost/won", "deviation"], errors="ignore")
+    shares = [name for key, name in _WHERE_USED.items() if key in _PERCENT and name in frame]
+    if shares:
+        together = frame[shares].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
+        frame.insert(list(frame.columns).index(shares[0]), " / ".join(shares) + " %", together)
+    return frame.drop(columns=shares)
+
+
+def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
+    """The same as texts: 95 % intervals in brackets, `–` where a value does not exist, unused columns left out."""
+    rows = table[table["averaging"] == averaging].to_dict("records")
+    used = {key: name for key, name in _WHERE_USED.items() if any(is_number(row[key]) and row[key] for row in rows)}
+    limited = any(is_number(row["ceiling"]) for row in rows)
+    return pd.DataFrame([_cells({str(k): v for k, v in row.items()}, _ALWAYS | used, limited) for row in rows])
+
+
+def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) -> dict[str, str]:
+    reference = row["label"] == row["baseline"]
+    return {
+        "setting": str(row["label"]),
+        "success %": _interval(row, "success", 100.0, 0),
+        "speedup": "1" if reference else _interval(row, "speedup", 1.0, 2),
+        **({"ceiling": number(row["ceiling"])} if limited else {}),
+        "ms / step": number(row["time_per_step_ms"]),
+        **{name: _percent(row[key]) if key in _PERCENT else number(row[key]) for key, name in columns.items()},
+        "lost/won": "" if reference or not row["pairs"] else f"{row['only_baseline']}/{row['only_method']}",
+        "p": "" if reference or not row["pairs"] else _p(row["mcnemar_p"]),
+    }
+
+
+def _p(value: float) -> str:
+    return "<0.001" if value < 0.001 else f"{value:.2g}"
+
+
+def _interval(row: Mapping[str, Any], name: str, scale: float, digits: int) -> str:
+    if not is_number(row[name]):
+        return "–"
+    value = row[name] * scale
+    # 99.5 % of success must not read as 100 %
+    text = f"{value:.1f}".removesuffix(".0") if name == "success" else f"{value:.{digits}f}"
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return f"{text} ({low * scale:.{digits}f}–{high * scale:.{digits}f})" if is_number(low) else text
+
+
+def number(value: float) -> str:
+    """Three significant digits, never an exponent for what occurs here."""
+    if not is_number(value):
+        return "–"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.0f} %" if is_number(value) else "–"
+
+
+def _title(table: pd.DataFrame, averaging: str) -> str:
+    rows = table[table["averaging"] == averaging]
+    first = rows.iloc[0]
+    counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes each"
+    return f"{first['study']}: {counts}, {averaging}, {first['device_name']}, {first['dtype']}"

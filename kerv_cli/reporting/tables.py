@@ -1,0 +1,236 @@
+"""From cells to tables, CSV files and the summary on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from kerv_cli.environments.metaworld.tasks import TASKS
+from kerv_cli.files import atomic_path
+from kerv_cli.provenance import PACKAGES
+from kerv_cli.reporting.ceiling import (
+    NONE,
+    Ceiling,
+    ceiling,
+    chunk_ratio,
+    is_autoregressive,
+    opens_with_drafts,
+)
+from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, Measured, measure
+from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
+from kerv_cli.studies.plan_file import StudyPlan
+from kerv_cli.studies.store import StoredCell, StudyStore
+
+_STATUS_COLUMNS = (
+    "workers",
+    "device_name",
+    "host",
+    *(f"{name}_version" for name in PACKAGES),
+    "python_version",
+    "git_commit",
+    "run",
+)
+_SETTINGS_ELSEWHERE = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
+
+
+@dataclass(frozen=True)
+class StudyData:
+    """A study's plan and the episodes of its complete cells."""
+
+    plan: StudyPlan
+    cells: dict[str, StoredCell]  # by id
+    episodes: pd.DataFrame  # one row per label and episode
+    absent: list[Cell]  # planned, not complete
+
+
+def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
+    """What a study has; with `cells`, only those of its cells.
+
+    Raises:
+        UsageError: no such study, or no complete cell.
+        CheckpointError: a cell is damaged.
+    """
+    plan = store.read_plan()
+    if cells is not None:
+        plan = StudyPlan(plan.name, plan.title, plan.baseline, plan.axis, tuple(cells))
+    found, absent = store.read_cells(plan.cells)
+    frames = [_labelled(cell, found[cell.id]) for cell in plan.cells if cell.id in found]
+    return StudyData(plan, found, pd.concat(frames, ignore_index=True), absent)
+
+
+def _labelled(cell: Cell, stored: StoredCell) -> pd.DataFrame:
+    runtime = cell.settings["runtime"]
+    return stored.episodes.assign(
+        rand_vec=stored.episodes["rand_vec"].map(tuple),  # comparable
+        label=cell.label,
+        cell=cell.id,
+        difficulty=difficulty_of(cell.task),
+        run=stored.status["run"],
+        device=runtime["device"],
+        device_name=stored.status["device_name"],
+        dtype=runtime["dtype"],
+        threads=runtime["threads"],
+    )
+
+
+def difficulty_of(task: str) -> str:
+    """The task's difficulty group; `other` for a task that is not Meta-World's."""
+    return TASKS[task].difficulty if task in TASKS else "other"
+
+
+def per_task_table(data: StudyData) -> pd.DataFrame:
+    """One row per task and label: tasks by name, labels in the plan's order."""
+    by_task = [episodes for _, episodes in data.episodes.groupby("task", sort=True)]
+    return _frame([row for episodes in by_task for row in _rows(data, episodes, "one task")])
+
+
+def study_table(data: StudyData) -> pd.DataFrame:
+    """Two rows per label: micro over tasks and macro over difficulty groups."""
+    return _frame([row for averaging in (MICRO, MACRO) for row in _rows(data, data.episodes, averaging)])
+
+
+Sections = list[dict[str, Any]]
+"""One row, in the order of its columns. Settings differ in what they have; what they share stays together."""
+
+
+def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
+    """Rows as a table: within a section, columns that only later rows have come behind those of the first."""
+    columns = [name for parts in zip(*rows, strict=True) for part in parts for name in part]
+    merged = [{name: value for part in row for name, value in part.items()} for row in rows]
+    return pd.DataFrame(merged, columns=list(dict.fromkeys(columns)))
+
+
+def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
+    """One row per label that has episodes here."""
+    baseline = episodes[episodes["label"] == data.plan.baseline]
+    for label in data.plan.labels:
+        own = episodes[episodes["label"] == label]
+        if len(own):
+            yield _row(data, label, own, baseline, averaging)
+
+
+def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
+    tasks = sorted(set(episodes["task"]))
+    cells = [c for c in data.plan.cells if c.label == label and c.task in tasks and c.id in data.cells]
+    head = {
+        "study": data.plan.name,
+        "averaging": averaging,
+        "label": label,
+        "method": cells[0].settings["method"],
+        "task": ";".join(tasks),
+        "tasks": len(tasks),
+        "difficulty": _joined(sorted(set(episodes["difficulty"]))),
+        "seeds": seeds_text(episodes["seed"]),
+        "episodes": len(episodes),
+        "baseline": data.plan.baseline,
+    }
+    measured = measure(episodes, baseline, averaging)
+    best = _ceiling(data, cells[0], episodes, averaging)
+    return [head, _measured(measured, best, episodes), *_origin(data, cells)]
+
+
+def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:
+    """Against autoregressive decoding of the same target on the same device: the baseline, or else the first one."""
+    if is_autoregressive(cell.settings):
+        return NONE
+    target = cell.identity.get("target")
+    found = [c for c in data.plan.cells if is_autoregressive(c.settings) and c.identity.get("target") == target]
+    found.sort(key=lambda other: other.label != data.plan.baseline)
+    if not found:
+        return NONE
+    reference = data.episodes[data.episodes["label"] == found[0].label]
+    for name in ("task", *COMPARABLE):
+        reference = reference[reference[name].isin(set(episodes[name]))]
+    chunks = chunk_ratio(cell.settings, found[0].settings)
+    return ceiling(episodes, reference, opens_with_drafts(cell.settings), chunks, averaging == MACRO)
+
+
+def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[str, Any]:
+    phases = {name: value for name, value in found.values.items() if name.startswith("ms.")}
+    rest = {name: value for name, value in found.values.items() if name not in phases}
+    limit = best.columns()
+    return {
+        "successes": int(episodes["success"].sum()),
+        "success": found.success.value,
+        "success_low": found.success.low,
+        "success_high": found.success.high,
+        "speedup": found.speedup.value,
+        "speedup_low": found.speedup.low,
+        "speedup_high": found.speedup.high,
+        "ceiling": limit.pop("ceiling"),
+        **rest,
+        "pairs": sum(found.counts),
+        **found.counts._asdict(),
+        "mcnemar_p": found.mcnemar_p,
+        "same_run": found.same_run,
+        "steps": int(episodes["steps"].sum()),
+        "decodes": int(episodes["decodes"].sum()),
+        "deviation_samples": int(episodes["deviation_count"].sum()),
+        **phases,
+        **limit,
+    }
+
+
+def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
+    """Settings, weights and provenance of a row, the same for all its cells or joined by semicolons."""
+    settings, policy = cells[0].settings, cells[0].settings["policy"]
+    world, runtime = settings["world"], settings["runtime"]
+    statuses = [data.cells[cell.id].status for cell in cells]
+    parts = {key: value for key, value in settings.items() if key not in {*_SETTINGS_ELSEWHERE, "world", "runtime"}}
+    weights = {
+        "target": policy["target"],
+        "drafter": policy.get("drafter"),
+        "early": policy.get("early"),
+        OBSERVATION: cells[0].identity.get(OBSERVATION, ""),
+        **{f"{name}_sha256": value for name, value in sorted(cells[0].identity.items()) if name != OBSERVATION},
+    }
+    surroundings = {
+        "horizon": world["horizon"],
+        "camera": world["camera"]["name"],
+        **flatten({"camera": {k: v for k, v in world["camera"].items() if k != "name"}}),
+        **{key: value for key, value in runtime.items() if key != "workers"},
+        **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
+        "cell": ";".join(cell.id for cell in cells),
+    }
+    return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; lists joined by semicolons."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = _joined(value) if isinstance(value, list | tuple) else value
+    return flat
+
+
+def _joined(values: Iterable[Any]) -> str:
+    return ";".join(dict.fromkeys(str(value) for value in values))
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """CSV with six significant digits; empty where a value does not exist."""
+    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> Path:
+    """Writes `csv_text` atomically.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(csv_text(table), encoding="utf-8")
+    return path
+
+
+def is_number(value: Any) -> bool:
+    """Whether a table's value is there: neither None nor NaN."""
+    return value is not None and not math.isnan(value)

@@ -1,1 +1,0 @@
-"""The world: Meta-World behind a small interface. Importing this package loads neither metaworld nor mujoco."""

@@ -1,0 +1,302 @@
+"""What a policy observes and what it does, as data: no constant of a simulator stands anywhere else.
+
+An `ActionSpace` and an `ObservationSpace` belong to an environment and travel with every artifact made from it: target,
+drafter, datastore, calibration. Where two that meet differ, kerv refuses (`check_same`).
+
+Notation (docs/methods.md §0): D degrees of freedom (DoFs) per control step, H control steps per chunk, N = H · D
+tokens; token j is control step j // D, DoF j % D.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.errors import CheckpointError
+
+
+@dataclass(frozen=True)
+class Group:
+    """A kinematic group: neighbouring DoFs that are drafted and judged together, e.g. position or rotation."""
+
+    name: str
+    size: int  # DoFs
+
+
+@dataclass(frozen=True)
+class ActionSpace:
+    """The actions of one control step, and their tokens.
+
+    names: of the D DoFs, in the tokens' order. groups: kinematic groups, in order; their sizes add up to D. strict: the
+    DoFs whose draft tokens must equal the target's and which are held, never extrapolated (a gripper opens or closes).
+    control_hz: control steps per second. low, high: (D,) in environment units, what -1 and 1 of the normalised range
+    mean; an environment gives its limits, a policy the 1st and 99th percentile of its demonstrations. bins: edges on
+    [-1, 1]; a token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges, 255 centres).
+
+    Raises:
+        ValueError: numbers that do not fit together.
+    """
+
+    names: tuple[str, ...]
+    groups: tuple[Group, ...]
+    strict: tuple[str, ...]
+    control_hz: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    bins: int = 256
+
+    def __post_init__(self) -> None:
+        if not self.names or len(set(self.names)) != len(self.names):
+            raise ValueError(f"DoFs need names of their own: {self.names}")
+        if sum(group.size for group in self.groups) != self.dofs or any(group.size < 1 for group in self.groups):
+            raise ValueError(f"groups {self.groups} do not cover the {self.dofs} DoFs in order")
+        if not set(self.strict) <= set(self.names):
+            raise ValueError(f"strict {self.strict} names a DoF that is not there: {self.names}")
+        if len(self.low) != self.dofs or len(self.high) != self.dofs:
+            raise ValueError(f"low and high need {self.dofs} numbers each")
+        if not all(low < high < np.inf and low > -np.inf for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"low {self.low} must lie below high {self.high}")
+        if self.bins < 3 or not 0 < self.control_hz < np.inf:
+            raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> ActionSpace:
+        """The inverse of `as_dict`.
+
+        Raises:
+            CheckpointError: not an action space.
+        """
+        from kerv_cli.manifests import read
+
+        return read(cls, value, "an action space")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return asdict(self)
+
+    @property
+    def dofs(self) -> int:
+        """D."""
+        return len(self.names)
+
+    @property
+    def tokens(self) -> int:
+        """How many tokens there are."""
+        return self.bins - 1
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """(bins,) on [-1, 1]."""
+        return np.linspace(-1.0, 1.0, self.bins)
+
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """(tokens,) what every token means, normalised."""
+        return (self.edges[:-1] + self.edges[1:]) / 2
+
+    @cached_property
+    def is_strict(self) -> np.ndarray:
+        """(D,) bool."""
+        return np.array([name in self.strict for name in self.names])
+
+    @cached_property
+    def bounds(self) -> tuple[tuple[int, int], ...]:
+        """Per DoF: the first DoF of its group, and one past the last."""
+        found, first = [], 0
+        for group in self.groups:
+            found += [(first, first + group.size)] * group.size
+            first += group.size
+        return tuple(found)
+
+    def segments(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
+        """Chunk indices [first, last) of every group between `start` and `stop`, and whether all its DoFs are strict.
+        A group that lies partly outside is cut."""
+        while start < stop:
+            step, dof = divmod(start, self.dofs)
+            first, end = self.bounds[dof]
+            last = min(stop, step * self.dofs + end)
+            yield start, last, bool(self.is_strict[first:end].all())
+            start = last
+
+    def strict_tokens(self, size: int) -> np.ndarray:
+        """(size,) bool: which of a chunk's first `size` tokens belong to a strict DoF."""
+        return np.resize(self.is_strict, size)
+
+    def normalise(self, actions: np.ndarray) -> np.ndarray:
+        """(..., D) environment units -> [-1, 1], clipped."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        return np.clip(2.0 * (actions - low) / (high - low) - 1.0, -1.0, 1.0)
+
+    def unnormalise(self, values: np.ndarray) -> np.ndarray:
+        """(..., D) in [-1, 1] -> environment units."""
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        return (values + 1.0) / 2.0 * (high - low) + low
+
+    def bins_of(self, values: np.ndarray) -> np.ndarray:
+        """Normalised values -> int64 tokens of the same shape. Both ends belong to the outermost bins."""
+        return np.clip(np.digitize(values, self.edges) - 1, 0, self.tokens - 1).astype(np.int64)
+
+    def values_of(self, tokens: np.ndarray) -> np.ndarray:
+        """Tokens -> normalised values of the same shape, the bins' centres."""
+        return self.centres[np.asarray(tokens)]
+
+    def encode(self, actions: np.ndarray) -> np.ndarray:
+        """(..., D) environment units -> (..., D) int64 tokens."""
+        return self.bins_of(self.normalise(actions))
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """(..., D) tokens -> (..., D) environment units; the centre of each bin."""
+        return self.unnormalise(self.values_of(tokens))
+
+    def fitted(self, actions: np.ndarray) -> ActionSpace:
+        """The same space, normalised by the 1st and 99th percentile of actions (n, D) in environment units. A DoF that
+        never moves gets a unit range around its value."""
+        low, high = np.percentile(actions, [1, 99], axis=0)
+        still = high - low < 1e-6
+        low, high = np.where(still, low - 1.0, low), np.where(still, high + 1.0, high)
+        return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
+
+    def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
+        """Refuse another action space: names, groups, strict DoFs, bins and control rate; with `statistics` the
+        normalisation too, without which the same token is another action.
+
+        Raises:
+            CheckpointError: they differ; the line names the first difference. here, there: who they belong to.
+        """
+        fields = ["names", "groups", "strict", "bins", "control_hz", *(("low", "high") if statistics else ())]
+        for name in fields:
+            mine, theirs = getattr(self, name), getattr(other, name)
+            if mine != theirs:
+                if name == "groups":
+                    mine, theirs = ("+".join(f"{g.name} {g.size}" for g in x) for x in (mine, theirs))
+                raise CheckpointError(
+                    f"{here} has an action space with {name} {_text(mine)}, {there} one with {_text(theirs)}: "
+                    "they were made for different actions and cannot be used together"
+                )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in value) or "none"
+    return str(value)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A position in the privileged state: `state[first : first + 3]`, metres."""
+
+    name: str
+    first: int
+
+
+@dataclass(frozen=True)
+class ObservationSpace:
+    """What an environment tells besides images.
+
+    proprioception: names of its numbers; the first three are the end effector's position in metres. state: how many
+    privileged numbers there are. places: positions in the state that a policy may estimate from images, e.g. object and
+    goal; all others are only for a policy that is given the state. extra: further indices of the state that such a
+    policy reads as they are. previous: (numbers, first index of the step before's copy of them), or None; their
+    difference over `step_scale` is a velocity. centre: metres, the middle of the workspace.
+    """
+
+    proprioception: tuple[str, ...]
+    state: int
+    places: tuple[Place, ...]
+    centre: tuple[float, float, float]
+    extra_places: tuple[Place, ...] = ()
+    extra: tuple[int, ...] = ()
+    previous: tuple[int, int] | None = None
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> ObservationSpace:
+        """The inverse of `as_dict`.
+
+        Raises:
+            CheckpointError: not an observation space.
+        """
+        from kerv_cli.manifests import read
+
+        return read(cls, value, "an observation space")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What is known before a decode.
+
+    proprioception: (p,) float64, what the robot feels. state: (s,) float64, privileged. instruction: what the robot is
+    told. images: camera name -> (h, w, 3) uint8, only those that were asked for.
+    """
+
+    proprioception: np.ndarray
+    state: np.ndarray
+    instruction: str = ""
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
+        """The same observation, seen."""
+        return replace(self, images=images)
+
+
+# --- until every room reads its ActionSpace: what Meta-World's compact target used to have built in
+EDGES = np.linspace(-1.0, 1.0, 256)
+CENTRES = (EDGES[:-1] + EDGES[1:]) / 2
+VOCABULARY = len(CENTRES)  # 255
+DOF_NAMES = ("dx", "dy", "dz", "gripper")
+GRIPPER = 3
+
+
+@dataclass(frozen=True)
+class ActionTokenizer:
+    """Normalise per DoF with the demonstrations' 1st / 99th percentile, then bin.
+
+    low, high: (D,) in environment units; they map to -1 and 1.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def fit(cls, actions: np.ndarray) -> ActionTokenizer:
+        """actions (n, D), environment units. A DoF that never moves gets a unit range around its value."""
+        low, high = np.percentile(actions, [1, 99], axis=0)
+        still = high - low < 1e-6
+        return cls(np.where(still, low - 1.0, low), np.where(still, high + 1.0, high))
+
+    @property
+    def dofs(self) -> int:
+        return len(self.low)
+
+    def normalise(self, actions: np.ndarray) -> np.ndarray:
+        """(..., D) environment units -> [-1, 1]."""
+        return np.clip(2.0 * (actions - self.low) / (self.high - self.low) - 1.0, -1.0, 1.0)
+
+    def unnormalise(self, values: np.ndarray) -> np.ndarray:
+        """(..., D) in [-1, 1] -> environment units."""
+        return (values + 1.0) / 2.0 * (self.high - self.low) + self.low
+
+    def encode(self, actions: np.ndarray) -> np.ndarray:
+        """(..., D) environment units -> (..., D) int64 tokens in [0, 254]."""
+        return bins_of(self.normalise(actions))
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """(..., D) tokens -> (..., D) environment units; the centre of each bin."""
+        return self.unnormalise(values_of(tokens))
+
+
+def bins_of(values: np.ndarray) -> np.ndarray:
+    """Normalised values -> tokens. Both ends belong to the outermost bins."""
+    return np.clip(np.digitize(values, EDGES) - 1, 0, VOCABULARY - 1).astype(np.int64)
+
+
+def values_of(tokens: np.ndarray) -> np.ndarray:
+    """Tokens -> normalised values, the bins' centres."""
+    return CENTRES[np.asarray(tokens)]

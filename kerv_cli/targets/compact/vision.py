@@ -1,0 +1,71 @@
+"""Frames -> vision tokens and image points.
+
+A small convolutional stem. Two things leave it: a coarse grid of tokens for the trunk, and K image points by spatial
+soft-argmax (Finn et al. 2016) on the finest map, because what decides success on Meta-World is where a 4-pixel marker
+lies. No augmentation moves the image: a shift is a lie about where things are.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kerv_cli.targets.compact.inference import Planned
+
+
+class Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(8, channels)
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(F.relu(self.first(self.norm(x))))
+
+
+class VisionEncoder(Planned):
+    """(B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
+
+    columns: Tensor
+
+    def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int) -> None:
+        super().__init__()
+        c, coarse = channels, size // 8
+        if size % 8 or coarse % grid:
+            raise ValueError(f"image size {size} must be a multiple of 8 and {size} / 8 a multiple of the grid {grid}")
+        self.fine = nn.Sequential(nn.Conv2d(3, c, 5, stride=2, padding=2), Residual(c))
+        self.middle = nn.Sequential(nn.Conv2d(c, 2 * c, 3, stride=2, padding=1), Residual(2 * c))
+        self.coarse = nn.Sequential(nn.Conv2d(2 * c, 4 * c, 3, stride=2, padding=1), Residual(4 * c))
+        self.heat_fine = nn.Conv2d(c, keypoints, 3, padding=1)
+        self.heat_middle = nn.Conv2d(2 * c, keypoints, 1)
+        self.heat_coarse = nn.Conv2d(4 * c, keypoints, 1)
+        self.patch = nn.Conv2d(4 * c, width, coarse // grid, stride=coarse // grid)
+        self.grid_position = nn.Parameter(torch.randn(grid * grid, width) * 0.02)
+        self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
+        self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        if self.plan is not None and len(images) == 1:
+            return self.plan(images)
+        images = images.to(self.patch.weight.dtype) / 255.0 - 0.5
+        fine = self.fine(images)
+        middle = self.middle(fine)
+        coarse = self.coarse(middle)
+        heat = (
+            self.heat_fine(fine)
+            + F.interpolate(self.heat_middle(middle), scale_factor=2.0, mode="nearest")
+            + F.interpolate(self.heat_coarse(coarse), scale_factor=4.0, mode="nearest")
+        )
+        tokens = self.patch(coarse).flatten(2).transpose(1, 2) + self.grid_position
+        return tokens, self.points(heat)
+
+    def points(self, heat: Tensor) -> Tensor:
+        """(B, K, h, w) -> (B, 2K): each map's expected column and row under its softmax."""
+        batch, keypoints, height, width = heat.shape
+        scaled = heat.float() * self.temperature[:, None, None].float()
+        weight = scaled.flatten(2).softmax(-1).view(batch, keypoints, height, width)
+        x = (weight.sum(2) * self.columns).sum(-1)
+        y = (weight.sum(3) * self.columns).sum(-1)
+        return torch.cat([x, y], -1)

@@ -1,0 +1,177 @@
+"""How well the next actions follow from the last ones: windows of the demonstrations, the filters' noise fitted on
+training episodes, every predictor's error on held-out ones (METHODS §3.1)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kerv_cli.drafting.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
+from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.spaces import DOF_NAMES, GRIPPER, ActionTokenizer
+
+if TYPE_CHECKING:
+    from kerv_cli.environments.demos.dataset import DemoDataset
+    from kerv_cli.environments.demos.episode_file import DemoEpisode
+
+RATIOS = np.logspace(-3, 3, 49)  # q / r that are tried, r = 1
+DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)  # tried by the damped filter
+HISTORIES = ("labels", "executed")
+
+
+@dataclass(frozen=True)
+class Windows:
+    """n recorded moments: what was done before each, and what the expert does from there on; normalised.
+
+    past (n, window, D), future (n, H, D), task (n,) index into `tasks`, held_out (n,) bool by whole episodes.
+    """
+
+    past: np.ndarray
+    future: np.ndarray
+    task: np.ndarray
+    held_out: np.ndarray
+    tasks: tuple[str, ...]
+    episodes: dict[str, dict[str, int]]  # task -> {"training": episodes, "held_out": episodes}
+
+    def where(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(past, future) of the moments in `mask`."""
+        return self.past[mask], self.future[mask]
+
+
+def episode_windows(
+    episode: DemoEpisode, actions: ActionTokenizer, history: str, window: int, horizon: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(past (n, window, D), future (n, horizon, D)) of every moment of an episode that has a full window behind it.
+
+    history: what the past is made of: the clean `labels`, or what was `executed`. The future is always the labels.
+
+    Raises:
+        CheckpointError: too few labels were recorded beyond the episode's end.
+    """
+    steps, dofs = episode.executed.shape
+    if len(episode.labels) < steps + horizon - 1:
+        raise CheckpointError(
+            f"the demonstrations have {len(episode.labels) - steps} labels behind an episode's end, predictions of "
+            f"{horizon} steps need {horizon - 1}: record them again with a longer tail"
+        )
+    if steps <= window:
+        return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
+    labels = actions.normalise(episode.labels)
+    source = labels[:steps] if history == "labels" else actions.normalise(episode.executed)
+    past = np.lib.stride_tricks.sliding_window_view(source[:-1], window, axis=0)
+    future = np.lib.stride_tricks.sliding_window_view(labels[window : steps + horizon - 1], horizon, axis=0)
+    return past.swapaxes(1, 2), future.swapaxes(1, 2)
+
+
+def read_windows(
+    dataset: DemoDataset,
+    chosen: Mapping[int, bool],
+    actions: ActionTokenizer,
+    history: str,
+    window: int,
+    horizon: int,
+    on_progress: Callable[[int, int], None],
+) -> Windows:
+    """The windows of the episodes `chosen`: index in the dataset -> whether it is held out.
+
+    Raises:
+        KervError: a task's training or held-out episodes are all shorter than the window.
+    """
+    tasks = tuple(dict.fromkeys(dataset.episodes[i].task for i in chosen))
+    counts = {task: {"training": 0, "held_out": 0} for task in tasks}
+    parts, labels, held = [], [], []
+    for done, (index, held_out) in enumerate(chosen.items(), 1):
+        episode = dataset.load(index)
+        past, future = episode_windows(episode, actions, history, window, horizon)
+        parts.append((past.astype(np.float32), future.astype(np.float32)))
+        labels.append(np.full(len(past), tasks.index(episode.task)))
+        held.append(np.full(len(past), held_out))
+        counts[episode.task]["held_out" if held_out else "training"] += bool(len(past))
+        on_progress(done, len(chosen))
+    short = [task for task, count in counts.items() if not all(count.values())]
+    if short:
+        raise KervError(f"{', '.join(short)}: no training or no held-out episode is longer than a window of {window}")
+    past, future = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Windows(past, future, np.concatenate(labels), np.concatenate(held), tasks, counts)
+
+
+def choose_episodes(dataset: DemoDataset, tasks: Iterable[str], limit: int, share: float) -> dict[int, bool]:
+    """Index -> held out, of the first `limit` episodes per task (0: all); every k-th of a task's plain episodes and
+    every k-th of its perturbed ones is held out.
+
+    Raises:
+        CheckpointError: a task has no demonstration.
+        UsageError: `share` or `limit` out of range.
+    """
+    if not 0 < share <= 0.5:
+        raise UsageError(f"held_out={share}: more than 0, at most 0.5")
+    if limit < 0:
+        raise UsageError(f"episodes={limit}: 0 for all, or the number per task")
+    by_task: dict[str, list[int]] = defaultdict(list)
+    for index, entry in enumerate(dataset.episodes):
+        by_task[entry.task].append(index)
+    chosen: dict[int, bool] = {}
+    for task in tasks:
+        if task not in by_task:
+            raise CheckpointError(f"the demonstrations hold no episode of {task}: record them first")
+        of_task = by_task[task][: limit or None]
+        for perturbed in (False, True):
+            kind = [i for i in of_task if dataset.episodes[i].perturbed == perturbed]
+            every = min(max(2, round(1 / share)), max(2, len(kind)))
+            chosen |= {index: place % every == every - 1 for place, index in enumerate(kind)}
+    return chosen
+
+
+def fit_noise(past: np.ndarray, future: np.ndarray, order: int, dampings: Sequence[float]) -> tuple[float, float]:
+    """(q, damping) with the smallest mean absolute error over all moments and steps, for r = 1.
+
+    past (n, window), future (n, H) of one DoF. Searched on a grid: `RATIOS` x `dampings`.
+    """
+    window, steps = past.shape[1], future.shape[1]
+
+    def error(candidate: tuple[float, float]) -> float:
+        weights = kalman_weights(candidate[0], 1.0, window, steps, order, candidate[1])
+        return float(np.abs(np.clip(past @ weights.T, -1.0, 1.0) - future).mean())
+
+    return min(((float(q), damping) for damping in dampings for q in RATIOS), key=error)
+
+
+def fit_filters(windows: Windows, steps: int) -> dict[str, Noise]:
+    """The noise of every kind of filter, per DoF, from the training episodes; the gripper is held and not fitted."""
+    past, future = windows.where(~windows.held_out)
+    fitted = {}
+    for kind, model in FILTERS.items():
+        dampings = DAMPINGS if kind == "damped" else (1.0,)
+        found = [
+            (0.0, 1.0) if dof == GRIPPER else fit_noise(past[..., dof], future[:, :steps, dof], model.order, dampings)
+            for dof in range(past.shape[2])
+        ]
+        fitted[kind] = Noise(tuple(q for q, _ in found), (1.0,) * len(found), tuple(d for _, d in found))
+    return fitted
+
+
+Errors = dict[str, dict[str, dict[str, list[float]]]]
+"""predictor -> task -> DoF -> mean absolute error 1 … H steps ahead, normalised action units."""
+
+
+def prediction_errors(windows: Windows, noise: Mapping[str, Noise]) -> Errors:
+    """Errors of every predictor on the held-out episodes."""
+    window, horizon, dofs = windows.past.shape[1], windows.future.shape[1], windows.past.shape[2]
+    errors: Errors = {}
+    for kind in PREDICTORS:
+        predictor = build_predictor(kind, dofs, noise, window, window, horizon, GRIPPER)
+        errors[kind] = {}
+        for number, task in enumerate(windows.tasks):
+            past, future = windows.where(windows.held_out & (windows.task == number))
+            mean = np.abs(predictor.predict_many(past, horizon) - future).mean(0)
+            errors[kind][task] = {name: mean[:, dof].tolist() for dof, name in enumerate(DOF_NAMES)}
+    return errors
+
+
+def position_errors(errors: Errors, kind: str) -> np.ndarray:
+    """(tasks, H): mean over dx, dy, dz."""
+    return np.array([[rows[name] for name in DOF_NAMES[:GRIPPER]] for rows in errors[kind].values()]).mean(1)

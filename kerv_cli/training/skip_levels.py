@@ -1,0 +1,123 @@
+"""How similar is similar enough to skip the verification (METHODS §4.3; HeiSD): each task's s_min, from a datastore.
+
+An entry's key is looked up among the other episodes of its task, and the best neighbour's chunk is compared with the
+chunk that the expert went on with from the entry itself. That is what would have been executed without a forward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kerv_cli.decoding.calibration_file import NEVER
+from kerv_cli.errors import UnknownName
+from kerv_cli.spaces import values_of
+
+if TYPE_CHECKING:
+    from kerv_cli.drafting.datastore import Datastore
+
+ENTRIES = 4000  # looked up per task, evenly spread; on MT10, levels from 1000 did not hold on other episodes
+LEAST = 20  # entries above a level; fewer prove nothing about it
+LOW, HIGH = 2.0, 1 / 3  # wrong chunks that the bounds of s_min allow, as multiples of what s_min itself allows
+
+
+@dataclass(frozen=True)
+class Matches:
+    """n entries of one task and their best neighbours in other episodes."""
+
+    similarity: np.ndarray  # (n,) float32, cosine
+    error: np.ndarray  # (n,) mean absolute difference of the two chunks, normalised action units
+    gripper: np.ndarray  # (n,) bool, some gripper token differs
+
+    def good(self, epsilon: float) -> np.ndarray:
+        """(n,) bool: the error is at most epsilon and the gripper is the expert's, token for token. A wrong gripper
+        hides in a mean over all DoFs, and drops what is held."""
+        return (self.error <= epsilon) & ~self.gripper
+
+
+def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
+    """Leave one episode out: the best neighbour of up to `entries` evenly spread entries of `task`; none where the
+    datastore holds a single episode of it.
+
+    Raises:
+        UnknownName: a task that the datastore does not hold.
+    """
+    if task not in store.shards:
+        raise UnknownName("task of the datastore", task, store.shards)
+    shard, dofs = store.shards[task], int(store.manifest["dofs"])
+    if len(np.unique(store.seeds[shard])) < 2:
+        return Matches(np.zeros(0, np.float32), np.zeros(0), np.zeros(0, bool))
+    rows = np.linspace(shard.start, shard.stop - 1, min(entries, shard.stop - shard.start)).astype(int)
+    similarity, chunks = [], []
+    for row in rows:
+        found = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
+        similarity.append(found.similarity[0])
+        chunks.append(found.chunks[0])
+    own, drafted = store.tokens[rows].astype(np.int64), np.stack(chunks)
+    error = np.abs(values_of(drafted) - values_of(own)).mean(1)
+    gripper = (drafted != own)[:, dofs - 1 :: dofs].any(1)
+    return Matches(np.array(similarity, np.float32), error, gripper)
+
+
+def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
+    """The lowest similarity s such that of the entries with similarity ≥ s at least the share `confidence` is good.
+
+    similarity (n,), good (n,) bool. Equal similarities are above a level together. None where no level has `least`
+    entries above it and enough good ones among them.
+    """
+    order = np.argsort(-similarity, kind="stable")
+    ranked = similarity[order]
+    above = np.arange(1, len(ranked) + 1)
+    enough = (np.cumsum(good[order]) / above >= confidence) & (above >= least)
+    enough[:-1] &= ranked[:-1] > ranked[1:]
+    return float(ranked[enough][-1]) if enough.any() else None
+
+
+def task_levels(matches: Matches, epsilon: float, confidence: float) -> dict[str, Any]:
+    """s_min of one task, the bounds between which feedback may move it, and what it would skip.
+
+    low ≤ s_min ≤ high: the same level where twice and where a third of the wrong chunks are allowed (at a confidence
+    of 0.9: 0.8 and 0.967). Where no level is that good, high is the largest similarity seen, where next to nothing is
+    skipped. A task without an s_min has NEVER for all three: nothing lets it skip.
+
+    -> {"s_min", "low", "high", "share" of the entries that would be skipped, "within": the share of those that are
+    good, "error": their mean absolute error (None where there are none), "entries": how many were looked up}
+    """
+    good, wrong = matches.good(epsilon), 1 - confidence
+    s_min = lowest_level(matches.similarity, good, confidence)
+    row: dict[str, Any] = {"s_min": NEVER, "low": NEVER, "high": NEVER, "share": 0.0, "within": None, "error": None}
+    if s_min is not None:
+        low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
+        skipped = matches.similarity >= s_min
+        row = {
+            "s_min": s_min,
+            "low": s_min if low is None else min(low, s_min),
+            "high": float(matches.similarity.max()) if high is None else max(high, s_min),
+            "share": float(skipped.mean()),
+            "within": float(good[skipped].mean()),
+            "error": float(matches.error[skipped].mean()),
+        }
+    return {**row, "entries": len(matches.similarity)}
+
+
+def skip_section(
+    store: Datastore,
+    sha256: str,
+    tasks: Sequence[str],
+    epsilon: float,
+    confidence: float,
+    on_progress: Callable[[int, int], None],
+) -> dict[str, Any]:
+    """The calibration's `skip`: the levels of those `tasks` that the datastore holds, and which datastore it was.
+
+    sha256: of the datastore's manifest. Empty where it holds none of the tasks.
+    """
+    found = {}
+    for done, task in enumerate(tasks, 1):
+        if task in store.shards:
+            found[task] = task_levels(match(store, task), epsilon, confidence)
+        on_progress(done, len(tasks))
+    return {"datastore": sha256, "epsilon": epsilon, "confidence": confidence, "tasks": found} if found else {}

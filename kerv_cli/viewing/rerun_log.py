@@ -1,0 +1,391 @@
+"""EpisodeRecord -> one .rrd file for the Rerun viewer.
+
+Everything is put together in memory and written by one atomic write of our own: Rerun's file sink waits forever on a
+full disk. Timelines: `step` (control steps) and `time` (simulated seconds). Column i of an entity belongs to a control
+step or to the control step at which a decode's actions begin.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from PIL import Image
+from rerun.error_utils import catch_and_log_exceptions
+
+from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord
+from kerv_cli.files import atomic_path
+from kerv_cli.viewing.blueprint import CELL_HEIGHT, CELL_WIDTH, KEY_ROWS, SIGNALS, STEP, TIME, EpisodeMeta, blueprint
+from kerv_cli.viewing.token_outcomes import FATES, TokenFate, acceptance, chunk_size, decode_table, dof_names, fates_of
+
+JPEG_QUALITY = 85
+_SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in FATES.values()}
+_MODE_COLORS = {
+    "ar": 0x6E7B8BFF,
+    "drafter": 0x56B4E9FF,
+    "retrieval": 0x009E73FF,
+    "merged": 0xCC79A7FF,
+    "early": 0xD4A6C8FF,
+    "jacobi": 0x8A7FD4FF,
+    "skip": 0xF0E442FF,
+    "hold": 0xE69F00FF,
+    "kalman": 0xD55E00FF,
+}
+_OTHER_COLORS = (0x0072B2FF, 0xA0522DFF, 0x4C9F70FF, 0xB07AA1FF)
+_DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
+_OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
+_CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
+
+
+@dataclass(frozen=True)
+class Entity:
+    """What one entity of the recording gets."""
+
+    path: str
+    static: tuple[rr.AsComponents, ...] = ()
+    steps: NDArray[np.int64] | None = None  # (rows,) control steps
+    columns: Iterable[Any] = ()  # rerun columns of as many rows
+
+
+def save_episode(
+    record: EpisodeRecord, path: Path, *, method: str, tokens_per_step: int = 4, fps: float = 80.0
+) -> Path:
+    """Writes an episode as a recording that carries its own layout; the file is complete or absent.
+
+    Args:
+        record: frames may be missing; then the recording has no camera.
+        path: the .rrd file; its folder is created.
+        method: name of the method, for the summary; recordings of one method share their layout in the viewer.
+        tokens_per_step: D.
+        fps: control steps per second of simulated time.
+
+    Returns:
+        `path`.
+
+    Raises:
+        StorageError: the disk is full or read-only, or the folder may not be written to.
+    """
+    with catch_and_log_exceptions(strict=True):  # a mistake must raise here, not become a warning and a missing view
+        content = _encode(record, method, tokens_per_step, fps)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return path
+
+
+def _encode(record: EpisodeRecord, method: str, dofs: int, fps: float) -> bytes:
+    """The .rrd file's bytes."""
+    recording = rr.RecordingStream("kerv_" + re.sub(r"\W+", "_", method, flags=re.ASCII))
+    memory = recording.memory_recording()
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    outcome = "success" if record.success else "failure"
+    recording.send_recording_name(readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
+    recording.send_property("episode", rr.AnyValues(**_facts(record, method)))
+    size = chunk_size(record.decodes, dofs)
+    fates = [fates_of(d, size, dofs) for d in record.decodes]
+    for entity in _entities(record, method, dofs, fates, fps):
+        for archetype in entity.static:
+            recording.log(entity.path, archetype, static=True)
+        if entity.steps is not None and len(entity.steps):
+            recording.send_columns(entity.path, _times(entity.steps, fps), entity.columns)
+    recording.send_blueprint(blueprint(meta_of(record, fates, dofs)))
+    return bytes(memory.drain_as_bytes())
+
+
+def meta_of(record: EpisodeRecord, fates: Sequence[Sequence[TokenFate]], dofs: int) -> EpisodeMeta:
+    """What of the episode decides the layout."""
+    low, high = record.path.min(axis=0), record.path.max(axis=0)
+    x, y, z = ((low + high) / 2).tolist()
+    return EpisodeMeta(
+        chunk_steps=len(fates[0]) // dofs if fates else 1,
+        dofs=dof_names(dofs),
+        frames=bool(record.frames),
+        drafted=any(f.fate not in ("target", "dropped") for chunk in fates for f in chunk),
+        verified=any(d.verifications for d in record.decodes),
+        threshold=any(_threshold(d) for d in record.decodes),
+        signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
+        most=max(max(d.forwards, acceptance(d)[0] if d.verifications else 0) for d in record.decodes),
+        centre=(x, y, z),
+        extent=float((high - low).max()),
+    )
+
+
+def readable(text: str) -> str:
+    """`text` with `?` for what the viewer's font lacks, on one line: a missing glyph ends the 0.41 viewer's process."""
+    return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
+
+
+def _times(steps: NDArray[np.int64], fps: float) -> list[rr.TimeColumn]:
+    nanoseconds = np.round(steps * (1e9 / fps)).astype("timedelta64[ns]")
+    return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
+
+
+def _entities(
+    record: EpisodeRecord, method: str, dofs: int, fates: Sequence[Sequence[TokenFate]], fps: float
+) -> list[Entity]:
+    starts = np.asarray(record.decode_steps, dtype=np.int64)
+    return [
+        Entity("summary", (_markdown(summary(record, method, fps)),)),
+        *_camera(record),
+        *_world(record),
+        *_actions(record, dofs),
+        _modes(record, starts),
+        *_token_lanes(fates, starts, dofs),
+        *_current_chunk(fates, starts, dofs),
+        _tables(record, fates, starts, dofs),
+        *_series_per_decode(record, starts, dofs),
+    ]
+
+
+def _camera(record: EpisodeRecord) -> list[Entity]:
+    if not record.frames:
+        return []
+    steps = np.array(sorted(record.frames), dtype=np.int64)
+    blobs = [_jpeg(record.frames[int(s)]) for s in steps]
+    return [
+        Entity(
+            "camera",
+            (rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="Linear"),),
+            steps,
+            rr.EncodedImage.columns(blob=blobs),
+        )
+    ]
+
+
+def _jpeg(frame: NDArray[np.uint8]) -> bytes:
+    """(h, w, 3) uint8 -> a JPEG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+def _world(record: EpisodeRecord) -> list[Entity]:
+    """The end effector's path: all of it, faint; what lies behind, coloured by the gripper; where it is now."""
+    steps = np.arange(len(record.path), dtype=np.int64)
+    opening = np.clip(record.gripper, 0.0, 1.0)[:, None]
+    colors = np.round(_OPEN * opening + _CLOSED * (1 - opening)).astype(np.uint8)
+    end_color = FATES["accepted" if record.success else "rejected"].color
+    ends = rr.Points3D(
+        record.path[[0, -1]],
+        radii=0.006,
+        colors=np.array([0x9AA5B1FF, end_color], dtype=np.uint32),
+        labels=["start", "success" if record.success else "failure"],
+    )
+    moving = rr.Points3D.columns(positions=record.path, colors=colors)
+    return [
+        Entity("world", (rr.ViewCoordinates.RIGHT_HAND_Z_UP,)),
+        Entity("world/path", (rr.LineStrips3D([record.path], radii=0.0008, colors=0x9AA5B160),)),
+        Entity("world/ends", (ends,)),
+        Entity("world/trail", (rr.Points3D.from_fields(radii=0.0025),), steps, moving),
+        Entity("world/hand", (rr.Points3D.from_fields(radii=0.009),), steps, moving),
+    ]
+
+
+def _actions(record: EpisodeRecord, dofs: int) -> list[Entity]:
+    steps = np.arange(record.steps, dtype=np.int64)
+    opening = np.asarray(record.gripper, dtype=np.float64)[:, None]
+    return [
+        Entity("actions", (_named(dof_names(dofs), _DOF_COLORS),), steps, _rows(record.actions)),
+        Entity("gripper", (_named(["gripper opening"], [0xF0E442FF]),), np.arange(len(opening)), _rows(opening)),
+    ]
+
+
+def _modes(record: EpisodeRecord, starts: NDArray[np.int64]) -> Entity:
+    """The decode mode; only its changes."""
+    modes = [d.mode for d in record.decodes]
+    changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]
+    used = sorted(set(modes))
+    others = [m for m in used if m not in _MODE_COLORS]
+    colors = [_MODE_COLORS.get(m) or _OTHER_COLORS[others.index(m) % len(_OTHER_COLORS)] for m in used]
+    style = rr.StateConfiguration(
+        values=used, labels=[readable(m) for m in used], colors=np.array(colors, dtype=np.uint32)
+    )
+    columns = rr.StateChange.columns(state=[modes[i] for i in changes])
+    return Entity("mode", (style,), starts[changes], columns)
+
+
+def _token_lanes(fates: Sequence[Sequence[TokenFate]], starts: NDArray[np.int64], dofs: int) -> list[Entity]:
+    """One entity per control step of the chunk with a lane per DoF: a map of all tokens over time."""
+    style = rr.StateConfiguration(
+        values=list(FATES),
+        labels=[s.symbol for s in FATES.values()],
+        colors=np.array([s.color for s in FATES.values()], dtype=np.uint32),
+    )
+    entities = []
+    for first in range(0, len(fates[0]) if fates else 0, dofs):
+        states = [fate.fate for chunk in fates for fate in chunk[first : first + dofs]]
+        columns = rr.StateChange.columns(state=states).partition([dofs] * len(fates))
+        entities.append(Entity(f"tokens/step_{first // dofs}", (style,), starts, columns))
+    return entities
+
+
+def _current_chunk(fates: Sequence[Sequence[TokenFate]], starts: NDArray[np.int64], dofs: int) -> list[Entity]:
+    """A picture of the chunk that is being executed: a coloured cell per token, rows are control steps."""
+    size = len(fates[0]) if fates else 0
+    centres = np.array([[i % dofs + 0.5, i // dofs + 0.5] for i in range(size)]) * _CELL
+    colors = np.array([FATES[f.fate].color for chunk in fates for f in chunk], dtype=np.uint32)
+    labels = [f.short for chunk in fates for f in chunk]
+    heads = [((i + 0.5, -0.45), name) for i, name in enumerate(dof_names(dofs))]
+    heads += [((-0.4, i + 0.5), f"step {i}") for i in range(size // dofs)]
+    used = [name for name in FATES if any(f.fate == name for chunk in fates for f in chunk)]
+    rows = max(size // dofs, KEY_ROWS)  # the key stands to the right, column by column
+    keys = np.array([[dofs + 1.0 + 1.1 * (i // rows), i % rows + 0.5] for i in range(len(used))]) * _CELL
+    partitions = [size] * len(fates)
+    return [
+        Entity("chunk/cells", (_cells(centres),), starts, rr.LineStrips2D.columns(colors=colors).partition(partitions)),
+        Entity("chunk/text", (_texts(centres),), starts, rr.Points2D.columns(labels=labels).partition(partitions)),
+        Entity("chunk/names", (_texts(np.array([at for at, _ in heads]) * _CELL, [name for _, name in heads]),)),
+        Entity("chunk/legend", (_cells(keys, [FATES[name].color for name in used]),)),
+        Entity("chunk/legend/text", (_texts(keys, [f"{FATES[name].symbol} {name}" for name in used]),)),
+    ]
+
+
+def _cells(centres: NDArray[np.float64], colors: Sequence[int] | None = None) -> rr.LineStrips2D:
+    """Filled, rounded cells at (n, 2) centres: thick short lines, since boxes are outlines."""
+    radius = 0.46 * _CELL[1]
+    reach = np.array([0.48 * _CELL[0] - radius, 0.0])
+    strips = np.stack([centres - reach, centres + reach], axis=1)
+    return rr.LineStrips2D(strips, radii=radius, colors=None if colors is None else np.array(colors, dtype=np.uint32))
+
+
+def _texts(centres: NDArray[np.float64], labels: Sequence[str] | None = None) -> rr.Points2D:
+    """Labels in the middle of (n, 2) centres; the viewer writes them below an invisible point."""
+    above = centres - [0.0, 0.2 * _CELL[1]]
+    return rr.Points2D(above, radii=0.0, colors=[255, 255, 255], labels=labels, show_labels=True, draw_order=40.0)
+
+
+def _tables(
+    record: EpisodeRecord, fates: Sequence[Sequence[TokenFate]], starts: NDArray[np.int64], dofs: int
+) -> Entity:
+    decodes = zip(record.decodes, record.decode_steps, fates, strict=True)
+    texts = [decode_table(d, i, step, chunk, dofs) for i, (d, step, chunk) in enumerate(decodes)]
+    kinds = ["text/markdown"] * len(texts)
+    return Entity("decode/table", (), starts, rr.TextDocument.columns(text=texts, media_type=kinds))
+
+
+def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], dofs: int) -> list[Entity]:
+    """Numbers per decode; a decode without the number has no row, a number that no decode has no entity."""
+    decodes = record.decodes
+    limits, limit_names = _thresholds(decodes, dofs)
+    phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
+    series = [
+        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0xE0E4E8FF]),
+        Series(
+            "decode/acceptance",
+            ["AL, tokens per verification", "drafts accepted per verification"],
+            [acceptance(d) if d.verifications else () for d in decodes],
+            [0x56B4E9FF, 0x009E73FF],
+        ),
+        Series("decode/threshold", limit_names, limits, [0xE69F00FF, *_DOF_COLORS]),
+        Series(
+            "decode/phases",
+            ["total", *phases],
+            [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes],
+            [0xE0E4E8FF, *_DOF_COLORS, 0x6E7B8BFF],
+        ),
+    ]
+    for signal, name in SIGNALS.items():
+        found = [getattr(d, signal) for d in decodes]
+        series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in found]))
+    return [s.entity(starts) for s in series if any(s.values)]
+
+
+@dataclass(frozen=True)
+class Series:
+    """Named numbers per decode, each held until the next one."""
+
+    path: str
+    names: Sequence[str]
+    values: Sequence[Sequence[float]]  # per decode: one number per name, or nothing
+    colors: Sequence[int] | None = None
+
+    def entity(self, starts: NDArray[np.int64]) -> Entity:
+        rows = [i for i, value in enumerate(self.values) if value]
+        style = _named(self.names, self.colors, held=True)
+        return Entity(self.path, (style,), starts[rows], _rows(np.array([self.values[i] for i in rows])))
+
+
+def _threshold(decode: DecodeRecord) -> tuple[int, ...]:
+    """r per DoF of a decode, in bins; empty where no rule with a threshold ran."""
+    return next((r.threshold for r in decode.rounds if r.threshold), ())
+
+
+def _thresholds(decodes: Sequence[DecodeRecord], dofs: int) -> tuple[list[tuple[int, ...]], list[str]]:
+    """r of every decode, one number per group of DoFs that share it all along, and the groups' names."""
+    limits = [_threshold(d) for d in decodes]
+    groups: dict[tuple[int, ...], list[int]] = {}  # a DoF's r over the episode -> the DoFs that have it
+    for dof in range(dofs):
+        groups.setdefault(tuple(r[dof % len(r)] for r in limits if r), []).append(dof)
+    if len(groups) == 1:
+        return [r[:1] for r in limits], ["r"]
+    names = ["r " + " ".join(dof_names(dofs)[i] for i in members) for members in groups.values()]
+    return [tuple(r[members[0]] for members in groups.values()) if r else () for r in limits], names
+
+
+def _named(names: Sequence[str], colors: Sequence[int] | None = None, held: bool = False) -> rr.SeriesLines:
+    colored = None if colors is None else np.array(colors[: len(names)], dtype=np.uint32)
+    return rr.SeriesLines(names=list(names), colors=colored, interpolation_mode="StepAfter" if held else None)
+
+
+def _rows(values: NDArray[Any]) -> Iterable[Any]:
+    """(rows, k) -> a column of k scalars per row."""
+    return rr.Scalars.columns(scalars=values.astype(np.float64).ravel()).partition([values.shape[1]] * len(values))
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type="text/markdown")
+
+
+def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
+    """The episode in single values, kept as properties of the recording."""
+    rounds = [r for d in record.decodes for r in d.rounds if r.tree_size > 0 and r.mode != "skip"]
+    facts: dict[str, Any] = {
+        "task": readable(record.task),
+        "instruction": readable(record.instruction),
+        "method": readable(method),
+        "seed": record.seed,
+        "success": record.success,
+        "steps": record.steps,
+        "decodes": len(record.decodes),
+        "forwards": record.forwards,
+        "forwards_per_step": record.forwards / record.steps,
+        "ms_per_step": 1000 * record.seconds / record.steps,
+        "inference_seconds": record.seconds,
+        "wall_seconds": record.wall_seconds,
+        "skipped_decodes": sum(d.skipped for d in record.decodes),
+        "compensated_tokens": sum(d.compensated for d in record.decodes),
+    }
+    if rounds:
+        facts["acceptance_length"] = sum(r.committed for r in rounds) / len(rounds)
+        facts["accepted_per_round"] = sum(r.accepted for r in rounds) / len(rounds)
+    return facts
+
+
+def summary(record: EpisodeRecord, method: str, fps: float) -> str:
+    """The episode as Markdown, with the key to the tokens' colours."""
+    facts = _facts(record, method)
+    outcome = "SUCCESS" if record.success else "FAILURE"
+    lines = [f"| {facts['task']} | {outcome} |", "|:--|:--|"]
+    lines += [f"| instruction | {facts['instruction']} |"]
+    lines += [f"| method, seed | {facts['method']}, {record.seed} |"]
+    lines.append(f"| control steps | {record.steps} ({record.steps / fps:.2f} s) |")
+    modes = [d.mode for d in record.decodes]
+    counts = ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes))
+    lines.append(f"| decodes | {counts} |")
+    lines.append(f"| forwards per step | {facts['forwards_per_step']:.2f} |")
+    if "acceptance_length" in facts:
+        lines.append(f"| AL | {facts['acceptance_length']:.2f} |")
+        lines.append(f"| accepted per round | {facts['accepted_per_round']:.2f} |")
+    lines.append(f"| compensated tokens | {facts['compensated_tokens']} |")
+    lines.append(f"| decodes without verification | {facts['skipped_decodes']} |")
+    lines.append(f"| inference per step | {facts['ms_per_step']:.2f} ms |")
+    lines += ["", "| token | what became of it |", "|:--|:--|"]
+    lines += [f"| {style.symbol} {name} | {style.meaning} |" for name, style in FATES.items()]
+    return "\n".join(lines)
