@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, composed, console, edge, print_plan, progress_bar
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,19 +19,14 @@ if TYPE_CHECKING:
 @edge
 def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels."""
-    from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import CalibrateSettings
 
-    settings = compose("calibrate", overrides or [], CalibrateSettings)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        return
+    settings = composed("calibrate", overrides, CalibrateSettings, cfg)
     from kerv_cli.training.calibration import CalibrationRun
 
     run = CalibrationRun(settings)
     if plan:
-        typer.echo(run.plan())
-        return
+        print_plan(run.plan())
     with progress_bar("reading demonstrations", len(run.chosen)) as advance:
         run.load(lambda done, total: advance(done, ""))
     variability, skip = {}, None
