@@ -5,3 +5,4 @@ from __future__ import annotations
 from kerv_cli.registry import Part, register
 
 register(Part("environment", "metaworld", "kerv_cli.environments.metaworld.spec:SPEC"))
+register(Part("target", "compact", "kerv_cli.targets.compact.target:build", about="the shipped family"))

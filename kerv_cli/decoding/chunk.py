@@ -16,7 +16,7 @@ from kerv_cli.decoding.record import PHASES, Round
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
-from kerv_cli.targets.compact.trunk import Cache
+from kerv_cli.targets.protocol import Cache
 
 
 class Clock:

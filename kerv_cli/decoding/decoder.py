@@ -18,11 +18,11 @@ from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.decoding.thresholds import Threshold, build_threshold
 from kerv_cli.decoding.verify_skip import VerifySkip
 from kerv_cli.drafting.kinematics import ActionHistory
-from kerv_cli.drafting.tree import TokenTree, prefill_mask, verify_mask
+from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import MethodSettings
-from kerv_cli.spaces import GRIPPER, values_of
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.spaces import GRIPPER, Observation
+from kerv_cli.targets.protocol import Target
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,23 @@ class Decoder:
         self.target, self.method, self.parts = target, method, parts or Parts()
         if self.parts.opening is not None and self.parts.opening.needs_states:
             raise UsageError(f"opening '{self.parts.opening.name}' needs the target's states, which come after it")
-        self.size = steps_of(method.chunk, target.settings.chunk) * target.settings.dofs
+        self.size = steps_of(method.chunk, target.chunk) * target.actions.dofs
         acceptance_rule(method.acceptance)
         self.threshold: Threshold = build_threshold(method.threshold)
         nodes = max(method.proposer.nodes, method.opening.nodes, self.size)
-        self.cache = target.trunk.new_cache(1, target.prompt_length + self.size + nodes + 1)
-        self.situation = Situation("", ActionHistory(target.settings.dofs))
-        self.words: Tensor | None = None
+        self.cache = target.new_cache(1, target.max_prompt + self.size + nodes + 1)
+        self.situation = Situation("", ActionHistory(target.actions.dofs))
+        self.instruction = ""
 
     @property
     def needs_frame(self) -> bool:
-        return self.target.needs_frame
+        return bool(self.target.cameras)
 
     def reset(self, task: str, instruction: str, seed: int = 0) -> None:
         """A new episode begins."""
-        self.words = self.target.words_of(instruction)
+        self.instruction = instruction
         random = episode_generator(self.method.boundary, task, seed)
-        self.situation = Situation(task, ActionHistory(self.target.settings.dofs), random=random)
+        self.situation = Situation(task, ActionHistory(self.target.actions.dofs), random=random)
         self.threshold.reset()
         for part in (self.parts.compensation, self.parts.skip):
             if part is not None:
@@ -86,12 +86,11 @@ class Decoder:
     @torch.inference_mode()
     def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
         """frame (s, s, 3) uint8 or None, state (39,) -> the chunk's actions and the record of its decode."""
-        assert self.words is not None, "reset() begins an episode"
-        target = self.target
-        clock = Clock(target.device)
-        inputs = target.inputs(frame, state, self.words)
+        clock = Clock(self.target.device)
+        images = {} if frame is None else dict.fromkeys(self.target.cameras, frame)
+        observation = Observation(state[:4], state, self.instruction, images)
         clock.lap("preprocess")
-        prompt, _ = target.encode(inputs)
+        prompt = self.target.encode(observation)
         clock.lap("vision")
         chunk = self.decode_prompt(prompt, clock)
         actions, compensated = self.actions_of(chunk)
@@ -129,7 +128,7 @@ class Decoder:
     def decode_prompt(self, prompt: Tensor, clock: Clock | None = None) -> Chunk:
         """prompt (1, P, E) -> a complete chunk, or one that the rectifier closed."""
         clock = clock or Clock(prompt.device)
-        chunk = Chunk(prompt, self.size, self.target.settings.dofs, self.cache, self.situation)
+        chunk = Chunk(prompt, self.size, self.target.actions.dofs, self.cache, self.situation)
         chunk.limits = limits_of(self.method.acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
         if self.parts.boundary is not None:
             chunk.choice = self.parts.boundary.choose(np.array(self.situation.path), self.situation.random)
@@ -155,23 +154,23 @@ class Decoder:
         chunk.forwards = 1
         length = prompt.shape[1]
         if not len(tree):
-            chunk.hidden = target.prefill(prompt, chunk.cache)
+            chunk.cache.length = 0
+            chunk.hidden = target.forward(prompt, torch.arange(length, device=prompt.device), chunk.cache)
             token = int(target.head(chunk.hidden[:, -1]).argmax())
             chunk.tokens.append(token)
             chunk.rounds.append(Round("prefill", "none", 0, (), (token,), 0, 1, 0, ()))
             clock.lap("prefill")
             return
-        x = torch.cat([prompt, target.embedding(torch.tensor([tree.tokens], device=prompt.device))], 1)
+        x = torch.cat([prompt, target.embed(torch.tensor([tree.tokens], device=prompt.device))], 1)
         positions = torch.tensor([*range(length), *(length + d for d in tree.depths)], device=prompt.device)
         chunk.cache.length = 0
-        mask = None if tree.is_chain else prefill_mask(tree, length, prompt)
-        hidden = target.trunk(x, positions, chunk.cache, mask)
+        hidden = target.forward(x, positions, chunk.cache, None if tree.is_chain else tree.seen(length))
         target_tokens = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
         clock.lap("prefill")
         path = self.accept(chunk, tree, target_tokens, self.parts.opening)
         clock.lap("accept")
         rows = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
-        chunk.cache.keep(length, rows)
+        chunk.cache.compact(length, rows)
         chunk.hidden = torch.cat([hidden[:, :length], hidden[:, rows]], 1)
         clock.lap("prefill")
         self.rectify(chunk)
@@ -191,7 +190,8 @@ class Decoder:
         clock.lap("accept")
         rows = torch.tensor([0, *(i + 1 for i in path)], device=hidden.device)
         if len(tree):
-            chunk.cache.keep(self.target.prompt_length + first, self.target.prompt_length + first + rows)
+            at = chunk.prompt.shape[1] + first
+            chunk.cache.compact(at, at + rows)
             clock.lap("accept")
             self.rectify(chunk)
             clock.lap("rectify")
@@ -202,11 +202,10 @@ class Decoder:
     def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:
         """Forward [last committed token, tree] -> hidden (1, 1 + n, E) and the argmax behind each of them."""
         device = self.target.device
-        at = self.target.prompt_length + len(chunk.tokens) - 1
+        at = chunk.prompt.shape[1] + len(chunk.tokens) - 1
         tokens = torch.tensor([[chunk.tokens[-1], *tree.tokens]], device=device)
         positions = torch.tensor([at, *(at + 1 + d for d in tree.depths)], device=device)
-        mask = verify_mask(tree, chunk.cache.length, chunk.prompt)
-        hidden = self.target.step(tokens, positions, chunk.cache, mask)
+        hidden = self.target.forward(self.target.embed(tokens), positions, chunk.cache, tree.seen(1))
         chunk.forwards += 1
         return hidden, self.target.head(hidden)[0].argmax(-1).tolist()
 
@@ -231,7 +230,8 @@ class Decoder:
         drafted = [tree.tokens[i] for i in judged]
         bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
         chunk.tokens += [tree.tokens[i] for i in path] + bonus
-        chunk.variability += float(np.abs(values_of(np.array(drafted)) - values_of(np.array(seen))).sum())
+        values = self.target.actions.values_of
+        chunk.variability += float(np.abs(values(np.array(drafted)) - values(np.array(seen))).sum())
         chunk.rounds.append(
             Round(
                 mode="verify",

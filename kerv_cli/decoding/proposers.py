@@ -17,7 +17,7 @@ from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.settings import ProposerSettings
 from kerv_cli.spaces import VOCABULARY, bins_of, values_of
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.protocol import ReadableTarget, Target
 
 EMPTY = TokenTree((), (), ())
 SURE = 0.05  # odds from which no spare draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
@@ -73,15 +73,15 @@ class EarlyProposer(ChainProposer):
 
     name = "early"
 
-    def __init__(self, early: EarlyDrafter) -> None:
-        self.early = early
+    def __init__(self, early: EarlyDrafter, target: ReadableTarget) -> None:
+        self.early, self.target = early, target
         self._drafted: tuple[Chunk, list[int], float] | None = None
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """Tokens, and the drafter's own odds that all of them are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
-            self._drafted = chunk, *self.early.drafted(chunk.prompt, history, radius)
+            self._drafted = chunk, *self.early.drafted(self.target.pooled(chunk.prompt), history, radius)
         return self._drafted[1], self._drafted[2]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
@@ -96,15 +96,15 @@ class RetrievalProposer(Stateless):
 
     name = "retrieval"
 
-    def __init__(self, datastore: Datastore, target: Target, neighbours: int, nodes: int) -> None:
+    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
-        self.groups = kinematic_groups(target.settings.dofs)
+        self.groups = kinematic_groups(target.actions.dofs)
         self._found: tuple[Chunk, Neighbours] | None = None
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
         """Looked up once per chunk."""
         if self._found is None or self._found[0] is not chunk:
-            key = self.datastore.key(chunk.prompt, self.target.settings)
+            key = self.datastore.key(chunk.prompt, self.target.segments)
             self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
             chunk.similarity = float(self._found[1].similarity[0])
         return self._found[1]
@@ -203,8 +203,8 @@ class DrafterProposer:
     def __init__(self, drafter: Drafter, target: Target, settings: ProposerSettings) -> None:
         self.drafter, self.target, self.settings = drafter, target, settings
         drafted = settings.top_k * max(1, settings.depth)
-        capacity = target.prompt_length + target.tokens_per_chunk + drafted
-        self.state = DraftState(drafter.new_cache(capacity), torch.empty(0))
+        capacity = target.max_prompt + target.chunk * target.actions.dofs + drafted
+        self.state = DraftState(drafter.new_cache(1, capacity), torch.empty(0))
 
     def begin(self, chunk: Chunk) -> None:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
@@ -216,8 +216,8 @@ class DrafterProposer:
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         following = self.embed(chunk.tokens[first + 1 :])
-        observe(self.drafter, self.state, following, hidden, self.target.prompt_length + first)
+        observe(self.drafter, self.state, following, hidden, chunk.prompt.shape[1] + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
         """(1, T, E)."""
-        return self.target.embedding(torch.tensor([tokens], device=self.target.device))
+        return self.target.embed(torch.tensor([tokens], device=self.target.device))

@@ -29,7 +29,8 @@ from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of
-from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, TargetSettings
+from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings
+from kerv_cli.targets.checkpoint import TargetDescription
 
 FORMAT = 1
 FILES = ("vectors.npy", "payload.parquet")
@@ -39,22 +40,13 @@ COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 BACKENDS = ("exact", "qdrant")
 
 
-def segments_of(settings: TargetSettings) -> dict[str, slice]:
-    """Where the prompt's parts lie; instructions are left out, they are the same within a task."""
-    vision = settings.grid**2 if settings.observation == "vision" else 0
-    scene = vision + settings.instruction_tokens
-    end = scene + settings.scene_tokens
-    parts = {"scene": slice(scene, end), "proprioception": slice(end, end + 1)}
-    return {"vision": slice(0, vision), **parts} if vision else parts
-
-
-def prompt_key(prompt: Tensor, settings: TargetSettings, segments: Sequence[str]) -> np.ndarray:
-    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
+def prompt_key(prompt: Tensor, known: Mapping[str, slice], segments: Sequence[str]) -> np.ndarray:
+    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E. known: where the target's prompt has its
+    parts.
 
     Raises:
         UnknownName: a segment that this target's prompt does not have.
     """
-    known = segments_of(settings)
     for name in segments:
         if name not in known:
             raise UnknownName("part of the prompt", name, known)
@@ -114,13 +106,13 @@ class Datastore:
             object.__setattr__(self, "index", ExactIndex(self.vectors, self.seeds, self.shards))
 
     @classmethod
-    def open(cls, folder: Path, description: Mapping[str, Any]) -> Datastore:
+    def open(cls, folder: Path, description: TargetDescription) -> Datastore:
         """With exact search; see `open_datastore`."""
         return cls(**_read(folder, description))
 
-    def key(self, prompt: Tensor, settings: TargetSettings) -> np.ndarray:
-        """prompt (1, P, E) of the target -> (d,) float32."""
-        return prompt_key(prompt, settings, self.manifest["key"])[0]
+    def key(self, prompt: Tensor, segments: Mapping[str, slice]) -> np.ndarray:
+        """prompt (1, P, E) of the target, and where its parts lie -> (d,) float32."""
+        return prompt_key(prompt, segments, self.manifest["key"])[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
         """Exact search among the entries of `task`: key (d,) -> its k nearest (all, where there are fewer).
@@ -138,7 +130,7 @@ class Datastore:
         return Neighbours(similarity, self.tokens[at].astype(np.int64), self.seeds[at], self.steps[at], self.left[at])
 
 
-def open_datastore(folder: Path, description: Mapping[str, Any], settings: DatastoreSettings) -> Datastore:
+def open_datastore(folder: Path, description: TargetDescription, settings: DatastoreSettings) -> Datastore:
     """A datastore, searched by the backend asked for; every backend finds the same neighbours.
 
     description: the target's, as `load_target` returns it.
@@ -173,7 +165,7 @@ def check_backend(settings: DatastoreSettings) -> None:
         raise UsageError("datastore.backend=qdrant needs the extra: pip install 'kerv[qdrant]'")
 
 
-def _read(folder: Path, description: Mapping[str, Any]) -> dict[str, Any]:
+def _read(folder: Path, description: TargetDescription) -> dict[str, Any]:
     """What a datastore's files hold, checked against each other and the target."""
     manifest = read_manifest(folder)
     check_target(manifest, description, folder)
@@ -215,27 +207,27 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def check_target(manifest: Mapping[str, Any], description: Mapping[str, Any], folder: Path) -> None:
+def check_target(manifest: Mapping[str, Any], description: TargetDescription, folder: Path) -> None:
     """Refuse a datastore whose keys or tokens mean something else to this target.
 
     Raises:
         CheckpointError: another chunk length, other action statistics, other weights.
     """
-    settings, again = description["settings"], "build one with 'kerv build datastore'"
-    if (manifest["chunk"], manifest["dofs"]) != (settings["chunk"], settings["dofs"]):
+    again, dofs = "build one with 'kerv build datastore'", description.actions.dofs
+    if (manifest["chunk"], manifest["dofs"]) != (description.chunk, dofs):
         raise CheckpointError(
             f"the datastore in {folder} holds chunks of {manifest['chunk']} steps of {manifest['dofs']} DoFs, the "
-            f"target decodes {settings['chunk']} of {settings['dofs']}: {again}"
+            f"target decodes {description.chunk} of {dofs}: {again}"
         )
-    if manifest["actions"] != description["actions"]:
+    if manifest["actions"] != {"low": list(description.actions.low), "high": list(description.actions.high)}:
         raise CheckpointError(
             f"the datastore in {folder} was made with other action statistics than the target's, the same token is "
             f"another action there: {again}"
         )
-    if manifest["target"] != description["sha256"]:
+    if manifest["target"] != description.sha256:
         raise CheckpointError(
             f"the datastore in {folder} was built for target {manifest['target'][:12]}, not for "
-            f"{description['sha256'][:12]}: {again}"
+            f"{description.sha256[:12]}: {again}"
         )
 
 

@@ -39,7 +39,7 @@ def build_decoder(policy: Policy, method: MethodSettings, task: str = "") -> Dec
 
 def build_parts(policy: Policy, method: MethodSettings, task: str = "") -> Parts:
     """task: whose calibrated levels hold, where a part has one per task."""
-    check_composition(method, policy.target.settings.chunk)
+    check_composition(method, policy.target.chunk)
     proposer = build_proposer(policy, method)
     return Parts(
         opening=build_opening(policy, method),
@@ -75,7 +75,7 @@ def build_source(
     """What drafts whole chunks without the target's states."""
     if name == "early":
         assert policy.early is not None
-        return EarlyProposer(policy.early)
+        return EarlyProposer(policy.early, policy.target)
     if name == "retrieval":
         assert policy.datastore is not None
         return RetrievalProposer(policy.datastore, policy.target, neighbours, nodes)
@@ -83,11 +83,11 @@ def build_source(
 
 
 def predictor_of(policy: Policy, name: str) -> Predictor:
-    chunk = policy.target.settings
+    target = policy.target
     if policy.calibration is not None and name in FILTERS:
-        return policy.calibration.predictor(name, horizon=chunk.chunk)
+        return policy.calibration.predictor(name, horizon=target.chunk)
     least = PREDICTED_FROM.get(name, MINIMUM)
-    return build_predictor(name, chunk.dofs, {}, least, horizon=chunk.chunk, gripper=GRIPPER)
+    return build_predictor(name, target.actions.dofs, {}, least, horizon=target.chunk, gripper=GRIPPER)
 
 
 def build_compensation(policy: Policy, method: MethodSettings) -> Compensation | None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration
 from kerv_cli.drafting.datastore import Datastore, check_backend, check_target, open_datastore, read_manifest
@@ -20,8 +18,8 @@ from kerv_cli.places import drafter_folder, early_folder, find_target
 from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.runtime import DTYPES, set_up
 from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings, opening_sources
-from kerv_cli.targets.checkpoint import load_target, read_description
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_target
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.datastore import datastore_beside
 
 
@@ -29,7 +27,7 @@ from kerv_cli.training.datastore import datastore_beside
 class Policy:
     """Loaded weights and the hashes that name them."""
 
-    target: Target
+    target: CompactTarget
     drafter: Drafter | None
     early: EarlyDrafter | None
     calibration: Calibration | None
@@ -42,15 +40,15 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     if is_expert(settings):
         return {"target": "", "observation": "state (privileged)"}
     folder = find_target(settings.results, settings.policy.target)
-    description = read_description(folder, "target")
-    identity = {"target": description["sha256"], "observation": observation_of(description)}
+    description = read_target(folder)
+    identity = {"target": description.sha256, "observation": observation_of(description)}
     method = settings.parts()
     if needs_drafter(method):
         beside = drafter_folder(settings.results, settings.policy.drafter, folder)
-        identity["drafter"] = read_description(beside, "drafter")["sha256"]
+        identity["drafter"] = read_drafter(beside, description.sha256, description.actions).sha256
     if needs_early(method):
         beside = early_folder(settings.results, settings.policy.early, folder)
-        identity["early"] = read_description(beside, "early")["sha256"]
+        identity["early"] = read_early(beside, description).sha256
     if needs_calibration(method):
         identity["calibration"] = sha256_of(calibration_beside(folder))
     if needs_datastore(method):
@@ -78,9 +76,9 @@ def needs_datastore(method: MethodSettings) -> bool:
     return "retrieval" in opening_sources(method.opening.sources)
 
 
-def observation_of(description: Mapping[str, Any]) -> str:
+def observation_of(description: TargetDescription) -> str:
     """What the target is shown, for every row: one that is given the scene must not pass for one that sees it."""
-    kind = description["settings"]["observation"]
+    kind = description.settings["observation"]
     return "state (privileged)" if kind == "state" else str(kind)
 
 
@@ -113,23 +111,22 @@ def check(settings: RolloutSettings) -> None:
             raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
         return
     folder = find_target(settings.results, settings.policy.target)
-    description = read_description(folder, "target")
-    size, camera = description["settings"]["image_size"], settings.world.camera
-    if description["settings"]["observation"] == "vision" and camera.size != size:
+    description = read_target(folder)
+    size, camera = description.settings["image_size"], settings.world.camera
+    if description.cameras and camera.size != size:
         raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
     method = settings.parts()
-    check_composition(method, description["settings"]["chunk"])
+    check_composition(method, description.chunk)
     if needs_drafter(method):
-        read_drafter(drafter_folder(settings.results, settings.policy.drafter, folder), description["sha256"])
+        beside = drafter_folder(settings.results, settings.policy.drafter, folder)
+        read_drafter(beside, description.sha256, description.actions)
     if needs_early(method):
         read_early(early_folder(settings.results, settings.policy.early, folder), description)
     if needs_datastore(method):
         check_backend(settings.datastore)
         check_target(read_manifest(datastore_beside(folder)), description, datastore_beside(folder))
     if needs_calibration(method):
-        calibration = load_calibration(
-            calibration_beside(folder), description["sha256"], description["settings"]["chunk"]
-        )
+        calibration = load_calibration(calibration_beside(folder), description.sha256, description.chunk)
         for name in resolve_tasks(settings.task):
             calibration.threshold(settings.threshold, name)
 
@@ -146,7 +143,7 @@ def _load(
 ) -> Policy:
     """stored: the datastore's backend and url."""
     loaded, description = load_target(target, device, DTYPES[dtype_name])
-    sha256, chunk, at = description["sha256"], loaded.settings.chunk, datastore_beside(target)
+    sha256, chunk, at = description.sha256, loaded.chunk, datastore_beside(target)
     return Policy(
         target=loaded,
         drafter=load_drafter(drafter, loaded, sha256)[0] if drafter is not None else None,

@@ -106,15 +106,15 @@ class CalibrationRun:
 
     def __init__(self, settings: CalibrateSettings) -> None:
         from kerv_cli.drafting.datastore import check_target, read_manifest
-        from kerv_cli.targets.checkpoint import read_description
+        from kerv_cli.targets.checkpoint import read_target
         from kerv_cli.training.datastore import datastore_beside
 
         self.settings = settings
         _check_settings(settings)
         self.tasks = resolve_tasks(settings.task)
         folder = find_target(settings.results, settings.policy.target)
-        self.described = read_description(folder, "target")
-        self.chunk = int(self.described["settings"]["chunk"])
+        self.described = read_target(folder)
+        self.chunk = self.described.chunk
         if not 0 <= settings.fit_steps <= self.chunk:
             raise UsageError(
                 f"fit_steps={settings.fit_steps}: at most the target's chunk of {self.chunk}, 0 for all of it"
@@ -143,8 +143,8 @@ class CalibrationRun:
 
     def load(self, progress: Progress) -> None:
         """Reads the actions and paths of the chosen episodes."""
-        s, statistics = self.settings, self.described["actions"]
-        actions = ActionTokenizer(*(np.asarray(statistics[name]) for name in ("low", "high")))
+        s, space = self.settings, self.described.actions
+        actions = ActionTokenizer(np.asarray(space.low), np.asarray(space.high))
         reader = PathReader(self.dataset.path, self.dataset.manifest, self.dataset.episodes)
         self.windows = read_windows(reader, self.chosen, actions, s.history, s.window, self.chunk, progress)
         self.paths = [reader.paths[index] for index, held_out in self.chosen.items() if not held_out]
@@ -231,7 +231,7 @@ class CalibrationRun:
         }
         sections, origins = self._kept({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target={"sha256": self.described["sha256"], "chunk": self.chunk, "dofs": len(self.windows.past[0, 0])},
+            target={"sha256": self.described.sha256, "chunk": self.chunk, "dofs": len(self.windows.past[0, 0])},
             demos={"sha256": self.dataset.sha256, "tasks": self.windows.episodes},
             window=self.settings.window,
             noise=noise,
@@ -245,7 +245,7 @@ class CalibrationRun:
     def _kept(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """The sections, empty ones as an earlier run left them, and the provenance of each that was taken over."""
         try:
-            earlier = load_calibration(self.path, self.described["sha256"], self.chunk)
+            earlier = load_calibration(self.path, self.described.sha256, self.chunk)
         except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew
             earlier = None
         reasons = {

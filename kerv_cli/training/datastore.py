@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kerv_cli.drafting.datastore import FILES, FORMAT, Datastore, check_seeds, prompt_key, segments_of
+from kerv_cli.drafting.datastore import FILES, FORMAT, Datastore, check_seeds, prompt_key
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.metaworld.tasks import resolve_tasks, task
@@ -25,8 +25,9 @@ from kerv_cli.places import artifact, beside, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, TargetSettings
-from kerv_cli.targets.checkpoint import load_target, read_description
-from kerv_cli.targets.compact.target import Inputs, Target
+from kerv_cli.targets.checkpoint import TargetDescription, load_target
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.training.imitation import observed
 
 BATCH = 128  # observations encoded at once
 WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
@@ -70,20 +71,21 @@ def observed_steps(episode: DemoEpisode, settings: TargetSettings) -> np.ndarray
 
 
 @torch.inference_mode()
-def entries_of(target: Target, episode: DemoEpisode, segments: list[str], stride: int = 1) -> Entries:
+def entries_of(target: CompactTarget, episode: DemoEpisode, segments: list[str], stride: int = 1) -> Entries:
     """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions. A
     chunk that begins near the end takes the labels recorded beyond the success: it never reaches into another episode.
     """
     settings = target.settings
     steps = observed_steps(episode, settings)[::stride]
-    states = torch.from_numpy(episode.states[steps])
-    frames = torch.from_numpy(episode.frames[::stride]).permute(0, 3, 1, 2) if target.needs_frame else None
+    felt, states = (torch.from_numpy(x) for x in observed(episode, steps, target.observation))
+    frames = torch.from_numpy(episode.frames[::stride]).permute(0, 3, 1, 2) if target.cameras else None
     words = target.words_of(task(episode.task).instruction)
     keys = []
     for rows in torch.arange(len(steps)).split(BATCH):
         images = frames[rows].to(target.device) if frames is not None else None
-        inputs = Inputs(images, states[rows].to(target.device), words.expand(len(rows), -1))
-        keys.append(prompt_key(target.encode(inputs)[0], settings, segments))
+        told = words.expand(len(rows), -1)
+        inputs = Inputs(images, felt[rows].to(target.device), states[rows].to(target.device), told)
+        keys.append(prompt_key(target.encode_batch(inputs)[0], target.segments, segments))
     chunks = np.stack([episode.labels[t : t + settings.chunk] for t in steps])
     tokens = target.actions.encode(chunks).reshape(len(steps), -1).astype(np.uint8)
     return Entries(np.concatenate(keys), tokens, steps.astype(np.int64), (episode.steps - steps).astype(np.int64))
@@ -101,8 +103,8 @@ class DatastoreBuild:
         self.settings = settings
         tasks = sorted(resolve_tasks(settings.task))
         self.target_folder = find_target(settings.results, settings.policy.target)
-        shape = TargetSettings(**read_description(self.target_folder, "target")["settings"])
-        known = segments_of(shape)
+        target, _ = load_target(self.target_folder)
+        known = target.segments
         for name in settings.key:
             if name not in known:
                 raise UnknownName("key", name, known)
@@ -159,7 +161,7 @@ class DatastoreBuild:
         return Datastore.open(self.folder, description)
 
     def _manifest(
-        self, target: Target, description: dict[str, Any], shards: dict[str, Any], rows: int, device: str
+        self, target: CompactTarget, description: TargetDescription, shards: dict[str, Any], rows: int, device: str
     ) -> dict[str, Any]:
         return {
             "format": FORMAT,
@@ -168,9 +170,9 @@ class DatastoreBuild:
             "width": len(self.settings.key) * target.settings.width,
             "rows": rows,
             "chunk": target.settings.chunk,
-            "dofs": target.settings.dofs,
-            "actions": description["actions"],
-            "target": description["sha256"],
+            "dofs": target.actions.dofs,
+            "actions": {"low": list(description.actions.low), "high": list(description.actions.high)},
+            "target": description.sha256,
             "demos": self.dataset.sha256,
             "first_evaluation_seed": EVALUATION_SEED,
             "tasks": shards,
