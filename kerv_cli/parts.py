@@ -353,6 +353,7 @@ def _calibrated(reads: bool) -> tuple[str, ...]:
 _BUILD = "kerv_cli.decoding.build:"
 
 register(Part("environment", "metaworld", "kerv_cli.environments.metaworld.spec:SPEC"))
+register(Part("target", "compact", "kerv_cli.targets.compact.target:build", about="the shipped family"))
 
 for _name, _fitted in (("hold", False), ("linear", False), ("kalman", True), ("damped", True), ("acceleration", True)):
     register(Part("predictor", _name, "kerv_cli.drafting.kinematics:build_predictor", traits={"fitted": _fitted}))

@@ -111,17 +111,16 @@ class TargetSettings:
     """Shapes of the target (METHODS §0). `conf/target/*.yaml` are the sizes."""
 
     size: str = "small"
-    observation: str = "vision"  # vision | state (privileged: object and goal positions are given)
+    observation: str = "vision"  # vision | state (privileged: the places' positions are given)
     width: int = 192
     layers: int = 8
     heads: int = 6
     feed_forward: int = 512
     chunk: int = 4  # H, control steps per decode
-    dofs: int = 4  # D
     grid: int = 4  # vision tokens per side
     keypoints: int = 32  # spatial soft-argmax points of the vision encoder
     channels: int = 24  # width of the vision encoder's first stage
-    scene_tokens: int = 4  # tokens that carry object and goal positions, estimated (vision) or given (state)
+    scene_tokens: int = 4  # tokens that carry the places' positions, estimated (vision) or given (state)
     instruction_tokens: int = 10
     image_size: int = 96
 
@@ -146,6 +145,7 @@ class TrainSettings:
     closed_loop: int = 0  # episodes per task and validation, closed loop
     seed: int = 0
     bf16: bool = True  # autocast the training forward to bfloat16
+    half: bool = False  # weights on disk in float16: half the size, for shipping
 
 
 @dataclass

@@ -17,7 +17,7 @@ from kerv_cli.rollouts.episode import Recording, run_episode
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.rollouts.policy import is_expert, load_policy
 from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings, WorldSettings
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.protocol import Target
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:

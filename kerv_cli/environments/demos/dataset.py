@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, load_episode
+from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of
+from kerv_cli.spaces import ActionSpace, ObservationSpace
 
 
 def episode_path(out: Path, task: str, seed: int) -> Path:
@@ -58,6 +60,21 @@ class DemoDataset:
     def sha256(self) -> str:
         """Hex hash over the hashes of all episode files: two datasets with the same hash are the same."""
         return str(self.manifest["sha256"])
+
+    @property
+    def environment(self) -> str:
+        """Name of the environment it was recorded in; what was recorded before there was more than one has none."""
+        return str(self.manifest.get("environment", "metaworld"))
+
+    @property
+    def actions(self) -> ActionSpace:
+        """Its environment's action space."""
+        return ACTIONS
+
+    @property
+    def observation(self) -> ObservationSpace:
+        """Its environment's observation space."""
+        return OBSERVATION
 
     @classmethod
     def open(cls, path: Path) -> DemoDataset:
