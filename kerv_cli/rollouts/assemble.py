@@ -23,7 +23,6 @@ from kerv_cli.decoding.rectify import DRAFT, Compensation
 from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
 from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, Predictor, build_predictor
 from kerv_cli.rollouts.composition import check_composition
-from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.policy import Policy
 from kerv_cli.settings import SPARE, CameraSettings, MethodSettings, RolloutSettings
 from kerv_cli.spaces import GRIPPER
@@ -160,7 +159,7 @@ class Sampled:
         self.decoder.finish(success)
 
 
-def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> ActionDecoder:
+def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> Decoder | Sampled:
     """The method's decoder, with the task's own reference level where the threshold follows one."""
     method = settings.parts()
     if policy.calibration is not None:
@@ -171,7 +170,7 @@ def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> Act
     return Sampled(decoder, Decoder(policy.target, MethodSettings(chunk=method.chunk)), settings.deviation_every)
 
 
-def warm_up(decoder: ActionDecoder, task: str, camera: CameraSettings) -> None:
+def warm_up(decoder: Decoder | Sampled, task: str, camera: CameraSettings) -> None:
     """First calls allocate, choose kernels and fault pages in: they are no part of any inference time. The hand moves,
     so that parts which wait for a history or a path take their turn."""
     decoder.reset(task, "", 0)

@@ -5,19 +5,43 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from kerv_cli.decoding.decoder import Decoder
-from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
+from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.metaworld.world import World
+from kerv_cli.environments.spec import World
 from kerv_cli.rollouts.assemble import episode_decoder, warm_up
-from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.episode import ActionDecoder, Recording, run_episode
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.rollouts.policy import is_expert, load_policy
 from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings, WorldSettings
+from kerv_cli.spaces import Observation
 from kerv_cli.targets.compact.target import Target
+
+
+class FrameDecoder:
+    """A decoder of (frame, state), given observations: until decoding/ takes them itself."""
+
+    def __init__(self, decoder: Any, camera: str) -> None:
+        self.decoder = decoder
+        self.cameras = (camera,) if decoder.needs_frame else ()
+
+    def reset(self, task: str, instruction: str, seed: int) -> None:
+        self.decoder.reset(task, instruction, seed)
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        record: DecodeRecord = self.decoder.decode(next(iter(observation.images.values()), None), observation.state)
+        return record
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        self.decoder.observe(action, end_effector)
+
+    def finish(self, success: bool) -> None:
+        self.decoder.finish(success)
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:
@@ -26,7 +50,7 @@ def camera_config(settings: CameraSettings) -> CameraConfig:
 
 @functools.lru_cache(maxsize=1)
 def _world(task: str, camera: CameraConfig, horizon: int) -> World:
-    return World(task, camera, horizon)
+    return spec_of(task).open_world(task, camera, horizon)
 
 
 _opened: list[World] = []
@@ -51,9 +75,12 @@ def close_worlds() -> None:
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
     """One method on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
-    decoder = ExpertDecoder() if is_expert(settings) else episode_decoder(load_policy(settings), settings, task)
-    warm_up(decoder, task, settings.world.camera)
     world = open_world(task, settings.world)
+    decoder: ActionDecoder = ExpertDecoder()
+    if not is_expert(settings):
+        decoded = episode_decoder(load_policy(settings), settings, task)
+        warm_up(decoded, task, settings.world.camera)
+        decoder = FrameDecoder(decoded, world.camera.name)
     logged = dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
     for number, seed in enumerate(seeds):
         recorded = settings.record < 0 or number < settings.record
@@ -62,7 +89,10 @@ def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iter
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share of successful AR episodes over tasks and seeds."""
-    decoder = Decoder(target, MethodSettings())
-    outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
+    decoder, outcomes = Decoder(target, MethodSettings()), []
+    for task in tasks:
+        world = open_world(task, settings)
+        seen = FrameDecoder(decoder, world.camera.name)
+        outcomes += [run_episode(world, seen, seed).success for seed in seeds]
     close_worlds()
     return float(np.mean(outcomes))

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from kerv_cli.drafting.datastore import FILES, FORMAT, Datastore, check_seeds, prompt_key, segments_of
+from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import resolve_tasks, task
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, write_json
 from kerv_cli.places import artifact, beside, find_target
@@ -78,7 +78,7 @@ def entries_of(target: Target, episode: DemoEpisode, segments: list[str], stride
     steps = observed_steps(episode, settings)[::stride]
     states = torch.from_numpy(episode.states[steps])
     frames = torch.from_numpy(episode.frames[::stride]).permute(0, 3, 1, 2) if target.needs_frame else None
-    words = target.words_of(task(episode.task).instruction)
+    words = target.words_of(spec_of(episode.task).task(episode.task).instruction)
     keys = []
     for rows in torch.arange(len(steps)).split(BATCH):
         images = frames[rows].to(target.device) if frames is not None else None

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.drafting.early import EarlyDrafter, choose, padded, pool
+from kerv_cli.environments import spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import task
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings, TrainSettings
 from kerv_cli.spaces import GRIPPER
@@ -78,7 +78,7 @@ def teach_early(
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
     """
-    stride = int(dataset.manifest["config"]["frame_stride"]) if target.needs_frame else 1
+    stride = int(dataset.manifest.config["frame_stride"]) if target.needs_frame else 1
     share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
     parts: list[EarlySamples] = []
     waiting: list[Observations] = []
@@ -102,7 +102,7 @@ def observations(target: Target, episode: DemoEpisode, index: int, share: float,
     executed = target.actions.normalise(episode.executed)
     shown = [padded(executed[:t], history, target.settings.dofs) for t in steps[chosen]]
     images = torch.from_numpy(frames[chosen]).permute(0, 3, 1, 2) if target.needs_frame else None
-    words = target.words_of(task(episode.task).instruction).repeat(len(chosen), 1)
+    words = target.words_of(spec_of(episode.task).task(episode.task).instruction).repeat(len(chosen), 1)
     inputs = Inputs(images, torch.from_numpy(episode.states[steps[chosen]]).float(), words)
     actions, known = (np.stack(x) for x in zip(*shown, strict=True))
     return Observations(inputs, actions, known, index, episode.perturbed)

@@ -17,9 +17,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.environments import spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import TASKS, task
+from kerv_cli.environments.metaworld.tasks import TASKS
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
 from kerv_cli.spaces import DOF_NAMES, VOCABULARY, ActionTokenizer, values_of
@@ -74,7 +75,7 @@ def load_samples(
         episode = dataset.load(index)
         frames, steps = _frames_and_steps(episode, settings)
         chunks = np.stack([episode.labels[t : t + settings.chunk] for t in steps])
-        ids = words.encode(task(episode.task).instruction, settings.instruction_tokens)
+        ids = words.encode(spec_of(episode.task).task(episode.task).instruction, settings.instruction_tokens)
         parts.append((frames, episode.states[steps], chunks, ids, number, task_names.index(episode.task)))
         on_episode(number + 1, len(chosen))
     counts = [len(p[1]) for p in parts]
