@@ -352,7 +352,22 @@ def _calibrated(reads: bool) -> tuple[str, ...]:
 
 _BUILD = "kerv_cli.decoding.build:"
 
-register(Part("environment", "metaworld", "kerv_cli.environments.metaworld.spec:SPEC"))
+register(
+    Part(
+        "environment",
+        "metaworld",
+        "kerv_cli.environments.metaworld.spec:SPEC",
+        traits={"names": "kerv_cli.environments.metaworld.tasks:NAMES"},
+    )
+)
+register(
+    Part(
+        "environment",
+        "insertion",
+        "kerv_cli.environments.insertion.spec:SPEC",
+        traits={"names": "kerv_cli.environments.insertion.tasks:NAMES"},
+    )
+)
 register(Part("target", "compact", "kerv_cli.targets.compact.target:build", about="the shipped family"))
 
 for _name, _fitted in (("hold", False), ("linear", False), ("kalman", True), ("damped", True), ("acceleration", True)):

@@ -62,7 +62,7 @@ def made_up_episode(task: str, seed: int, tail: int = 8) -> DemoEpisode:
         states=np.random.default_rng(seed).normal(0, 0.1, (STEPS, 39)).astype(np.float32),
         labels=labels.astype(np.float32),
         executed=np.clip(executed, -1, 1).astype(np.float32),
-        rand_vec=np.zeros(3),
+        initial_state=np.zeros(3),
     )
 
 

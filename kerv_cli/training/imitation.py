@@ -77,7 +77,7 @@ def load_samples(
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
         frames, steps = _frames_and_steps(episode, settings)
-        felt, states = observed(episode, steps, dataset.observation)
+        felt, states = observed(episode, steps, dataset.manifest.observation)
         ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
         parts.append(
             {
@@ -97,7 +97,7 @@ def load_samples(
 
 def instruction_of(name: str) -> str:
     """What the robot is told in a task."""
-    return task(name).instruction
+    return spec_of(name).task(name).instruction
 
 
 def observed(episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace) -> tuple[np.ndarray, np.ndarray]:
@@ -232,7 +232,7 @@ def new_target(
     """A fresh policy of the dataset's spaces with the samples' action statistics."""
     torch.manual_seed(seed)
     actions = dataset.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    return CompactTarget(replace(settings), actions, dataset.observation, words, camera)
+    return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
 
 
 def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:
@@ -265,7 +265,7 @@ def check_spaces(target: CompactTarget, dataset: DemoDataset) -> None:
         CheckpointError: other actions or observations.
     """
     target.actions.check_same(dataset.actions, "the target", f"the demonstrations in {dataset.path}")
-    if target.observation != dataset.observation:
+    if target.observation != dataset.manifest.observation:
         raise CheckpointError(
             f"the demonstrations in {dataset.path} have other observations than the target was trained on: "
             "they are of another environment"

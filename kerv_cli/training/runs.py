@@ -14,8 +14,8 @@ from torch import nn
 
 from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
+from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.metaworld.tasks import resolve_tasks
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.places import artifact, drafter_folder, early_folder, find_target
 from kerv_cli.provenance import provenance
@@ -147,7 +147,7 @@ class TargetRun:
             "command": "kerv train target",
             "settings": asdict(self.settings),
             **self.origin,
-            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
@@ -222,7 +222,7 @@ class DrafterRun:
         made = {
             "command": "kerv train drafter",
             "settings": asdict(self.settings),
-            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
