@@ -40,7 +40,29 @@ class RuntimeSettings:
     device: str = "cpu"  # cpu | cuda | auto
     dtype: str = "float32"
     threads: int = 1  # torch threads of each process
-    workers: int = 1  # processes
+    executor: str = "local"  # sweeps: who runs the blocks: local (processes here) | slurm | ray
+    workers: int = 1  # sweeps: blocks that run at the same time
+    executor_options: dict[str, Any] = field(default_factory=dict)  # see SlurmOptions, RayOptions
+
+
+@dataclass
+class SlurmOptions:
+    """`runtime.executor_options` of slurm: a block is a job."""
+
+    cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
+    partition: str = ""  # empty: the cluster's default
+    minutes: int = 120  # longest time of a job
+    memory_gb: int = 8
+    gpus: int = 0
+    setup: list[str] = field(default_factory=list)  # shell lines before the job's Python starts
+
+
+@dataclass
+class RayOptions:
+    """`runtime.executor_options` of ray: a block is a task."""
+
+    address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: a Ray of its own on this machine
+    gpus: float = 0.0  # per block
 
 
 @dataclass
@@ -204,6 +226,8 @@ class StudySettings:
     common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
+    block: int = 5  # seeds for which the settings take turns in one process, episode by episode
+    repeats: int = 1  # how often every episode is measured
 
 
 @dataclass

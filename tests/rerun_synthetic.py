@@ -122,7 +122,7 @@ def episode(kind: str, horizon: int = 60, chunk: int = 4, frames: int = 0, seed:
         actions=np.stack(actions).astype(np.float32),
         path=path.astype(np.float32),
         gripper=(0.5 + 0.5 * np.cos(angle)).astype(np.float32),
-        rand_vec=np.zeros(6),
+        initial_state=np.zeros(6),
         frames=pictures,
         wall_seconds=1.5,
     )

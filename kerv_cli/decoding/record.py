@@ -85,7 +85,7 @@ class EpisodeRecord:
     actions: np.ndarray  # (T, D) float32, executed, environment units, clipped to [-1, 1]
     path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
     gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
-    rand_vec: np.ndarray  # Meta-World's random vector: with the task it rebuilds the initial state
+    initial_state: np.ndarray  # what the seed drew: with the task it rebuilds the first observation
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
     wall_seconds: float = 0.0  # whole episode, simulation and rendering included
 

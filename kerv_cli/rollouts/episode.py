@@ -83,7 +83,7 @@ def run_episode(world: World, decoder: ActionDecoder, seed: int, recording: Reco
         actions=np.stack(actions),
         path=np.stack(path).astype(np.float32),
         gripper=np.asarray(gripper, dtype=np.float32),
-        rand_vec=world.rand_vec,
+        initial_state=world.rand_vec,
         frames=frames,
         wall_seconds=time.perf_counter() - began,
     )
