@@ -252,6 +252,29 @@ class QdrantSearchSettings:
     url: str | None = None  # a server, e.g. http://localhost:6333; None: the engine in this process
 
 
+# --- executors of a sweep
+
+
+@dataclass
+class SlurmOptions:
+    """`runtime.executor_options` of slurm: a block is a job."""
+
+    cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
+    partition: str = ""  # empty: the cluster's default
+    minutes: int = 120  # longest time of a job
+    memory_gb: int = 8
+    gpus: int = 0
+    setup: list[str] = field(default_factory=list)  # shell lines before the job's Python starts
+
+
+@dataclass
+class RayOptions:
+    """`runtime.executor_options` of ray: a block is a task."""
+
+    address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: a Ray of its own on this machine
+    gpus: float = 0.0  # per block
+
+
 # --- checks of numbers, and what settings need
 
 
@@ -539,3 +562,25 @@ register(Part("artifact", "drafter", "kerv_cli.drafting.eagle:ARTIFACT"))
 register(Part("artifact", "early", "kerv_cli.drafting.early:ARTIFACT"))
 register(Part("artifact", "datastore", "kerv_cli.drafting.datastore:ARTIFACT"))
 register(Part("artifact", "calibration", "kerv_cli.decoding.calibration_file:ARTIFACT"))
+
+register(Part("executor", "local", "kerv_cli.studies.executors.local:build", about="processes of this machine"))
+register(
+    Part(
+        "executor",
+        "slurm",
+        "kerv_cli.studies.executors.slurm:build",
+        SlurmOptions,
+        traits={"package": "submitit", "extra": "slurm"},
+        about="jobs of a Slurm cluster",
+    )
+)
+register(
+    Part(
+        "executor",
+        "ray",
+        "kerv_cli.studies.executors.ray:build",
+        RayOptions,
+        traits={"package": "ray", "extra": "ray"},
+        about="tasks of a Ray cluster",
+    )
+)

@@ -33,7 +33,9 @@ class RuntimeSettings:
     device: str = "cpu"  # cpu | cuda | auto
     dtype: str = "float32"
     threads: int = 1  # torch threads of each process
-    workers: int = 1  # processes
+    executor: str = "local"  # sweeps: who runs the blocks: local (processes here) | slurm | ray
+    workers: int = 1  # sweeps: blocks that run at the same time
+    executor_options: dict[str, Any] = field(default_factory=dict)  # see SlurmOptions, RayOptions in parts.py
 
 
 MODEL, EXPERT = "model", "expert"
@@ -96,6 +98,8 @@ class StudySettings:
     common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
+    block: int = 5  # seeds for which the settings take turns in one process, episode by episode
+    repeats: int = 1  # how often every episode is measured
 
 
 @dataclass

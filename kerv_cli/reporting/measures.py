@@ -16,7 +16,7 @@ MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 
 COMPARABLE = ("device", "device_name", "dtype", "threads")  # what times must agree in to be compared
-_SAME = (*COMPARABLE, "rand_vec")  # what two episodes of a pair must agree in
+_SAME = (*COMPARABLE, "initial_state")  # what two episodes of a pair must agree in
 
 _RATIOS = {
     "AL": ("committed", "verifications"),

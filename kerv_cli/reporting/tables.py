@@ -66,7 +66,7 @@ def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyD
 def _labelled(cell: Cell, stored: StoredCell) -> pd.DataFrame:
     runtime = cell.settings["runtime"]
     return stored.episodes.assign(
-        rand_vec=stored.episodes["rand_vec"].map(tuple),  # comparable
+        initial_state=stored.episodes["initial_state"].map(tuple),  # comparable
         label=cell.label,
         cell=cell.id,
         difficulty=difficulty_of(cell.task),
