@@ -161,7 +161,7 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
             near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
             hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {command} --cfg' for the keys"
             return UsageError(f"unknown key '{key}': {hint}")
-    return UsageError(_one_line(error.__cause__ or error))
+    return UsageError(_one_line(error))
 
 
 def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:

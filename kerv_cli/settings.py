@@ -14,6 +14,7 @@ from kerv_cli import manifests, parts, registry
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
 
+
 @dataclass
 class CameraSettings:
     name: str = ""  # empty: the environment's first camera

@@ -21,7 +21,7 @@ SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core take
 def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused."""
     from kerv_cli.config import to_yaml
-    from kerv_cli.environments.metaworld.tasks import resolve_tasks
+    from kerv_cli.environments import resolve_tasks
     from kerv_cli.studies.executors import check_executor
     from kerv_cli.studies.resolve import resolve
 

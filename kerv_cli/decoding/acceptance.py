@@ -1,5 +1,5 @@
-"""Which drafts are good enough (docs/methods.md §2.1). Pure functions of tokens; the longest accepted path wins, ties go
-to the smaller summed distance, then to the node proposed first."""
+"""Which drafts are good enough (docs/methods.md §2.1). Pure functions of tokens; the longest accepted path wins, ties
+go to the smaller summed distance, then to the node proposed first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each part's settings become the part: the functions that the registry's entries name, and `compose`, which calls them.
+"""Each part's settings become the part: the functions that the registry names, and `compose`, which calls them.
 
 A build function takes (settings, context) and returns the part, or None where there is nothing to do.
 """
@@ -39,7 +39,7 @@ LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at le
 class Context:
     """What a part is built from. artifact: kind -> the loaded artifact. built: the method's parts so far, by kind."""
 
-    target: Target
+    target: Any  # a Target; some parts want a ReadableTarget
     artifact: Callable[[str], Any]
     task: str = ""
     built: dict[str, Any] = field(default_factory=dict)
@@ -121,9 +121,7 @@ def nothing(settings: Any, context: Context) -> None:
 
 def drafter(settings: Any, context: Context) -> DrafterProposer:
     """proposer=drafter, and the drafter's side of hybrid."""
-    return DrafterProposer(
-        context.artifact("drafter"), context.target, settings.depth, settings.top_k, settings.nodes
-    )
+    return DrafterProposer(context.artifact("drafter"), context.target, settings.depth, settings.top_k, settings.nodes)
 
 
 def early(settings: Any, context: Context) -> EarlyProposer:

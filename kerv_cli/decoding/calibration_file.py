@@ -113,7 +113,7 @@ class Calibration:
     boundary: BoundarySection | None = None
     skip: SkipSection | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
-    format: Literal[2] = FORMAT
+    format: Literal[2] = 2
     kind: Literal["calibration"] = "calibration"
 
     def __post_init__(self) -> None:
@@ -185,8 +185,8 @@ class Calibration:
 
 
 def calibration_place(results: str, name: str | None, target: Path) -> Path:
-    """The file of the named calibration, else of the one beside the target. Shipped: pretrained/<name>/calibration.json;
-    made here: artifacts/calibration/<name>/calibration.json."""
+    """The file of the named calibration, else of the one beside the target. Shipped: in pretrained/<name>; made here: in
+    artifacts/calibration/<name>."""
     if name is not None:
         return artifact(results, "calibration", name) / FILE
     if target.name == "target":
@@ -220,7 +220,8 @@ def load_calibration(path: Path, description: TargetDescription) -> Calibration:
     loaded.target.actions.check_same(description.actions, str(path), "the target", statistics=True)
     if loaded.target.chunk != description.chunk:
         raise CheckpointError(
-            f"{path} was made for chunks of {loaded.target.chunk} steps, not of {description.chunk}: run 'kerv calibrate'"
+            f"{path} was made for chunks of {loaded.target.chunk} steps, not of {description.chunk}: "
+            "run 'kerv calibrate'"
         )
     if loaded.target.sha256 != description.sha256:
         raise CheckpointError(

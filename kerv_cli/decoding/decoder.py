@@ -1,4 +1,4 @@
-"""The one decode loop: propose, verify, accept, commit, rectify (docs/methods.md §2). A method is a set of its parts."""
+"""The one decode loop: propose, verify, accept, commit, rectify (docs/methods.md §2)."""
 
 from __future__ import annotations
 

@@ -14,10 +14,12 @@ from kerv_cli.drafting.eagle import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.early import EarlyDrafter
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
-from kerv_cli.targets.protocol import Target
+from kerv_cli.targets.protocol import ReadableTarget, Target
 
 EMPTY = TokenTree((), (), ())
-SURE = 0.05  # odds from which no fallback draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
+SURE = (
+    0.05  # odds from which no fallback draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
+)
 
 
 class Stateless:
@@ -57,7 +59,9 @@ class PredictionProposer(ChainProposer):
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         whole = len(chunk.tokens) // chunk.dofs
-        pending = chunk.space.values_of(np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64)).reshape(whole, chunk.dofs)
+        pending = chunk.space.values_of(np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64)).reshape(
+            whole, chunk.dofs
+        )
         history = chunk.situation.history.values(pending)
         predicted = self.predictor.predict(history, chunk.steps - whole)
         if predicted is None:
@@ -94,7 +98,7 @@ class RetrievalProposer(Stateless):
 
     name = "retrieval"
 
-    def __init__(self, datastore: Datastore, target: Target, neighbours: int, nodes: int) -> None:
+    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
         self._found: tuple[Chunk, Neighbours] | None = None
 
@@ -205,7 +209,7 @@ class DrafterProposer:
         self.drafter, self.target = drafter, target
         self.depth, self.top_k, self.nodes = depth, top_k, nodes
         capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
-        self.state = DraftState(drafter.new_cache(capacity), torch.empty(0))
+        self.state = DraftState(drafter.new_cache(1, capacity), torch.empty(0))
 
     def begin(self, chunk: Chunk) -> None:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)

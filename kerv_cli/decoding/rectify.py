@@ -17,9 +17,9 @@ DRAFT = "draft"
 class Compensation:
     """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
 
-    With `use_target_token` (ours) the target's token at the rejected position is kept too: it is there and free. `steps`
-    (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) what the rejected draft had behind the
-    rejected token goes before the prediction: it was drafted with the observation in view, which a filter has not.
+    With `use_target_token` (ours) the target's token at the rejected position is kept too: it is there and free.
+    `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) what the rejected draft
+    had behind the rejected token goes before the prediction: it was drafted with the observation in view.
     After a compensation the filter rests for `rest` decodes.
     """
 

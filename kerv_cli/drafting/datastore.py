@@ -1,4 +1,4 @@
-"""Retrieval: the demonstrations' action chunks, found by what the target itself sees (docs/methods.md §4.1, §4.2; HeiSD).
+"""Retrieval: the demonstrations' action chunks, found by what the target itself sees (docs/methods.md §4; HeiSD).
 
 The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
 normalised again; optionally projected onto the directions that hold nearly all of the keys. The default is the scene
@@ -36,7 +36,7 @@ from kerv_cli.files import sha256_of
 from kerv_cli.manifests import read_file
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.protocol import ReadableTarget
 
 FORMAT = 2
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
@@ -81,7 +81,7 @@ class Manifest:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def prompt_key(prompt: Tensor, target: CompactTarget, segments: Sequence[str]) -> np.ndarray:
+def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
     """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
 
     Raises:
@@ -180,7 +180,7 @@ class Datastore:
         """SHA-256 of what is found in it."""
         return self.manifest.content
 
-    def key(self, prompt: Tensor, target: CompactTarget) -> np.ndarray:
+    def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
         """prompt (1, P, E) of the target -> (d,) float32."""
         keys = prompt_key(prompt, target, self.manifest.key)
         return (keys if self.projection is None else projected(keys, self.projection))[0]
@@ -212,7 +212,9 @@ def _read(folder: Path, manifest: Manifest) -> dict[str, Any]:
     except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
         raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
     if not fits or not np.isfinite(vectors).all():
-        raise CheckpointError(f"the datastore in {folder} is damaged: its files do not fit its manifest, build it again")
+        raise CheckpointError(
+            f"the datastore in {folder} is damaged: its files do not fit its manifest, build it again"
+        )
     shards = {task: slice(*shard.rows) for task, shard in manifest.tasks.items()}
     return {"vectors": vectors, "shards": shards, "projection": projection, **payload}
 

@@ -135,9 +135,7 @@ class Predictor:
     name = ""
     least = 1  # actions without which the weights are not defined
 
-    def __init__(
-        self, held: np.ndarray, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON
-    ) -> None:
+    def __init__(self, held: np.ndarray, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON) -> None:
         """held: (D,) bool, DoFs that are never extrapolated. minimum: actions without which predict() gives None.
 
         Raises:

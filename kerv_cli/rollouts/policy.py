@@ -1,4 +1,4 @@
-"""The policy of a rollout: whether its parts and files fit together, what names its results, and the decoder that acts."""
+"""The policy of a rollout: whether its parts and files fit together, its identity, and the decoder that acts."""
 
 from __future__ import annotations
 

@@ -17,7 +17,6 @@ import torch
 
 from kerv_cli.artifacts import Artifacts
 from kerv_cli.drafting.datastore import (
-    FORMAT,
     PAYLOAD,
     PROJECTION,
     VECTORS,
@@ -38,7 +37,7 @@ from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import BuildDatastoreSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.training.imitation import instruction_of, observed_steps
+from kerv_cli.training.imitation import frames_and_steps, instruction_of
 
 BATCH = 128  # observations encoded at once
 KEYS = ("vision", "scene", "proprioception")  # parts of the prompt; instructions are the same within a task
@@ -60,7 +59,7 @@ def entries_of(target: CompactTarget, episode: DemoEpisode, segments: Sequence[s
     """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions. A
     chunk that begins near the end takes the labels recorded beyond the success: it never reaches into another episode.
     """
-    frames, steps = observed_steps(episode, target)
+    frames, steps = frames_and_steps(episode, target.settings)
     frames, steps = frames if frames is None else frames[::stride], steps[::stride]
     words = target.words_of(instruction_of(episode.task))
     keys = []
@@ -164,7 +163,9 @@ class DatastoreBuild:
         tokens = np.concatenate([p.tokens for p in parts])
         counts = [shard.rows[1] - shard.rows[0] for shard in shards.values()]
         columns = {
-            "task": pa.DictionaryArray.from_arrays(np.repeat(np.arange(len(shards), dtype=np.int32), counts), [*shards]),
+            "task": pa.DictionaryArray.from_arrays(
+                np.repeat(np.arange(len(shards), dtype=np.int32), counts), [*shards]
+            ),
             "seed": seeds,
             "step": np.concatenate([p.steps for p in parts]),
             "left": np.concatenate([p.left for p in parts]),
@@ -186,7 +187,7 @@ class DatastoreBuild:
                         np.save(file, content)
         target = self.artifacts.description
         manifest = Manifest(
-            format=FORMAT,
+            format=2,
             kind="datastore",
             key=tuple(self.settings.key),
             width=files[VECTORS].shape[1],
@@ -233,8 +234,8 @@ def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` when the block ends well. An older folder of that name is deleted once the
-    new one stands in its place.
+    """A temporary folder that becomes `folder` when the block ends well. An older folder of that name is deleted once
+    the new one stands in its place.
 
     Raises:
         StorageError: the disk refused.

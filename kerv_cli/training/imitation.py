@@ -17,9 +17,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.environments import spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import TASKS, task
+from kerv_cli.environments.metaworld.tasks import TASKS
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
 from kerv_cli.spaces import ObservationSpace
@@ -76,7 +77,7 @@ def load_samples(
     parts: list[dict[str, Tensor]] = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
-        frames, steps = _frames_and_steps(episode, settings)
+        frames, steps = frames_and_steps(episode, settings)
         felt, states = observed(episode, steps, dataset.manifest.observation)
         ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
         parts.append(
@@ -106,7 +107,13 @@ def observed(episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace) -
     return states[:, : len(space.proprioception)], states
 
 
-def _frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
+def frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
+    """The episode's frames (n, size, size, 3), None for a state policy, and the control steps (n,) that a policy of
+    these settings learns from.
+
+    Raises:
+        CheckpointError: too few labels behind the episode's end for a whole chunk, or frames of another size.
+    """
     if settings.chunk > len(episode.labels) - episode.steps + 1:
         raise CheckpointError(
             f"the demonstrations have {len(episode.labels) - episode.steps} labels behind an episode's end, "
@@ -231,7 +238,7 @@ def new_target(
 ) -> CompactTarget:
     """A fresh policy of the dataset's spaces with the samples' action statistics."""
     torch.manual_seed(seed)
-    actions = dataset.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
+    actions = dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
     return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
 
 
@@ -264,7 +271,7 @@ def check_spaces(target: CompactTarget, dataset: DemoDataset) -> None:
     Raises:
         CheckpointError: other actions or observations.
     """
-    target.actions.check_same(dataset.actions, "the target", f"the demonstrations in {dataset.path}")
+    target.actions.check_same(dataset.manifest.actions, "the target", f"the demonstrations in {dataset.path}")
     if target.observation != dataset.manifest.observation:
         raise CheckpointError(
             f"the demonstrations in {dataset.path} have other observations than the target was trained on: "

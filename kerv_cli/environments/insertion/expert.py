@@ -59,4 +59,3 @@ def _next_peg(peg: Pose, slot: Pose) -> Pose:
     if depth > -HOVER / 2 and sideways > 4 * _NEAR:  # low and beside the mouth: up first, as it lies
         return Pose(peg.position + np.array([0.0, 0.0, HOVER]), peg.rotation)
     return slot.along(PEG_HALF + HOVER)
-

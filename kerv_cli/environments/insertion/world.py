@@ -33,9 +33,7 @@ _FINGER = 0.023, 0.012  # metres: the fingers' distance from the middle when clo
 class InsertionWorld(MujocoWorld):
     """Task `insert-peg`: the peg is in the hand, the slot is tilted. `fetch-peg`: the peg stands on the table."""
 
-    def __init__(
-        self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0
-    ) -> None:
+    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
         self._model: Any = None
         self._data: Any = None

@@ -5,6 +5,7 @@ The results folder must be one that the nodes share.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -25,9 +26,9 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
     """
     import ray
 
-    started = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
+    started: dict[str, Any] = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
     try:
-        ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
+        ray.init(address=options.address or "local", log_to_driver=False, logging_level=logging.ERROR, **started)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
         why = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise UsageError(f"the Ray cluster {options.address or 'of this machine'} cannot be reached: {why}") from None
@@ -43,7 +44,7 @@ class Tasks:
         self.slots = slots
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
-        self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
+        self._call: Any = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
         self._open: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
