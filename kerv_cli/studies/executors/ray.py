@@ -25,7 +25,7 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
     """
     import ray
 
-    started = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
+    started: dict[str, Any] = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
     try:
         ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
