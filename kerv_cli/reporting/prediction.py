@@ -23,10 +23,8 @@ from kerv_cli.files import read_json, sha256_of
 from kerv_cli.places import find_target
 from kerv_cli.reporting.drawing import INK, STYLE, colour, entitle, new_figure
 from kerv_cli.settings import opening_sources
-from kerv_cli.spaces import DOF_NAMES, GRIPPER
 
 REFERENCE = "hold"
-_POSITION = DOF_NAMES[:GRIPPER]
 
 
 @dataclass(frozen=True)
@@ -125,16 +123,25 @@ def _against(error: float, hold: list[float]) -> dict[str, float]:
     return {"error": error, "hold_error": reference, "ratio_to_hold": ratio}
 
 
-def position_means(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean error over dx, dy, dz: columns predictor, task, steps_ahead, error."""
-    position = table[table["dof"].isin(_POSITION)]
-    return position.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
+def predicted_dofs(table: pd.DataFrame) -> list[str]:
+    """The DoFs that the predictors predict: all but those, a gripper, which every one of them holds."""
+    others = table[table["predictor"] != REFERENCE]
+    differs = others[others["error"] != others["hold_error"]]
+    return [dof for dof in dict.fromkeys(table["dof"]) if dof in set(differs["dof"])] or list(
+        dict.fromkeys(table["dof"])
+    )
+
+
+def predicted_means(table: pd.DataFrame) -> pd.DataFrame:
+    """Mean error over `predicted_dofs`: columns predictor, task, steps_ahead, error."""
+    own = table[table["dof"].isin(predicted_dofs(table))]
+    return own.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
 
 
 def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Texts: one row per predictor, the mean error over dx, dy, dz and all tasks by steps ahead; beside it, as a share
-    of hold's."""
-    means = position_means(table).groupby(["predictor", "steps_ahead"], sort=False)["error"].mean().reset_index()
+    """Texts: one row per predictor, the mean error over the predicted DoFs and all tasks by steps ahead; beside it, as
+    a share of hold's."""
+    means = predicted_means(table).groupby(["predictor", "steps_ahead"], sort=False)["error"].mean().reset_index()
     errors = {(str(p), int(s)): float(e) for p, s, e in means.itertuples(index=False)}
     rows: dict[str, dict[str, str]] = {}
     for (predictor, step), error in errors.items():
@@ -146,7 +153,7 @@ def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
 
 def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
     """Error against steps ahead, one line per predictor, and every task's error one step ahead."""
-    means = position_means(table)
+    means = predicted_means(table)
     predictors, tasks = list(dict.fromkeys(means["predictor"])), list(dict.fromkeys(means["task"]))
     with mpl.rc_context(STYLE):
         figure = new_figure(11.5, max(4.8, 1.9 + len(tasks) * (0.1 + 0.085 * len(predictors))))
@@ -157,7 +164,7 @@ def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
         handles, labels = ahead.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         held_out = table.drop_duplicates("task")["held_out_episodes"].sum()
-        about = f"mean of dx, dy, dz · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
+        about = f"mean of {', '.join(predicted_dofs(table))} · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
         about += f" · from the last {table['window'][0]} steps"
         entitle(figure, f"Prediction of the next actions, {predictions.target}", about)
     return figure
