@@ -126,7 +126,7 @@ def drafter(settings: Any, context: Context) -> DrafterProposer:
 
 def early(settings: Any, context: Context) -> EarlyProposer:
     """proposer=early."""
-    return EarlyProposer(context.artifact("early"))
+    return EarlyProposer(context.artifact("early"), context.target)
 
 
 def prediction(settings: PredictionProposerSettings, context: Context) -> PredictionProposer:

@@ -75,15 +75,15 @@ class EarlyProposer(ChainProposer):
 
     name = "early"
 
-    def __init__(self, early: EarlyDrafter) -> None:
-        self.early = early
+    def __init__(self, early: EarlyDrafter, target: ReadableTarget) -> None:
+        self.early, self.target = early, target
         self._drafted: tuple[Chunk, list[int], float] | None = None
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
         """Tokens, and the drafter's own odds that all of them are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
-            self._drafted = chunk, *self.early.drafted(chunk.prompt, history, radius)
+            self._drafted = chunk, *self.early.drafted(self.target.pooled(chunk.prompt), history, radius)
         return self._drafted[1], self._drafted[2]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:

@@ -151,7 +151,7 @@ def _prediction_note(predictions: Predictions, table: pd.DataFrame) -> str:
     return (
         f"Mean absolute error on held-out demonstrations, mean of {', '.join(predicted_dofs(table))} over the tasks, "
         "in normalised action units; brackets: share of the error of holding the last action. "
-        f"Calibration {predictions.sha256[:12]}, predicted from the last {predictions.window} steps; "
+        f"Calibration {predictions.sha256[:12]}, predicted from the last {predictions.calibration.window} steps; "
         f"per task and DoF: tables/{predictions.name}.csv."
     )
 
