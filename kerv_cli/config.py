@@ -152,8 +152,13 @@ def _task_list(word: str) -> str:
 
 
 def _explained(command: str, error: Exception, overrides: Sequence[str], schema: type) -> UsageError:
+    from hydra.errors import HydraException
+
     choices = [word for word in overrides if word.split("=", 1)[0] in groups()]
-    keys = _keys(command, choices, schema)
+    try:
+        keys = _keys(command, choices, schema)
+    except HydraException:  # the choices alone do not compose
+        return UsageError(_one_line(error))
     for word in overrides:
         key = word.split("=", 1)[0].lstrip("+~")
         if key not in keys and key not in groups():

@@ -84,6 +84,10 @@ class RolloutSettings:
     record_size: int = 240  # pixels of the logged camera
     results: str = "results"
 
+    def __post_init__(self) -> None:
+        if self.policy.kind == EXPERT:
+            self.method = EXPERT  # it decodes nothing: no method is a name for what it does
+
     def parts(self) -> dict[str, Any]:
         """Kind -> settings of the method's parts: what a decoder is composed of."""
         return {kind: getattr(self, kind) for kind in parts.METHOD_KINDS}

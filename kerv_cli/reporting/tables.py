@@ -19,7 +19,7 @@ from kerv_cli.reporting.ceiling import (
     ceiling,
     chunk_ratio,
     is_autoregressive,
-    opens_with_drafts,
+    verifies_in_prefill,
 )
 from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, Measured, measure
 from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
@@ -150,7 +150,7 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
     for name in ("task", *COMPARABLE):
         reference = reference[reference[name].isin(set(episodes[name]))]
     chunks = chunk_ratio(cell.settings, found[0].settings)
-    return ceiling(episodes, reference, opens_with_drafts(cell.settings), chunks, averaging == MACRO)
+    return ceiling(episodes, reference, verifies_in_prefill(cell.settings), chunks, averaging == MACRO)
 
 
 def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[str, Any]:

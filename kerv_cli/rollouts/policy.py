@@ -99,8 +99,8 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 def _check_expert(settings: RolloutSettings) -> None:
     if settings.deviation_every > 0:
         raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
-    if settings.method != "ar" or settings.chunk:
-        raise UsageError(f"policy=expert with method={settings.method}: the expert decodes nothing, leave method out")
+    if settings.chunk:
+        raise UsageError(f"policy=expert with chunk={settings.chunk}: the expert decodes nothing, leave it out")
     for kind, part in settings.parts().items():
         if part != getattr(RolloutSettings(), kind):
             raise UsageError(f"policy=expert with {kind}={part.kind}: the expert decodes nothing, leave it out")
