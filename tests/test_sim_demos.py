@@ -1,5 +1,6 @@
 """Recorded demonstrations on real Meta-World: contents, resuming, refusals, damage."""
 
+import hashlib
 import itertools
 import json
 import shutil
@@ -19,6 +20,8 @@ from kerv_cli.manifests import read_file
 CONFIG = DemoConfig(
     tasks=("reach",), episodes=6, frame_stride=10, camera=CameraConfig(size=24, supersample=1), workers=1, tail=5
 )
+
+GOLDEN_NOISE = "da22e466a3c803b9b3d044c2cfe817eb4241429e2422b91622f51c340dc4a442"
 
 
 @pytest.fixture(scope="module")
@@ -217,6 +220,36 @@ def test_damage_is_found(copied, tmp_path):
         (copied / "manifest.json").write_text(text)
         with pytest.raises(CheckpointError, match="manifest"):
             DemoDataset.open(copied)
+
+
+def as_format_1(folder):
+    """Rewrites a dataset's JSON as it was before environments had names."""
+    for name in ("manifest.json", "recording.json"):
+        value = json.loads((folder / name).read_text())
+        for key in ("environment", "actions", "observation"):
+            del value[key]
+        (folder / name).write_text(json.dumps({**value, "format": 1}))
+
+
+def test_a_dataset_of_format_1_is_metaworlds_and_can_be_gone_on_with(copied):
+    before = DemoDataset.open(copied)
+    as_format_1(copied)
+    opened = DemoDataset.open(copied)
+    assert opened.manifest == before.manifest
+    assert opened.load(1).labels.tobytes() == before.load(1).labels.tobytes()
+    (copied / "manifest.json").unlink()
+    opened.episodes[1].path.unlink()
+    assert record(CONFIG, copied).sha256 == before.sha256
+    (copied / "manifest.json").write_text('{"format": 3}')
+    with pytest.raises(CheckpointError, match="has format 3, this kerv reads 2 and 1"):
+        DemoDataset.open(copied)
+
+
+def test_noise_is_what_it_was_in_every_dataset_so_far():
+    """Datasets recorded before must come out bit-equal when they are recorded again."""
+    perturb = Perturbation("reach-v3", 1, SPEC.actions, (0.2, 0.6), 0.02)
+    executed = np.array([perturb(np.array([0.1, -0.2, 0.3, -1.0])) for _ in range(200)])
+    assert hashlib.sha256(executed.tobytes()).hexdigest() == GOLDEN_NOISE
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5, 1.0])
