@@ -99,17 +99,15 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.errors import KervError
     from kerv_cli.places import find_target, shipped_dir
     from kerv_cli.settings import DoctorSettings
-    from kerv_cli.targets.checkpoint import read_description
+    from kerv_cli.targets.checkpoint import read_target
 
     assert isinstance(settings, DoctorSettings)
     findings = []
     for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
         try:
-            described = read_description(find_target(settings.results, name), "target")
-            parameters = described["provenance"]["parameters"] / 1e6
-            findings.append(
-                Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described['sha256'][:12]}")
-            )
+            described = read_target(find_target(settings.results, name))
+            parameters = described.provenance["parameters"] / 1e6
+            findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
     return findings or [Finding("policies", True, "none shipped here: 'kerv train target' trains one")]

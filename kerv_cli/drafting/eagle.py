@@ -1,4 +1,4 @@
-"""The EAGLE-style drafter and its dynamic tree (METHODS §2.2; EAGLE-2; Spec-VLA §3).
+"""The EAGLE-style drafter and its dynamic tree (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
 
 Input at position i: concat(embedding of what stands at i + 1, the target's last hidden state at i) → width → decoder
 layers → predicted hidden state of i + 1; the target's frozen head turns it into logits for position i + 2. The prompt,
@@ -11,36 +11,33 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from kerv_cli.artifacts import Artifact, Request, artifact_folder
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
-from kerv_cli.targets.checkpoint import load_state, read_description, save_module
-from kerv_cli.targets.compact.layout import lay_out_for_inference
-from kerv_cli.targets.compact.target import Target
-from kerv_cli.targets.compact.trunk import Cache, Layer, Rotary
+from kerv_cli.spaces import ActionSpace
+from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
+from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.trunk import Cache, LayerStack
+from kerv_cli.targets.protocol import ReadableTarget, Target
 
 
-class Drafter(nn.Module):
+class Drafter(LayerStack):
     """One decoder layer (or a few) of the target's shape; the head and the token embeddings are the target's own."""
 
     def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
-        super().__init__()
-        self.settings, self.width, self.heads, self.feed_forward = settings, width, heads, feed_forward
+        super().__init__(width, settings.layers, heads, feed_forward)
+        self.settings = settings
         self.fuse = nn.Linear(2 * width, width)
-        self.rotary = Rotary(width // heads)
-        self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(settings.layers))
-        self.norm = nn.RMSNorm(width, eps=1e-5)
 
     @classmethod
-    def beside(cls, settings: DrafterSettings, target: Target) -> Drafter:
-        shape = target.settings
-        return cls(settings, shape.width, shape.heads, shape.feed_forward)
-
-    def new_cache(self, capacity: int) -> Cache:
-        return Cache(len(self.layers), 1, self.heads, capacity, self.width // self.heads, self.norm.weight)
+    def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> Drafter:
+        """A fresh one for `target`."""
+        return cls(settings, target.width, target.heads, target.feed_forward)
 
     def forward(
         self,
@@ -48,17 +45,13 @@ class Drafter(nn.Module):
         hidden: Tensor,
         positions: Tensor,
         cache: Cache | None = None,
-        mask: Tensor | None = None,
+        seen: np.ndarray | None = None,
     ) -> Tensor:
-        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); mask as in `Trunk`."""
+        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
+        `attention_mask`."""
         x = self.fuse(torch.cat([following, hidden], -1))
-        rotary = self.rotary(positions)
-        start = cache.length if cache is not None else 0
-        for i, layer in enumerate(self.layers):
-            x = layer(x, rotary, cache.layers[i] if cache is not None else None, start, mask)
-        if cache is not None:
-            cache.length = start + x.shape[1]
-        return self.norm(x)
+        predicted: Tensor = self.norm(self.run_layers(x, positions, cache, seen))
+        return predicted
 
 
 @dataclass
@@ -76,12 +69,7 @@ def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tens
     state.cache.length = first
     tokens = hidden.shape[1]
     positions = torch.arange(first, first + tokens, device=hidden.device)
-    mask = None
-    if first and tokens > 1:
-        mask = torch.full((tokens, first + tokens), -torch.inf, dtype=hidden.dtype, device=hidden.device).triu(
-            first + 1
-        )
-    state.hidden = drafter(following, hidden, positions, state.cache, mask)[0, -1]
+    state.hidden = drafter(following, hidden, positions, state.cache)[0, -1]
 
 
 def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> TokenTree:
@@ -96,12 +84,11 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
     all_tokens, parents, cumulative = tokens.tolist(), [ROOT] * len(tokens), values.tolist()
     base = state.cache.length
     hidden = state.hidden.expand(1, len(tokens), -1)
-    seen = torch.eye(len(tokens), dtype=torch.bool, device=values.device)
+    seen = np.eye(len(tokens), dtype=bool)  # of the nodes that were forwarded, level by level
     for reached in range(1, depth):
-        mask = _level_mask(base, seen, hidden)
-        following = target.embedding(tokens)[None]
+        following = target.embed(tokens[None])
         position = torch.full((len(level),), base + reached - 1, device=tokens.device)
-        hidden = drafter(following, hidden, position, state.cache, mask)
+        hidden = drafter(following, hidden, position, state.cache, seen)
         logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
         child_values, child_tokens = logp.topk(top_k, -1)
         values, flat = child_values.flatten().topk(top_k)
@@ -113,9 +100,8 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
         chosen = flat.tolist()
         level = [offset + c for c in chosen]
         tokens = child_tokens.flatten()[flat]
-        rows = flat // top_k
-        hidden = hidden[:, rows]
-        seen = torch.cat([seen[rows], torch.eye(top_k, dtype=torch.bool, device=seen.device)], -1)
+        hidden = hidden[:, flat // top_k]
+        seen = np.concatenate([seen[[c // top_k for c in chosen]], np.eye(top_k, dtype=bool)], 1)
     state.cache.length = base
     return _keep_best(all_tokens, parents, cumulative, nodes)
 
@@ -127,18 +113,11 @@ def draft_chain(drafter: Drafter, target: Target, state: DraftState, depth: int)
     hidden = state.hidden[None, None]
     drafted = [target.head(hidden[0]).argmax(-1)]
     for reached in range(depth - 1):
-        following = target.embedding(drafted[-1])[None]
+        following = target.embed(drafted[-1][None])
         hidden = drafter(following, hidden, positions[reached], state.cache)
         drafted.append(target.head(hidden[0]).argmax(-1))
     state.cache.length = base
     return torch.cat(drafted).tolist()
-
-
-def _level_mask(base: int, seen: Tensor, like: Tensor) -> Tensor:
-    """Additive (k, base + drafted so far): the committed part is seen by all, drafted entries by their descendants."""
-    mask = torch.zeros((seen.shape[0], base + seen.shape[1]), dtype=like.dtype, device=like.device)
-    mask[:, base:].masked_fill_(~seen, -torch.inf)
-    return mask
 
 
 def _keep_best(tokens: list[int], parents: list[int], scores: list[float], nodes: int) -> TokenTree:
@@ -148,29 +127,62 @@ def _keep_best(tokens: list[int], parents: list[int], scores: list[float], nodes
     return TokenTree.build([tokens[i] for i in best], [index[parents[i]] for i in best])
 
 
-def save_drafter(folder: Path, drafter: Drafter, target_sha256: str, provenance: dict[str, Any]) -> str:
-    """The description names the target by the hash of its weights: a drafter imitates exactly one."""
-    description = {"settings": asdict(drafter.settings), "target": target_sha256, "provenance": provenance}
-    return save_module(folder, "drafter", drafter, description)
+@dataclass(frozen=True)
+class DrafterDescription(Description):
+    """A drafter's JSON. target: hash of the weights it imitates; actions: the action space whose tokens it drafts."""
+
+    settings: DrafterSettings
+    target: str
+    actions: ActionSpace
+    provenance: dict[str, Any]
 
 
-def read_drafter(folder: Path, target_sha256: str) -> dict[str, Any]:
-    """Its description. Raises CheckpointError where the drafter was trained for another target."""
-    description = read_description(folder, "drafter")
-    if description["target"] != target_sha256:
+def save_drafter(
+    folder: Path, drafter: Drafter, target: Target, target_sha256: str, provenance: dict[str, Any], half: bool = False
+) -> str:
+    """Write the drafter of `target` -> sha256 of its weights: a drafter imitates exactly one target."""
+    description = {
+        "settings": asdict(drafter.settings),
+        "target": target_sha256,
+        "actions": target.actions.as_dict(),
+        "provenance": provenance,
+    }
+    return save_module(folder, "drafter", drafter, description, half)
+
+
+def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> DrafterDescription:
+    """Its description. actions: the target's.
+
+    Raises:
+        CheckpointError: none there, a damaged one, one of another target or action space.
+    """
+    description = read_description(folder, "drafter", DrafterDescription)
+    description.actions.check_same(actions, f"the drafter in {folder}", "the target", statistics=True)
+    if description.target != target_sha256:
         raise CheckpointError(
-            f"the drafter in {folder} was trained for target {description['target'][:12]}, not for "
+            f"the drafter in {folder} was trained for target {description.target[:12]}, not for "
             f"{target_sha256[:12]}: train one with 'kerv train drafter policy.target=…'"
         )
     return description
 
 
-def load_drafter(folder: Path, target: Target, target_sha256: str) -> tuple[Drafter, dict[str, Any]]:
+def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tuple[Drafter, DrafterDescription]:
     """The drafter, ready for inference, and its description; errors as `read_drafter`."""
-    description = read_drafter(folder, target_sha256)
-    drafter = Drafter.beside(DrafterSettings(**description["settings"]), target)
+    description = read_drafter(folder, target_sha256, target.actions)
+    drafter = Drafter.beside(description.settings, target)
     load_state(drafter, folder, "drafter")
-    weight = target.head.weight
-    drafter = drafter.to(device=weight.device, dtype=weight.dtype).eval().requires_grad_(False)
-    lay_out_for_inference(drafter)
+    drafter = drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)
+    pack(drafter)
     return drafter, description
+
+
+def _check(folder: Path, request: Request) -> str:
+    return read_drafter(folder, request.description.sha256, request.description.actions).sha256
+
+
+def _load(folder: Path, request: Request) -> Drafter:
+    target: Any = request.target
+    return load_drafter(folder, target, request.description.sha256)[0]
+
+
+ARTIFACT = Artifact("drafter", artifact_folder("drafter"), _check, _load)

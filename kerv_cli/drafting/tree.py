@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 ROOT = -1
 
@@ -58,16 +56,6 @@ class TokenTree:
                 seen[i] |= seen[parent]
         return seen
 
-    def truncate(self, depth: int) -> TokenTree:
-        """Nodes of depth < `depth` only."""
-        keep = [i for i, d in enumerate(self.depths) if d < depth]
-        index = {old: new for new, old in enumerate(keep)} | {ROOT: ROOT}
-        return TokenTree(
-            tuple(self.tokens[i] for i in keep),
-            tuple(index[self.parents[i]] for i in keep),
-            tuple(self.depths[i] for i in keep),
-        )
-
     def down_from(self, node: int) -> list[int]:
         """`node` and what lies below it along first children, down to a leaf."""
         found = [node]
@@ -102,26 +90,20 @@ def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
     return TokenTree.build(tokens, parents)
 
 
-def prefill_mask(tree: TokenTree, prompt: int, like: Tensor) -> Tensor:
-    """Additive mask (P + n, P + n) for [prompt, nodes…]: causal in the prompt; a node sees the prompt and its path."""
+def visible_in_prefill(tree: TokenTree, prompt: int) -> np.ndarray:
+    """(P + n, P + n) bool for [prompt, nodes…]: causal in the prompt; a node sees the prompt and its path."""
     n = len(tree)
     seen = np.zeros((prompt + n, prompt + n), dtype=bool)
     seen[:prompt, :prompt] = np.tri(prompt, dtype=bool)
     seen[prompt:, :prompt] = True
     seen[prompt:, prompt:] = tree.ancestors()
-    return torch.from_numpy(np.where(seen, 0.0, -np.inf).astype(np.float32)).to(device=like.device, dtype=like.dtype)
+    return seen
 
 
-def verify_mask(tree: TokenTree, cached: int, like: Tensor) -> Tensor | None:
-    """Additive mask (1 + n, cached + 1 + n) for [last committed token, nodes…] behind `cached` tokens.
-
-    Every row sees the cache and the last committed token; a node sees its ancestors and itself. None where a single
-    token is forwarded and everything may be seen.
-    """
+def visible_in_verification(tree: TokenTree) -> np.ndarray:
+    """(1 + n, 1 + n) bool for [last committed token, nodes…]: a node sees that token, its ancestors and itself."""
     n = len(tree)
-    if n == 0:
-        return None
-    hidden = np.zeros((1 + n, cached + 1 + n), dtype=np.float32)
-    hidden[0, cached + 1 :] = -np.inf
-    hidden[1:, cached + 1 :] = np.where(tree.ancestors(), 0.0, -np.inf)
-    return torch.from_numpy(hidden).to(device=like.device, dtype=like.dtype)
+    seen = np.zeros((1 + n, 1 + n), dtype=bool)
+    seen[:, 0] = True
+    seen[1:, 1:] = tree.ancestors()
+    return seen

@@ -1,101 +1,172 @@
-"""Checkpoints: safetensors + one JSON with settings, statistics, vocabulary and provenance. Nothing is pickled."""
+"""Checkpoints: safetensors and one JSON with settings, spaces, vocabulary and provenance. Nothing is pickled."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
-from torch import nn
+from torch import Tensor, nn
 
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
-from kerv_cli.settings import TargetSettings
-from kerv_cli.spaces import ActionTokenizer
-from kerv_cli.targets.compact.layout import lay_out_for_inference
-from kerv_cli.targets.compact.target import Target
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.manifests import read
+from kerv_cli.registry import find
+from kerv_cli.spaces import ActionSpace, ObservationSpace
+
+if TYPE_CHECKING:
+    from kerv_cli.targets.compact.target import CompactTarget
 
 FORMAT = 1
+WEIGHTS = "model.safetensors"
 
 
-def save_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
+@dataclass(frozen=True)
+class Description:
+    """What the JSON beside any weights holds. sha256: of the weights' file."""
+
+    format: int
+    kind: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class TargetDescription(Description):
+    """A target's JSON. family: the registered kind of target that its `settings` are of. environment: whose
+    demonstrations it was trained on. cameras: whose images it reads. words: vocabulary of instructions."""
+
+    family: str
+    environment: str
+    settings: dict[str, Any]
+    actions: ActionSpace
+    observation: ObservationSpace
+    cameras: tuple[str, ...]
+    words: tuple[str, ...]
+    provenance: dict[str, Any]
+
+    @property
+    def chunk(self) -> int:
+        """H, control steps it was trained to decode at once."""
+        return int(self.settings["chunk"])
+
+
+T = TypeVar("T", bound=Description)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Atomic safetensors file."""
-    payload = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()})
+    payload = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(payload)
 
 
-def load_tensors(path: Path, what: str) -> dict[str, torch.Tensor]:
+def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
+    """The tensors in a file.
+
+    Raises:
+        CheckpointError: missing, damaged, or numbers that are not finite.
+    """
     if not path.is_file():
         raise CheckpointError(f"no {what} at {path}: train it, or name another with its folder")
     try:
-        return load_file(path)
+        tensors = load_file(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{what} at {path} is damaged ({error}): delete it and train or copy it again") from error
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise CheckpointError(f"{what} at {path} has numbers in {name} that are not finite: train it again")
+    return tensors
 
 
-def save_module(folder: Path, kind: str, module: nn.Module, description: dict[str, Any]) -> str:
-    """Write `model.safetensors` and `<kind>.json` -> sha256 of the weights. The JSON is written last."""
+def save_module(folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], half: bool = False) -> str:
+    """Write the weights and `<kind>.json` -> sha256 of the weights. The JSON is written last. half: in float16, which
+    `load_state` gives back as float32."""
     folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(folder / "model.safetensors", dict(module.state_dict()))
-    digest = sha256_of(folder / "model.safetensors")
+    state = module.state_dict()
+    if half:
+        state = {k: v.half() if v.is_floating_point() else v for k, v in state.items()}
+    save_tensors(folder / WEIGHTS, state)
+    digest = sha256_of(folder / WEIGHTS)
     write_json(folder / f"{kind}.json", {"format": FORMAT, "kind": kind, "sha256": digest, **description})
     return digest
 
 
-def read_description(folder: Path, kind: str) -> dict[str, Any]:
-    """The JSON beside the weights, checked against them."""
-    path = folder / f"{kind}.json"
+def read_description(folder: Path, kind: str, schema: type[T]) -> T:
+    """The JSON beside the weights, checked against its schema and them.
+
+    Raises:
+        CheckpointError: none there, one of another version, or damaged.
+    """
+    path, weights = folder / f"{kind}.json", folder / WEIGHTS
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
-    description = read_json(path)
-    if description.get("format") != FORMAT or description.get("kind") != kind:
+    value = read_json(path)
+    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
-    weights = folder / "model.safetensors"
+    description = read(schema, with_spaces(value), str(path))
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing: the {kind} is incomplete, train or copy it again")
-    if sha256_of(weights) != description["sha256"]:
+    if sha256_of(weights) != description.sha256:
         raise CheckpointError(f"{weights} does not match its description: damaged or mixed up, copy the folder again")
     return description
+
+
+def with_spaces(value: dict[str, Any]) -> dict[str, Any]:
+    """A description as it is written today. One from before artifacts carried their spaces is Meta-World's."""
+    actions = value.get("actions", {})
+    if not isinstance(actions, dict) or "names" in actions:
+        return value
+    value = {**value, "actions": {**SPEC.actions.as_dict(), **actions}}
+    if value["kind"] == "target" and isinstance(value.get("settings"), dict):
+        settings = {k: v for k, v in value["settings"].items() if k != "dofs"}
+        cameras = ["corner4"] if settings.get("observation") == "vision" else []
+        of_target = {"settings": settings, "observation": SPEC.observation.as_dict(), "cameras": cameras}
+        value |= {"family": "compact", "environment": "metaworld", **of_target}
+    return value
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
     """Fill `module` with the folder's weights; a tensor of another name or shape is an error."""
     try:
-        module.load_state_dict(load_tensors(folder / "model.safetensors", kind))
+        module.load_state_dict(load_tensors(folder / WEIGHTS, kind))
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(f"{kind} in {folder} does not fit its own settings: {reason}") from error
 
 
-def describe_target(target: Target, provenance: dict[str, Any]) -> dict[str, Any]:
-    return {
+def save_target(
+    folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], half: bool = False
+) -> str:
+    """Write a target -> sha256 of its weights. environment: whose demonstrations it was trained on."""
+    description = {
+        "family": "compact",
+        "environment": environment,
         "settings": asdict(target.settings),
-        "actions": {"low": target.actions.low.tolist(), "high": target.actions.high.tolist()},
+        "actions": target.actions.as_dict(),
+        "observation": target.observation.as_dict(),
+        "cameras": list(target.cameras),
         "words": list(target.words.words),
         "provenance": provenance,
     }
+    return save_module(folder, "target", target, description, half)
 
 
-def save_target(folder: Path, target: Target, provenance: dict[str, Any]) -> str:
-    return save_module(folder, "target", target, describe_target(target, provenance))
+def read_target(folder: Path) -> TargetDescription:
+    """A target's description; errors as `read_description`."""
+    return read_description(folder, "target", TargetDescription)
 
 
-def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> tuple[Target, dict[str, Any]]:
-    """The policy, ready for inference, and its description (settings, provenance, sha256)."""
-    description = read_description(folder, "target")
-    try:
-        settings = TargetSettings(**description["settings"])
-        actions = ActionTokenizer(*(np.asarray(description["actions"][k]) for k in ("low", "high")))
-        target = Target(settings, actions, WordTokenizer(tuple(description["words"])))
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{folder / 'target.json'} is not a target's description ({error})") from error
-    load_state(target, folder, "target")
-    target = target.to(device=device, dtype=dtype).eval().requires_grad_(False)
-    lay_out_for_inference(target)
-    return target, description
+def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> tuple[Any, TargetDescription]:
+    """The target in `folder`, ready for inference, built by its family, and its description.
+
+    Raises:
+        CheckpointError: none there, a damaged one.
+        UnknownName: a family that is not registered.
+    """
+    description = read_target(folder)
+    return find("target", description.family, "target family").built(folder, description, device, dtype), description

@@ -5,7 +5,8 @@ Shapes: B batch (1 while decoding), P prompt tokens, T new tokens, S cached toke
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ class Target(Protocol):
 
     actions: its action space, with its own normalisation. chunk: H, control steps it was trained to decode at once.
     cameras: names of the images that `encode` reads; none are drawn otherwise. width: E. max_prompt: the longest prompt
-    that `encode` returns. sha256: of the weights; artifacts made for this target name it.
+    that `encode` returns.
     """
 
     @property
@@ -59,10 +60,9 @@ class Target(Protocol):
     def new_cache(self, batch: int, capacity: int) -> Cache:
         """An empty cache for `capacity` tokens."""
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
-    ) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind what the cache holds.
+    def forward(self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | None = None) -> Tensor:
+        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind what the cache holds: one
+        that `new_cache` gave, or None.
 
         seen (T, T) bool says which of the new tokens each new token sees; all of them see everything that is cached.
         None: each sees itself and the new ones before it.
@@ -70,3 +70,25 @@ class Target(Protocol):
 
     def head(self, hidden: Tensor) -> Tensor:
         """(..., E) -> logits over the action tokens (..., V)."""
+
+
+class ReadableTarget(Target, Protocol):
+    """What drafters and the datastore know of a target besides: the prompt's parts, and the layers' shapes.
+
+    segments: where the prompt's parts lie, by name. pooled_width: F. heads, feed_forward: of a layer. dtype: of the
+    weights.
+    """
+
+    @property
+    def segments(self) -> Mapping[str, slice]: ...
+    @property
+    def pooled_width(self) -> int: ...
+    @property
+    def heads(self) -> int: ...
+    @property
+    def feed_forward(self) -> int: ...
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    def pooled(self, prompt: Tensor) -> Tensor:
+        """prompt (B, P, E) -> (B, F): the prompt as one vector, which the early drafter reads."""

@@ -1,4 +1,4 @@
-"""Training the drafter on the frozen target's own greedy decodes (METHODS §2.2).
+"""Training the drafter on the frozen target's own greedy decodes (docs/methods.md §2.2).
 
 The teacher decodes the demonstrations' *observations* (the prompt, not the expert's answer); its hidden states, prompt
 embeddings and tokens are what the drafter imitates, under the same causal mask and positions as at inference.
@@ -13,17 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.decoding.acceptance import Acceptance
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer
+from kerv_cli.decoding.thresholds import Fixed
 from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.settings import (
-    AcceptanceSettings,
-    DrafterSettings,
-    MethodSettings,
-    ProposerSettings,
-    ThresholdSettings,
-)
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.settings import DrafterSettings
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.protocol import Target
 from kerv_cli.training.imitation import Samples
 from kerv_cli.training.loop import Job, Metrics
 
@@ -43,24 +40,26 @@ class TeacherStates:
 @torch.inference_mode()
 def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
     """prompt (B, P, E) -> greedy tokens (B, N) and the hidden states (B, P + N − 1, E) that predict them."""
-    length, size = target.prompt_length, target.tokens_per_chunk
-    cache = target.trunk.new_cache(len(prompt), length + size)
-    hidden = [target.prefill(prompt, cache)]
+    length, size = prompt.shape[1], target.chunk * target.actions.dofs
+    cache = target.new_cache(len(prompt), length + size)
+    hidden = [target.forward(prompt, torch.arange(length, device=prompt.device), cache)]
     tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
     for i in range(size - 1):
         position = torch.tensor([length + i], device=prompt.device)
-        hidden.append(target.step(tokens[-1][:, None], position, cache))
+        hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
         tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
     return torch.stack(tokens, 1), torch.cat(hidden, 1)
 
 
 @torch.inference_mode()
-def teach(target: Target, samples: Samples, limit: int, on_progress: Callable[[int, int], None]) -> TeacherStates:
+def teach(
+    target: CompactTarget, samples: Samples, limit: int, on_progress: Callable[[int, int], None]
+) -> TeacherStates:
     """Evenly spread samples of `samples`, at most `limit`."""
     chosen = torch.linspace(0, len(samples) - 1, min(limit, len(samples))).long()
     parts = []
     for indices in chosen.split(64):
-        prompt, _ = target.encode(samples.inputs(indices, target.device))
+        prompt, _ = target.encode_batch(samples.inputs(indices, target.device))
         tokens, hidden = greedy(target, prompt)
         parts.append((prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
         on_progress(sum(len(p[2]) for p in parts), len(chosen))
@@ -83,6 +82,7 @@ class Distillation:
         self.device = target.device
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Over all unrolled passes, and the token loss of each."""
         prompt = self.states.prompt[indices].to(self.device).float()
         hidden = self.states.hidden[indices].to(self.device).float()
         tokens = self.states.tokens[indices].to(self.device)
@@ -90,15 +90,16 @@ class Distillation:
         inputs = self.noisy(hidden[:, :-1], step)
         for unrolled in range(self.settings.unroll):
             predicted = self.predict(prompt, inputs, tokens)
-            state_loss, token_loss = self.compare(predicted, hidden)
+            state_loss, token_loss = self.compare(predicted, hidden, prompt.shape[1])
             total = total + self.settings.state_weight * state_loss + self.settings.token_weight * token_loss
             metrics[f"token_loss_{unrolled}"] = float(token_loss.detach())
             # next pass: behind the first drafted position the drafter sees its own predictions, as in drafting
-            start = self.target.prompt_length
+            start = prompt.shape[1]
             inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
         return total / self.settings.unroll, metrics
 
     def noisy(self, hidden: Tensor, step: int) -> Tensor:
+        """Uniform noise on the input states, a function of the step."""
         if not self.settings.noise:
             return hidden
         generator = torch.Generator(self.device).manual_seed(step)
@@ -107,15 +108,15 @@ class Distillation:
 
     def predict(self, prompt: Tensor, hidden: Tensor, tokens: Tensor) -> Tensor:
         """hidden (B, P + N − 2, E) at positions 0 … -> predictions of positions 1 … P + N − 2, same shape."""
-        following = torch.cat([prompt[:, 1:], self.target.embedding(tokens[:, :-1])], 1)
+        following = torch.cat([prompt[:, 1:], self.target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1], device=hidden.device)
         predicted: Tensor = self.drafter(following, hidden, positions)
         return predicted
 
-    def compare(self, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Smooth L1 of states and soft cross-entropy of tokens, over the positions that tokens 1 … N − 1 need."""
-        start = self.target.prompt_length - 1
-        guess, truth = predicted[:, start:], hidden[:, start + 1 :]
+    def compare(self, predicted: Tensor, hidden: Tensor, length: int) -> tuple[Tensor, Tensor]:
+        """Smooth L1 of states and soft cross-entropy of tokens, over the positions that tokens 1 … N − 1 need; length:
+        P."""
+        guess, truth = predicted[:, length - 1 :], hidden[:, length:]
         teacher = self.target.head(truth).softmax(-1)
         cross_entropy = -(teacher * F.log_softmax(self.target.head(guess), -1)).sum(-1).mean()
         return F.smooth_l1_loss(guess, truth), cross_entropy
@@ -132,15 +133,15 @@ class Distillation:
 
 
 def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r: int) -> float:
-    """AL (METHODS §7) of decoding `prompts` with a chain of up to 5 drafts at radius r."""
-    tree = ProposerSettings(kind="drafter", depth=5, top_k=1, nodes=5)
-    acceptance = AcceptanceSettings(kind="relaxed" if r else "strict", strict_gripper=True)
-    method = MethodSettings("validation", tree, acceptance, ThresholdSettings(r=r))
-    decoder = Decoder(target, method, Parts(proposer=DrafterProposer(drafter, target, tree)))
+    """AL (docs/methods.md §7) of decoding `prompts` with a chain of up to 5 drafts at radius r."""
+    acceptance = Acceptance(target.actions, "relaxed" if r else "strict")
+    proposer = DrafterProposer(drafter, target, depth=5, top_k=1, nodes=5)
+    decoder = Decoder(target, Parts(acceptance, Fixed(r), proposer=proposer))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     verified = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in verified) / max(1, len(verified))
 
 
 def distillation_job(run: Distillation, save: Callable[[nn.Module, Metrics], None]) -> Job:
+    """The run as the shared loop takes it."""
     return Job(run.drafter, len(run.states), run.loss, run.validate, save)

@@ -1,4 +1,4 @@
-"""Training the early drafter on the frozen target's own greedy decodes (METHODS §5).
+"""Training the early drafter on the frozen target's own greedy decodes (docs/methods.md §5).
 
 What it reads of an observation is pooled as soon as the target has encoded it, so that neither frames nor prompts of a
 whole data set are kept. The history it is shown is what the demonstration *executed*, noise included.
@@ -13,16 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.drafting.early import EarlyDrafter, choose, padded, pool
-from kerv_cli.environments import spec_of
+from kerv_cli.drafting.early import EarlyDrafter, choose, padded
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings, TrainSettings
-from kerv_cli.spaces import GRIPPER
-from kerv_cli.targets.compact.target import Inputs, Target
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.training.distillation import greedy
-from kerv_cli.training.imitation import held_out_of, soft_labels, token_loss
+from kerv_cli.training.imitation import held_out_of, instruction_of, observed, soft_labels, token_loss
 from kerv_cli.training.loop import Job, Metrics
 
 BATCH = 64  # observations that the teacher decodes at once
@@ -44,6 +42,7 @@ class EarlySamples:
         return len(self.tokens)
 
     def where(self, mask: Tensor) -> EarlySamples:
+        """The samples where mask (n,) bool is set."""
         return EarlySamples(*(getattr(self, f.name)[mask] for f in fields(self)))
 
     def split(self, share: float) -> tuple[EarlySamples, EarlySamples]:
@@ -68,7 +67,7 @@ class Observations:
 
 @torch.inference_mode()
 def teach_early(
-    target: Target,
+    target: CompactTarget,
     dataset: DemoDataset,
     settings: DrafterSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -78,7 +77,7 @@ def teach_early(
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
     """
-    stride = int(dataset.manifest.config["frame_stride"]) if target.needs_frame else 1
+    stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1
     share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
     parts: list[EarlySamples] = []
     waiting: list[Observations] = []
@@ -91,37 +90,36 @@ def teach_early(
     return EarlySamples(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(EarlySamples)))
 
 
-def observations(target: Target, episode: DemoEpisode, index: int, share: float, history: int) -> Observations:
+def observations(target: CompactTarget, episode: DemoEpisode, index: int, share: float, history: int) -> Observations:
     """The share of the episode's observations, evenly spread, the first always."""
     frames, size = episode.frames, target.settings.image_size
-    steps = episode.frame_steps if target.needs_frame else np.arange(episode.steps)
-    if target.needs_frame and frames.shape[1] != size:
+    steps = episode.frame_steps if target.cameras else np.arange(episode.steps)
+    if target.cameras and frames.shape[1] != size:
         raise CheckpointError(f"the demonstrations' frames have {frames.shape[1]} pixels, the target takes {size}")
     order = np.arange(len(steps))
     chosen = np.flatnonzero(np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9))
     executed = target.actions.normalise(episode.executed)
-    shown = [padded(executed[:t], history, target.settings.dofs) for t in steps[chosen]]
-    images = torch.from_numpy(frames[chosen]).permute(0, 3, 1, 2) if target.needs_frame else None
-    words = target.words_of(spec_of(episode.task).task(episode.task).instruction).repeat(len(chosen), 1)
-    inputs = Inputs(images, torch.from_numpy(episode.states[steps[chosen]]).float(), words)
+    shown = [padded(executed[:t], history, target.actions.dofs) for t in steps[chosen]]
+    images = torch.from_numpy(frames[chosen]).permute(0, 3, 1, 2) if target.cameras else None
+    words = target.words_of(instruction_of(episode.task)).repeat(len(chosen), 1)
+    felt, states = (torch.from_numpy(x).float() for x in observed(episode, steps[chosen], target.observation))
+    inputs = Inputs(images, felt, states, words)
     actions, known = (np.stack(x) for x in zip(*shown, strict=True))
     return Observations(inputs, actions, known, index, episode.perturbed)
 
 
-def decode(target: Target, waiting: Sequence[Observations]) -> EarlySamples:
+def decode(target: CompactTarget, waiting: Sequence[Observations]) -> EarlySamples:
     """The teacher on some episodes' observations."""
-    device = target.device
     counts = torch.tensor([len(o) for o in waiting])
-    states = torch.cat([o.inputs.states for o in waiting])
-    words = torch.cat([o.inputs.words for o in waiting])
-    images = (
-        torch.cat([o.inputs.images for o in waiting if o.inputs.images is not None]) if target.needs_frame else None
-    )
+    inputs = [o.inputs for o in waiting]
+    felt, states, words = (torch.cat([getattr(i, n) for i in inputs]) for n in ("proprioception", "states", "words"))
+    images = torch.cat([i.images for i in inputs if i.images is not None]) if target.cameras else None
     features, tokens = [], []
     for some in torch.arange(len(states)).split(BATCH):
-        seen = images[some].to(device) if images is not None else None
-        prompt, _ = target.encode(Inputs(seen, states[some].to(device), words[some]))
-        features.append(pool(prompt, target.settings).half().cpu())
+        seen = images[some].to(target.device) if images is not None else None
+        batch = Inputs(seen, *(x[some].to(target.device) for x in (felt, states, words)))
+        prompt, _ = target.encode_batch(batch)
+        features.append(target.pooled(prompt).half().cpu())
         tokens.append(greedy(target, prompt)[0].cpu())
     return EarlySamples(
         features=torch.cat(features),
@@ -141,14 +139,15 @@ class EarlyDistillation:
     ) -> None:
         self.early, self.training, self.held_out = early, training, held_out
         self.device = early.mean.device
-        self.labels = soft_labels(train.label_sigma).to(self.device)
+        self.labels = soft_labels(early.actions.tokens, train.label_sigma).to(self.device)
 
     def logits(self, early: EarlyDrafter, samples: EarlySamples, indices: Tensor) -> Tensor:
-        """(B, N, V)."""
+        """(B, N, V) of the samples at `indices` (B,)."""
         given = (samples.features, samples.history, samples.known)
-        return early.draft(*(x[indices].to(self.device).float() for x in given))
+        return early(*(x[indices].to(self.device).float() for x in given))
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Cross-entropy of a batch."""
         logits = self.logits(self.early, self.training, indices)
         loss = token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
         return loss, {"token_loss": float(loss.detach())}
@@ -159,21 +158,20 @@ class EarlyDistillation:
         assert isinstance(module, EarlyDrafter)
         indices = torch.arange(len(self.held_out))
         logits = torch.cat([self.logits(module, self.held_out, i).cpu() for i in indices.split(512)])
-        metrics = measure(logits, self.held_out, module.target.dofs)
+        metrics = measure(logits, self.held_out, module.strict.cpu())
         return {"score": metrics["accepted_r9"] + metrics["accepted_strict"], **metrics}
 
 
-def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, dofs: int) -> Tensor:
-    """drafts, teacher (n, N) -> (n,) length of the longest prefix within r bins of the teacher; the gripper's tokens
-    must be equal. A proxy of relaxed acceptance: there the verdict is conditioned on the draft."""
-    limit = torch.full((drafts.shape[1],), r)
-    limit[GRIPPER::dofs] = 0
+def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> Tensor:
+    """drafts, teacher (n, N), strict (N,) bool -> (n,) length of the longest prefix within r bins of the teacher; the
+    strict tokens must be equal. A proxy of relaxed acceptance: there the target's token is conditioned on the draft."""
+    limit = torch.where(strict, 0, r)
     return ((drafts - teacher).abs() <= limit).long().cumprod(1).sum(1)
 
 
-def measure(logits: Tensor, samples: EarlySamples, dofs: int) -> Metrics:
-    """logits (n, N, V) -> accepted tokens of N and the share of chunks accepted whole, at every radius; token
-    accuracy."""
+def measure(logits: Tensor, samples: EarlySamples, strict: Tensor) -> Metrics:
+    """logits (n, N, V), strict (N,) bool -> accepted tokens of N and the share of chunks accepted whole, at every
+    radius; token accuracy."""
     kinds = [mask for mask in (samples.perturbed, ~samples.perturbed) if mask.any()]
 
     def balanced(values: Tensor) -> float:
@@ -181,8 +179,8 @@ def measure(logits: Tensor, samples: EarlySamples, dofs: int) -> Metrics:
 
     metrics: Metrics = {}
     for name, r in RADII.items():
-        drafts = choose(logits, r, dofs)
-        accepted = accepted_tokens(drafts, samples.tokens, r, dofs)
+        drafts = choose(logits, r, strict)
+        accepted = accepted_tokens(drafts, samples.tokens, r, strict)
         metrics[f"accepted_{name}"] = balanced(accepted)
         metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])
     metrics["token_accuracy"] = balanced((logits.argmax(-1) == samples.tokens).float().mean(1))
@@ -190,4 +188,5 @@ def measure(logits: Tensor, samples: EarlySamples, dofs: int) -> Metrics:
 
 
 def early_job(run: EarlyDistillation, save: Callable[[nn.Module, Metrics], None]) -> Job:
+    """The run as the shared loop takes it."""
     return Job(run.early, len(run.training), run.loss, run.validate, save)

@@ -23,8 +23,10 @@ from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.metaworld.tasks import TASKS
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
-from kerv_cli.spaces import DOF_NAMES, VOCABULARY, ActionTokenizer, values_of
-from kerv_cli.targets.compact.target import GOAL, OBJECT, Inputs, Target
+from kerv_cli.spaces import ObservationSpace
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.compact.features import places_of
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Job, Metrics
 
@@ -36,7 +38,8 @@ class Samples:
     """Everything a policy is trained on, in memory; n samples in episode order."""
 
     frames: Tensor | None  # (n, s, s, 3) uint8
-    states: Tensor  # (n, 39) float32
+    proprioception: Tensor  # (n, p) float32
+    states: Tensor  # (n, s) float32, privileged
     chunks: Tensor  # (n, H, D) float32, the expert's clean actions, environment units
     words: Tensor  # (n, L) int64
     episodes: Tensor  # (n,) int64, index of the sample's episode
@@ -47,15 +50,16 @@ class Samples:
         return len(self.states)
 
     def where(self, mask: Tensor) -> Samples:
-        frames = self.frames[mask] if self.frames is not None else None
-        states, chunks, words = self.states[mask], self.chunks[mask], self.words[mask]
-        return Samples(frames, states, chunks, words, self.episodes[mask], self.tasks[mask], self.task_names)
+        """The samples where mask (n,) bool is set."""
+        chosen: dict[str, Any] = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **chosen)
 
     def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
+        """The observations at `indices` (B,) as a batch."""
         images = None
         if self.frames is not None:
             images = self.frames[indices].to(device).permute(0, 3, 1, 2)
-        return Inputs(images, self.states[indices].to(device), self.words[indices].to(device))
+        return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
 def load_samples(
@@ -70,28 +74,46 @@ def load_samples(
     missing = set(task_names) - {dataset.episodes[i].task for i in chosen}
     if missing:
         raise CheckpointError(f"the demonstrations hold no episode of {', '.join(sorted(missing))}: record them first")
-    parts: list[tuple[np.ndarray | None, np.ndarray, np.ndarray, list[int], int, int]] = []
+    parts: list[dict[str, Tensor]] = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
-        frames, steps = _frames_and_steps(episode, settings)
-        chunks = np.stack([episode.labels[t : t + settings.chunk] for t in steps])
-        ids = words.encode(spec_of(episode.task).task(episode.task).instruction, settings.instruction_tokens)
-        parts.append((frames, episode.states[steps], chunks, ids, number, task_names.index(episode.task)))
+        frames, steps = frames_and_steps(episode, settings)
+        felt, states = observed(episode, steps, dataset.manifest.observation)
+        ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
+        parts.append(
+            {
+                **({} if frames is None else {"frames": torch.from_numpy(frames)}),
+                "proprioception": torch.from_numpy(felt).float(),
+                "states": torch.from_numpy(states).float(),
+                "chunks": torch.from_numpy(np.stack([episode.labels[t : t + settings.chunk] for t in steps])).float(),
+                "words": ids.repeat(len(steps), 1),
+                "episodes": torch.full((len(steps),), number),
+                "tasks": torch.full((len(steps),), task_names.index(episode.task)),
+            }
+        )
         on_episode(number + 1, len(chosen))
-    counts = [len(p[1]) for p in parts]
-    images = np.concatenate([p[0] for p in parts if p[0] is not None]) if settings.observation == "vision" else None
-    return Samples(
-        frames=torch.from_numpy(images) if images is not None else None,
-        states=torch.from_numpy(np.concatenate([p[1] for p in parts])).float(),
-        chunks=torch.from_numpy(np.concatenate([p[2] for p in parts])).float(),
-        words=torch.tensor([p[3] for p in parts]).repeat_interleave(torch.tensor(counts), 0),
-        episodes=torch.tensor([p[4] for p in parts]).repeat_interleave(torch.tensor(counts)),
-        tasks=torch.tensor([p[5] for p in parts]).repeat_interleave(torch.tensor(counts)),
-        task_names=task_names,
-    )
+    whole: dict[str, Any] = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    return Samples(**{"frames": None, **whole}, task_names=task_names)
 
 
-def _frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
+def instruction_of(name: str) -> str:
+    """What the robot is told in a task."""
+    return spec_of(name).task(name).instruction
+
+
+def observed(episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Proprioception (n, p) and privileged state (n, s) at `steps` (n,)."""
+    states = episode.states[steps]
+    return states[:, : len(space.proprioception)], states
+
+
+def frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
+    """The episode's frames (n, size, size, 3), None for a state policy, and the control steps (n,) that a policy of
+    these settings learns from.
+
+    Raises:
+        CheckpointError: too few labels behind the episode's end for a whole chunk, or frames of another size.
+    """
     if settings.chunk > len(episode.labels) - episode.steps + 1:
         raise CheckpointError(
             f"the demonstrations have {len(episode.labels) - episode.steps} labels behind an episode's end, "
@@ -124,11 +146,11 @@ def held_out_of(episodes: Tensor, share: float) -> Tensor:
     return episodes % every == every - 1
 
 
-def soft_labels(sigma: float) -> Tensor:
-    """(V, V) row per true bin: a discrete Gaussian of `sigma` bins; the identity for sigma 0."""
-    bins = torch.arange(VOCABULARY, dtype=torch.float32)
+def soft_labels(tokens: int, sigma: float) -> Tensor:
+    """(V, V) row per true bin of V = `tokens`: a discrete Gaussian of `sigma` bins; the identity for sigma 0."""
+    bins = torch.arange(tokens, dtype=torch.float32)
     if sigma <= 0:
-        return torch.eye(VOCABULARY)
+        return torch.eye(tokens)
     return torch.softmax(-((bins[:, None] - bins) ** 2) / (2 * sigma**2), -1)
 
 
@@ -140,10 +162,10 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
 class Imitation:
     """Losses and metrics of one training run."""
 
-    def __init__(self, target: Target, samples: Samples, settings: TrainSettings, device: torch.device) -> None:
+    def __init__(self, target: CompactTarget, samples: Samples, settings: TrainSettings, device: torch.device) -> None:
         self.target, self.settings, self.device = target, settings, device
         self.training, self.held_out = split(samples, settings.held_out)
-        self.labels = soft_labels(settings.label_sigma).to(device)
+        self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(device)
 
     def tokens(self, samples: Samples, indices: Tensor) -> Tensor:
         """(B, N) int64."""
@@ -151,22 +173,24 @@ class Imitation:
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
     def autocast(self) -> torch.autocast:
+        """bfloat16 where it is asked for."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16)
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Of a batch; in the first `scene_steps` of the positions alone."""
         inputs = self.training.inputs(indices, self.device)
-        scene = self.settings.scene_weight if self.target.needs_frame else 0.0
+        scene = self.settings.scene_weight if self.target.cameras else 0.0
         with self.autocast():
             if scene and step < self.settings.scene_steps:
-                _, positions = self.target.encode(inputs)
-                loss = position_loss(positions, inputs.states)
+                _, positions = self.target.encode_batch(inputs)
+                loss = position_loss(positions, places_of(inputs.states, self.target.observation))
                 return loss, {"position_loss": float(loss.detach())}
             tokens = self.tokens(self.training, indices)
-            logits, positions = self.target(inputs, tokens)
+            logits, positions = self.target.teacher_forced(inputs, tokens)
             loss = token_loss(logits, tokens, self.labels)
             metrics = {"token_loss": float(loss.detach())}
             if scene:
-                extra = position_loss(positions, inputs.states)
+                extra = position_loss(positions, places_of(inputs.states, self.target.observation))
                 loss = loss + scene * extra
                 metrics["position_loss"] = float(extra.detach())
         return loss, metrics
@@ -174,52 +198,51 @@ class Imitation:
     @torch.no_grad()
     def validate(self, module: nn.Module, limit: int = 2048) -> Metrics:
         """Teacher-forced metrics on held-out episodes; the score is minus the mean action L1."""
-        assert isinstance(module, Target)
+        assert isinstance(module, CompactTarget)
         chosen = torch.linspace(0, len(self.held_out) - 1, min(limit, len(self.held_out))).long()
         hits, close, errors, offsets = [], [], [], []
+        actions = module.actions
         for indices in chosen.split(256):
             inputs = self.held_out.inputs(indices, self.device)
             tokens = self.tokens(self.held_out, indices)
-            logits, positions = module(inputs, tokens)
+            logits, positions = module.teacher_forced(inputs, tokens)
             guess = logits.argmax(-1)
             distance = (guess - tokens).abs()
             hits.append((distance == 0).float().flatten())
             close.append((distance <= WITHIN).float().flatten())
-            gap = np.abs(values_of(guess.cpu().numpy()) - values_of(tokens.cpu().numpy()))
-            errors.append(gap.reshape(-1, module.settings.dofs))
-            offsets.append((positions - scene_of(inputs.states)).unflatten(-1, (2, 3)).norm(dim=-1))
+            gap = np.abs(actions.values_of(guess.cpu().numpy()) - actions.values_of(tokens.cpu().numpy()))
+            errors.append(gap.reshape(-1, actions.dofs))
+            offsets.append((positions - places_of(inputs.states, module.observation)).norm(dim=-1))
         error = np.concatenate(errors).mean(0)
         metrics = {
             "score": -float(error.mean()),
             "token_accuracy": float(torch.cat(hits).mean()),
             f"within_{WITHIN}": float(torch.cat(close).mean()),
             "action_l1": float(error.mean()),
-            **{f"l1_{name}": float(e) for name, e in zip(DOF_NAMES, error, strict=True)},
+            **{f"l1_{name}": float(e) for name, e in zip(actions.names, error, strict=True)},
         }
-        if module.needs_frame:
-            object_error, goal_error = torch.cat(offsets).median(0).values.tolist()
-            metrics |= {"object_error_cm": 100 * object_error, "goal_error_cm": 100 * goal_error}
+        if module.cameras:
+            medians = torch.cat(offsets).median(0).values.tolist()
+            names = [place.name.replace(" ", "_") for place in module.observation.places]
+            metrics |= {f"{name}_error_cm": 100 * e for name, e in zip(names, medians, strict=True)}
         return metrics
 
 
-def scene_of(states: Tensor) -> Tensor:
-    """(B, 39) -> (B, 6) object and goal positions, metres."""
-    return torch.cat([states[:, OBJECT], states[:, GOAL]], -1)
+def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
+    """Smooth L1 of estimated positions (B, K, 3) metres, in units of 2 cm."""
+    return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5
 
 
-def position_loss(positions: Tensor, states: Tensor) -> Tensor:
-    """Smooth L1 of estimated positions (B, 6), in units of 2 cm."""
-    return F.smooth_l1_loss(positions / 0.02, scene_of(states) / 0.02, beta=1.0) * 0.5
-
-
-def new_target(settings: TargetSettings, samples: Samples, seed: int) -> Target:
-    """A fresh policy with the samples' action statistics."""
+def new_target(
+    settings: TargetSettings, dataset: DemoDataset, samples: Samples, words: WordTokenizer, camera: str, seed: int
+) -> CompactTarget:
+    """A fresh policy of the dataset's spaces with the samples' action statistics."""
     torch.manual_seed(seed)
-    actions = ActionTokenizer.fit(samples.chunks[:, 0].numpy().astype(np.float64))
-    return Target(replace(settings), actions, vocabulary())
+    actions = dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
+    return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
 
 
-def check_init(settings: TargetSettings, description: dict[str, Any], folder: Path) -> None:
+def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:
     """Whether the target in `folder`, described by its JSON, can be fine-tuned to `settings`: no weight depends on the
     chunk length, all else must agree.
 
@@ -227,35 +250,51 @@ def check_init(settings: TargetSettings, description: dict[str, Any], folder: Pa
         UsageError: the first shape that differs.
     """
     for name, wanted in asdict(settings).items():
-        there = description["settings"].get(name)
+        there = description.settings.get(name)
         if name not in ("size", "chunk") and there != wanted:
             raise UsageError(
                 f"train.init: the target in {folder} has {name}={there}, the run target.{name}={wanted}: set both alike"
             )
 
 
-def continued_target(settings: TargetSettings, init: Target) -> Target:
+def continued_target(settings: TargetSettings, init: CompactTarget) -> CompactTarget:
     """A policy of `settings` that begins with a copy of the weights of `init` and shares its statistics and words."""
-    target = Target(replace(settings), init.actions, init.words)
+    camera = init.cameras[0] if init.cameras else ""
+    target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
     target.load_state_dict(init.state_dict())
     return target
 
 
+def check_spaces(target: CompactTarget, dataset: DemoDataset) -> None:
+    """Refuse demonstrations of another environment than the target's.
+
+    Raises:
+        CheckpointError: other actions or observations.
+    """
+    target.actions.check_same(dataset.manifest.actions, "the target", f"the demonstrations in {dataset.path}")
+    if target.observation != dataset.manifest.observation:
+        raise CheckpointError(
+            f"the demonstrations in {dataset.path} have other observations than the target was trained on: "
+            "they are of another environment"
+        )
+
+
 def vocabulary() -> WordTokenizer:
+    """All words of the environment's instructions."""
     return WordTokenizer.build(t.instruction for t in TASKS.values())
 
 
 def imitation_job(
     run: Imitation,
     save: Callable[[nn.Module, Metrics], None],
-    closed_loop: Callable[[Target], float] | None = None,
+    closed_loop: Callable[[CompactTarget], float] | None = None,
 ) -> Job:
     """The run as the shared loop takes it. With `closed_loop` (success in [0, 1]) success outranks the action error."""
 
     def validate(module: nn.Module) -> Metrics:
         metrics = run.validate(module)
         if closed_loop is not None:
-            assert isinstance(module, Target)
+            assert isinstance(module, CompactTarget)
             metrics["closed_loop_success"] = closed_loop(module)
             metrics["score"] += 10 * metrics["closed_loop_success"]
         return metrics

@@ -1,21 +1,25 @@
 """The optimisation loop that the target and the drafters share: schedule, EMA, validation, exact resume.
 
-The batch of step s is a function of (seed, s), and the resume file holds weights, EMA, optimiser moments and the best
-score: a run that was cut and resumed writes the same bytes as one that was not (same machine, same threads).
+The batch of step s is a function of (seed, s), and one resume file holds weights, EMA, optimiser moments, best score
+and history: a run that was cut and resumed writes the same bytes as one that was not (same machine, same threads).
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.errors import CheckpointError, KervError
-from kerv_cli.files import atomic_path, read_json, write_json
+from kerv_cli.files import atomic_path
+from kerv_cli.manifests import read
 from kerv_cli.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 
@@ -34,8 +38,19 @@ class Job:
     save: Callable[[nn.Module, Metrics], None]
 
 
+@dataclass(frozen=True)
+class Progress:
+    """How far a run has come. identity: hash of everything that determines it; best: greatest score so far; history:
+    the metrics of every validation."""
+
+    identity: str
+    step: int
+    best: float
+    history: list[Metrics]
+
+
 class Loop:
-    """Runs a `Job`. folder: where `resume.safetensors`, `progress.json` and `log.csv` live."""
+    """Runs a `Job`. folder: where `resume.safetensors` and `log.csv` live."""
 
     def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str) -> None:
         self.job, self.settings, self.folder = job, settings, folder
@@ -62,6 +77,11 @@ class Loop:
         return max(self.history, key=lambda m: m["score"])
 
     def update(self) -> Metrics:
+        """One optimiser step -> loss and what the job logs.
+
+        Raises:
+            KervError: the loss is not finite.
+        """
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
@@ -87,6 +107,11 @@ class Loop:
         module.load_state_dict(self.ema)
         module.eval()
         metrics = {"step": float(self.step), "train_loss": training["loss"], **self.job.validate(module)}
+        broken = [name for name, value in metrics.items() if not math.isfinite(value)]
+        if broken:
+            raise KervError(
+                f"training diverged: {broken[0]} is {metrics[broken[0]]} at step {self.step}: lower train.lr"
+            )
         self.history.append(metrics)
         if metrics["score"] >= self.best:
             self.best = metrics["score"]
@@ -96,33 +121,34 @@ class Loop:
         self.store()
 
     def store(self) -> None:
-        """The JSON, written last, names the step whose tensors it belongs to."""
+        """Write the resume file, then the log."""
+        import pandas as pd
+
         tensors = {f"model.{k}": v for k, v in self.job.module.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
-        tensors["step"] = torch.tensor(self.step)
-        save_tensors(self.folder / "resume.safetensors", tensors)
-        progress = {"identity": self.identity, "step": self.step, "best": self.best, "history": self.history}
-        write_json(self.folder / "progress.json", progress)
-        columns = list(self.history[-1])
-        rows = [",".join(f"{m.get(c, math.nan):.6g}" for c in columns) for m in self.history]
+        progress = Progress(self.identity, self.step, self.best, self.history)
+        write_state(self.folder / "resume.safetensors", tensors, progress)
         with atomic_path(self.folder / "log.csv") as temporary:
-            temporary.write_text("\n".join([",".join(columns), *rows]) + "\n")
+            pd.DataFrame(self.history).to_csv(temporary, index=False, float_format="%.6g")
 
     def restore(self) -> None:
-        path = self.folder / "progress.json"
+        """Go on where the folder's run stopped, if it holds one.
+
+        Raises:
+            CheckpointError: a run with other settings or data, or a damaged one.
+        """
+        path = self.folder / "resume.safetensors"
         if not path.is_file():
             return
-        progress = read_json(path)
-        if progress["identity"] != self.identity:
+        tensors, progress = read_state(path)
+        if progress.identity != self.identity:
             raise CheckpointError(
                 f"{self.folder} holds a run with other settings or data: choose another name=, or delete that folder"
             )
-        tensors = load_tensors(self.folder / "resume.safetensors", "training state")
-        step = int(tensors.pop("step"))
         self.job.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
-        self.ema = {k[4:]: v for k, v in tensors.items() if k.startswith("ema.")}
+        self.ema = {k[4:]: v.to(self.ema[k[4:]].device) for k, v in tensors.items() if k.startswith("ema.")}
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in tensors.items():
             if name.startswith("optimiser."):
@@ -130,9 +156,44 @@ class Loop:
                 state.setdefault(int(index), {})[key] = tensor
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
-        self.step = step
-        # a cut between the two files leaves tensors one validation ahead of the JSON; history is then one row short
-        self.best, self.history = progress["best"], progress["history"]
+        self.step, self.best, self.history = progress.step, progress.best, progress.history
+
+
+def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
+    """Tensors and progress in one file, so that no kill can leave them of different steps."""
+    text = json.dumps(asdict(progress), allow_nan=False)
+    save_tensors(path, tensors, {"progress": text, "sha256": digest(tensors, text)})
+
+
+def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
+    """The inverse of `write_state`.
+
+    Raises:
+        CheckpointError: damaged, or numbers that are not finite.
+    """
+    again = f"delete {path.parent} to begin again"
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+        tensors = load_tensors(path, "training state")
+        text = metadata["progress"]
+        intact = metadata["sha256"] == digest(tensors, text)
+        value = json.loads(text)
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise CheckpointError(f"training state at {path} is damaged ({error}): {again}") from error
+    if not intact:
+        raise CheckpointError(f"training state at {path} is damaged, its hash does not fit: {again}")
+    return tensors, read(Progress, value, str(path))
+
+
+def digest(tensors: Mapping[str, Tensor], text: str) -> str:
+    """Hex SHA-256 over names, types, shapes and bytes of tensors, and a text."""
+    found = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
 
 
 def schedule(step: int, settings: TrainSettings) -> float:

@@ -17,18 +17,20 @@ from kerv_cli.drafting.early import EarlyDrafter, save_early
 from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.places import artifact, drafter_folder, early_folder, find_target
+from kerv_cli.artifacts import artifact_folder
+from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
-from kerv_cli.targets.checkpoint import load_target, read_description, save_target
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.checkpoint import load_target, read_target, save_target
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import Distillation, distillation_job, teach
 from kerv_cli.training.early_distillation import EarlyDistillation, early_job, teach_early
 from kerv_cli.training.imitation import (
     Imitation,
     Samples,
     check_init,
+    check_spaces,
     continued_target,
     imitation_job,
     load_samples,
@@ -46,7 +48,9 @@ VALIDATION_SEED = EVALUATION_SEED // 2
 def determining(train: TrainSettings) -> dict[str, Any]:
     """What of the optimisation settings makes two runs different. A run may be resumed with more or fewer steps.
     `init` is a name: the weights that it stands for count."""
-    return {k: v for k, v in asdict(train).items() if k not in ("steps", "validate_every", "closed_loop", "init")}
+    return {
+        k: v for k, v in asdict(train).items() if k not in ("steps", "validate_every", "closed_loop", "init", "half")
+    }
 
 
 def identity_of(**parts: Any) -> str:
@@ -71,7 +75,7 @@ class TargetRun:
         self.init = self.find_init()
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         self.samples: Samples | None = None
-        self.begun: Target | None = None
+        self.begun: CompactTarget | None = None
         self.origin: dict[str, str] = {}  # hash of the weights that the run begins with, where they are not fresh
 
     def find_init(self) -> Path | None:
@@ -84,10 +88,11 @@ class TargetRun:
             raise UsageError(
                 f"train.init={name} would be overwritten by the run that begins with it: choose another name="
             )
-        check_init(self.settings.target, read_description(folder, "target"), folder)
+        check_init(self.settings.target, read_target(folder), folder)
         return folder
 
     def plan(self) -> str:
+        """One line: what the run would do."""
         train, episodes = self.settings.train, [e for e in self.dataset.episodes if e.task in self.tasks]
         return (
             f"{self.folder}: {self.settings.target.size} on {self.settings.target.observation}, {len(episodes)} "
@@ -96,18 +101,23 @@ class TargetRun:
         )
 
     def load(self, progress: Progress) -> None:
+        """Read the demonstrations, and the weights to begin with."""
         self.device, _ = set_up(self.settings.runtime)
         if self.init is not None:
             self.begun, described = load_target(self.init)
-            self.origin = {"init": described["sha256"]}
+            assert self.begun is not None
+            self.origin = {"init": described.sha256}
+            check_spaces(self.begun, self.dataset)
         words = self.begun.words if self.begun else vocabulary()
         self.samples = load_samples(self.dataset, self.settings.target, words, self.tasks, progress)
 
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
+        """Train, resuming what is there -> metrics of the best checkpoint."""
         assert self.samples is not None
         settings = self.settings
         if self.begun is None:
-            target = new_target(settings.target, self.samples, settings.train.seed)
+            camera = settings.world.camera.name
+            target = new_target(settings.target, self.dataset, self.samples, vocabulary(), camera, settings.train.seed)
         else:
             target = continued_target(settings.target, self.begun)
         target = target.to(self.device)
@@ -124,7 +134,7 @@ class TargetRun:
         target.train()
         return loop.run(on_step)
 
-    def closed_loop(self, target: Target) -> float:
+    def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of greedy decoding over the tasks, on seeds of their own."""
         from kerv_cli.rollouts.run import success_of
 
@@ -132,7 +142,8 @@ class TargetRun:
         return success_of(target, self.tasks, seeds, self.settings.world)
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
-        assert isinstance(module, Target)
+        """Write the weights and what made them."""
+        assert isinstance(module, CompactTarget)
         made = {
             "command": "kerv train target",
             "settings": asdict(self.settings),
@@ -142,7 +153,7 @@ class TargetRun:
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
         }
-        save_target(self.folder, module, made)
+        save_target(self.folder, module, self.dataset.manifest.environment, made, self.settings.train.half)
 
 
 class DrafterRun:
@@ -159,9 +170,11 @@ class DrafterRun:
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
 
     def place(self) -> Path:
-        return drafter_folder(self.settings.results, self.settings.policy.drafter, self.target_folder)
+        """Where the drafter is put."""
+        return artifact_folder("drafter")(self.settings.results, self.settings.policy.drafter, self.target_folder)
 
     def plan(self) -> str:
+        """One line: what the run would do."""
         s = self.settings
         return (
             f"{self.folder}: {s.drafter.layers}-layer {self.noun} of {self.target_folder}, greedy decodes of "
@@ -169,11 +182,14 @@ class DrafterRun:
         )
 
     def load(self, progress: Progress) -> None:
+        """Load the target and let it decode the demonstrations' observations."""
         self.device, _ = set_up(self.settings.runtime)
         self.target, self.described = load_target(self.target_folder, self.device)
+        check_spaces(self.target, self.dataset)
         self.teach(progress)
 
     def teach(self, progress: Progress) -> None:
+        """The target's decodes, for training and validation."""
         tasks = tuple(dict.fromkeys(e.task for e in self.dataset.episodes))
         samples = load_samples(self.dataset, self.target.settings, self.target.words, tasks)
         training, held_out = split(samples, self.settings.train.held_out)
@@ -182,11 +198,13 @@ class DrafterRun:
         self.held_out = teach(self.target, held_out, max(60, limit // 50), lambda done, total: None)
 
     def job(self) -> Job:
+        """What the loop optimises."""
         drafter = Drafter.beside(self.settings.drafter, self.target).to(self.device)
         run = Distillation(drafter, self.target, self.states, self.held_out, self.settings.drafter)
         return distillation_job(run, self.save)
 
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
+        """Train, resuming what is there -> metrics of the best checkpoint."""
         settings = self.settings
         torch.manual_seed(settings.train.seed)
         job = self.job()
@@ -194,13 +212,14 @@ class DrafterRun:
             drafter=asdict(settings.drafter),
             train=determining(settings.train),
             demos=self.dataset.sha256,
-            target=self.described["sha256"],
+            target=self.described.sha256,
         )
         loop = Loop(job, settings.train, self.folder, identity)
         job.module.train()
         return loop.run(on_step)
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
+        """Write the weights and what made them."""
         made = {
             "command": "kerv train drafter",
             "settings": asdict(self.settings),
@@ -212,8 +231,9 @@ class DrafterRun:
         self.write(module, made)
 
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+        """Write the weights; made: provenance."""
         assert isinstance(module, Drafter)
-        save_drafter(self.folder, module, self.described["sha256"], made)
+        save_drafter(self.folder, module, self.target, self.described.sha256, made, self.settings.train.half)
 
 
 class EarlyRun(DrafterRun):
@@ -222,21 +242,21 @@ class EarlyRun(DrafterRun):
     noun = "early drafter"
 
     def place(self) -> Path:
-        return early_folder(self.settings.results, self.settings.policy.early, self.target_folder)
+        return artifact_folder("early")(self.settings.results, self.settings.policy.early, self.target_folder)
 
     def teach(self, progress: Progress) -> None:
         taught = teach_early(self.target, self.dataset, self.settings.drafter, progress)
         self.training, self.validation = taught.split(self.settings.train.held_out)
 
     def job(self) -> Job:
-        early = EarlyDrafter(self.settings.drafter, self.target.settings)
+        early = EarlyDrafter.beside(self.settings.drafter, self.target)
         early.standardise(self.training.features)
         run = EarlyDistillation(early.to(self.device), self.training, self.validation, self.settings.train)
         return early_job(run, self.save)
 
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
         assert isinstance(module, EarlyDrafter)
-        save_early(self.folder, module, self.described["sha256"], made)
+        save_early(self.folder, module, self.described.sha256, made, self.settings.train.half)
 
 
 DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": EarlyRun}

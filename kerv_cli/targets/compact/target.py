@@ -1,177 +1,270 @@
-"""The target: vision + instruction + scene + proprioception tokens -> Llama-style trunk -> action tokens.
+"""The compact target: vision + instruction + scene + proprioception tokens -> Llama-style trunk -> action tokens.
 
 Prompt order: [vision grid] [instruction] [scene] [proprioception]; the last prompt position predicts token 0.
 
-Scene tokens carry where the object and the goal are, as positions and as vectors relative to the hand. With
-`observation=vision` the positions are *estimated* from the image points (supervised while training, never read from the
-simulator afterwards); with `observation=state` they are given, together with the rest of Meta-World's state:
+Scene tokens carry where the environment's places are (object and goal, say), as positions and as vectors relative to
+the hand. With `observation=vision` the positions are *estimated* from the image points (supervised while training,
+never read from the simulator afterwards); with `observation=state` they are given, together with the rest of the state:
 privileged, to separate decoding from perception.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from kerv_cli.errors import CheckpointError
+from kerv_cli.manifests import read
 from kerv_cli.settings import TargetSettings
-from kerv_cli.spaces import VOCABULARY, ActionTokenizer
-from kerv_cli.targets.compact.inference import Planned
+from kerv_cli.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.targets.checkpoint import TargetDescription, load_state
+from kerv_cli.targets.compact.features import (
+    hand_features,
+    places_of,
+    privileged_features,
+    privileged_width,
+    scene_features,
+    scene_width,
+)
+from kerv_cli.targets.compact.packed import Packable, PackedPrompt, pack
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
 
-OBJECT, GOAL = slice(4, 7), slice(36, 39)  # Meta-World's state vector
-WORKSPACE = (0.0, 0.7, 0.15)  # metres, centre of the positions that Meta-World uses
-STATE_EXTRAS = 11 + 18 + 12  # rotations and second object, velocities, vectors to the second object
-
 
 @dataclass(frozen=True)
 class Inputs:
-    """A batch of observations as the policy takes them. images (B, 3, s, s) uint8 or None, states (B, 39) float32,
-    words (B, L) int64. Of `states` a vision policy reads only the first four numbers (hand, gripper)."""
+    """A batch of observations as tensors. images (B, 3, size, size) uint8 or None, proprioception (B, p) and states
+    (B, s) float32, words (B, L) int64. A vision policy does not read `states`."""
 
     images: Tensor | None
+    proprioception: Tensor
     states: Tensor
     words: Tensor
 
 
-def relative(vector: Tensor) -> Tensor:
-    """(…, 3) metres -> (…, 6): a coarse linear and a fine saturating view of the same vector."""
-    return torch.cat([vector / 0.1, torch.tanh(vector / 0.02)], -1)
+class CompactTarget(Packable):
+    """The policy put together; see `targets/protocol.py`. Parameters in float32.
 
-
-def scene_features(states: Tensor, positions: Tensor, centre: Tensor) -> Tensor:
-    """states (B, >=4), positions (B, 6) object and goal, metres -> (B, 28)."""
-    hand, gripper = states[:, :3], states[:, 3:4]
-    thing, goal = positions[:, :3], positions[:, 3:]
-    absolute = [(hand - centre) / 0.1, gripper, (thing - centre) / 0.1, (goal - centre) / 0.1]
-    return torch.cat([*absolute, relative(thing - hand), relative(goal - hand), relative(goal - thing)], -1)
-
-
-def privileged_features(states: Tensor) -> Tensor:
-    """states (B, 39) -> (B, 41): what Meta-World's state has beyond the two positions."""
-    second = states[:, 11:14]
-    velocity = (states[:, :18] - states[:, 18:36]) / 0.01
-    vectors = [relative(second - states[:, :3]), relative(states[:, GOAL] - second)]
-    return torch.cat([states[:, 7:18], velocity.clamp(-3, 3), *vectors], -1)
-
-
-class Target(Planned):
-    """The policy put together. Parameters in float32; `VOCABULARY` action tokens; greedy target_tokens are the argmax."""
+    cameras: of a vision policy, the one whose images it reads. sha256: of the weights it was loaded with, else empty.
+    """
 
     centre: Tensor
+    packed: PackedPrompt | None
 
-    def __init__(self, settings: TargetSettings, actions: ActionTokenizer, words: WordTokenizer) -> None:
+    def __init__(
+        self,
+        settings: TargetSettings,
+        actions: ActionSpace,
+        observation: ObservationSpace,
+        words: WordTokenizer,
+        camera: str = "",
+    ) -> None:
         super().__init__()
         s = self.settings = settings
-        self.actions, self.words = actions, words
-        self.register_buffer("centre", torch.tensor(WORKSPACE), persistent=False)
-        self.embedding = nn.Embedding(VOCABULARY, s.width)
-        self.embedding.weight.data = _smooth_table(s.width)
+        self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
+        self.cameras = (camera,) if s.observation == "vision" else ()
+        felt, places = len(observation.proprioception), len(observation.places)
+        self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
+        self.embedding = nn.Embedding(actions.tokens, s.width)
+        self.embedding.weight.data = _smooth_table(actions.tokens, s.width)
         self.word_embedding = nn.Embedding(words.size, s.width)
         nn.init.normal_(self.word_embedding.weight, std=0.02)
-        features = 28 + (STATE_EXTRAS if s.observation == "state" else 0)
+        features = scene_width(observation) + (privileged_width(observation) if s.observation == "state" else 0)
         self.scene = nn.Sequential(
             nn.Linear(features, 2 * s.width), nn.SiLU(), nn.Linear(2 * s.width, s.scene_tokens * s.width)
         )
-        self.proprioception = nn.Sequential(nn.Linear(4, s.width), nn.SiLU(), nn.Linear(s.width, s.width))
+        self.proprioception = nn.Sequential(nn.Linear(felt, s.width), nn.SiLU(), nn.Linear(s.width, s.width))
         if s.observation == "vision":
             self.vision = VisionEncoder(s.image_size, s.grid, s.keypoints, s.channels, s.width)
             self.locate = nn.Sequential(
-                nn.Linear(2 * s.keypoints + 4 + s.width, 256),
+                nn.Linear(2 * s.keypoints + felt + s.width, 256),
                 nn.SiLU(),
                 nn.Linear(256, 128),
                 nn.SiLU(),
-                nn.Linear(128, 6),
+                nn.Linear(128, 3 * places),
             )
         self.trunk = Trunk(s.width, s.layers, s.heads, s.feed_forward)
-        self.head = nn.Linear(s.width, VOCABULARY, bias=False)
+        self.head = nn.Linear(s.width, actions.tokens, bias=False)
         nn.init.normal_(self.head.weight, std=0.02)
 
     @property
-    def needs_frame(self) -> bool:
-        return self.settings.observation == "vision"
+    def chunk(self) -> int:
+        """H, control steps it was trained to decode at once."""
+        return self.settings.chunk
 
     @property
-    def tokens_per_chunk(self) -> int:
-        """N = H · D."""
-        return self.settings.chunk * self.settings.dofs
+    def width(self) -> int:
+        """E."""
+        return self.settings.width
 
     @property
-    def prompt_length(self) -> int:
+    def heads(self) -> int:
+        """A, of the trunk; a drafter has as many."""
+        return self.settings.heads
+
+    @property
+    def feed_forward(self) -> int:
+        """Hidden units of the trunk's layers; a drafter's has as many."""
+        return self.settings.feed_forward
+
+    @property
+    def max_prompt(self) -> int:
         """P, the same for every observation and instruction."""
+        return self.segments["proprioception"].stop
+
+    @property
+    def segments(self) -> Mapping[str, slice]:
+        """Where the prompt's parts lie, in order."""
         s = self.settings
-        return (s.grid**2 if self.needs_frame else 0) + s.instruction_tokens + s.scene_tokens + 1
+        sizes = {"instruction": s.instruction_tokens, "scene": s.scene_tokens, "proprioception": 1}
+        if self.cameras:
+            sizes = {"vision": s.grid**2, **sizes}
+        stops = np.cumsum(list(sizes.values())).tolist()
+        return {name: slice(stop - size, stop) for (name, size), stop in zip(sizes.items(), stops, strict=True)}
+
+    @property
+    def pooled_width(self) -> int:
+        """F of `pooled`."""
+        return self.width * (self.settings.scene_tokens + (3 if self.cameras else 2))
+
+    def pooled(self, prompt: Tensor) -> Tensor:
+        """prompt (B, P, E) -> (B, F): scene tokens end to end, proprioception, mean word, mean vision token if any."""
+        parts = self.segments
+        pooled = [prompt[:, parts["scene"]].flatten(1), prompt[:, parts["proprioception"]].flatten(1)]
+        pooled += [prompt[:, parts[name]].mean(1) for name in ("instruction", "vision") if name in parts]
+        return torch.cat(pooled, -1)
 
     @property
     def device(self) -> torch.device:
+        """Where the weights are."""
         return self.head.weight.device
 
-    def inputs(self, frame: np.ndarray | None, state: np.ndarray, words: Tensor) -> Inputs:
-        """One observation to a batch of one: frame (s, s, 3) uint8 or None, state (39,), words (1, L)."""
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the weights."""
+        return self.head.weight.dtype
+
+    def pack(self) -> None:
+        """Prepare for inference: packed weights where it is frozen float32 on a CPU."""
+        pack(self)
+
+    def pack_weights(self) -> PackedPrompt | None:
+        return PackedPrompt(self) if self.cameras else None
+
+    def inputs(self, observation: Observation) -> Inputs:
+        """One observation as a batch of one.
+
+        Raises:
+            CheckpointError: numbers or images of another size than the policy was trained on.
+        """
+        felt, state = (
+            torch.from_numpy(np.asarray(x, dtype=np.float32)).to(self.device)[None]
+            for x in (observation.proprioception, observation.state)
+        )
+        if felt.shape[1] != len(self.observation.proprioception) or state.shape[1] != self.observation.state:
+            raise CheckpointError(
+                f"the target takes {len(self.observation.proprioception)} numbers of proprioception and "
+                f"{self.observation.state} of state, the environment gives {felt.shape[1]} and {state.shape[1]}: "
+                "it was trained for another environment"
+            )
         images = None
-        if self.needs_frame:
-            images = torch.from_numpy(np.ascontiguousarray(frame)).to(self.device).permute(2, 0, 1)[None]
-        states = torch.from_numpy(np.asarray(state, dtype=np.float32)).to(self.device)[None]
-        return Inputs(images, states, words)
+        for camera in self.cameras:
+            if camera not in observation.images:
+                raise CheckpointError(f"the target was trained on images of camera '{camera}', which were not drawn")
+            image = np.ascontiguousarray(observation.images[camera])
+            images = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
+        return Inputs(images, felt, state, self.words_of(observation.instruction))
 
     def words_of(self, instruction: str) -> Tensor:
         """(1, L) int64."""
         return torch.tensor([self.words.encode(instruction, self.settings.instruction_tokens)], device=self.device)
 
-    def encode(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Prompt embeddings (B, P, E) and the object and goal positions (B, 6) in metres they are built on."""
-        if self.plan is not None and len(inputs.states) == 1:
-            return self.plan(inputs)
+    def encode(self, observation: Observation) -> Tensor:
+        """The prompt's embeddings (1, P, E); errors as `inputs`."""
+        return self.encode_batch(self.inputs(observation))[0]
+
+    def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """Prompt embeddings (B, P, E) and the places' positions (B, K, 3) in metres they are built on."""
+        if self.packed is not None and len(inputs.proprioception) == 1:
+            return self.packed(inputs)
         words = self.word_embedding(inputs.words)
-        hand = torch.cat([(inputs.states[:, :3] - self.centre) / 0.1, inputs.states[:, 3:4]], -1)
+        hand = hand_features(inputs.proprioception, self.centre)
         parts = []
-        if self.needs_frame:
-            tokens, positions = self.see(inputs, words, hand)
+        if self.cameras:
+            tokens, places = self.see(inputs, words, hand)
             parts.append(tokens)
-            features = scene_features(inputs.states, positions, self.centre)
+            features = scene_features(inputs.proprioception, places, self.centre)
         else:
-            positions = torch.cat([inputs.states[:, OBJECT], inputs.states[:, GOAL]], -1)
-            features = scene_features(inputs.states, positions, self.centre)
-            features = torch.cat([features, privileged_features(inputs.states)], -1)
+            places = places_of(inputs.states, self.observation)
+            features = scene_features(inputs.proprioception, places, self.centre)
+            privileged = privileged_features(inputs.proprioception, inputs.states, self.observation)
+            features = torch.cat([features, privileged], -1)
         scene = self.scene(features.to(self.head.weight.dtype)).unflatten(-1, (self.settings.scene_tokens, -1))
         proprioception = self.proprioception(hand.to(self.head.weight.dtype))[:, None]
-        return torch.cat([*parts, words, scene, proprioception], 1), positions
+        return torch.cat([*parts, words, scene, proprioception], 1), places
 
     def see(self, inputs: Inputs, words: Tensor, hand: Tensor) -> tuple[Tensor, Tensor]:
-        """Vision tokens (B, grid², E) and estimated object and goal positions (B, 6), metres."""
+        """Vision tokens (B, grid², E) and the places' estimated positions (B, K, 3), metres."""
         assert inputs.images is not None
         tokens, points = self.vision(inputs.images)
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
             located = self.locate(features)
-        return tokens, located.float() * 0.1 + self.centre.repeat(2)
+        return tokens, located.float().unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
-    def forward(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Teacher forcing: tokens (B, N) -> logits (B, N, V) that predict them, positions (B, 6) metres."""
-        prompt, positions = self.encode(inputs)
+    def embed(self, tokens: Tensor) -> Tensor:
+        """Action tokens (B, T) int64 -> (B, T, E)."""
+        embedded: Tensor = self.embedding(tokens)
+        return embedded
+
+    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
+        """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
+        return self.trunk.new_cache(batch, capacity, fixed)
+
+    def forward(
+        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
+    ) -> Tensor:
+        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind what the cache holds; seen
+        (T, T) bool as in `targets/protocol.py`."""
+        hidden: Tensor = self.trunk(x, positions, cache, seen)
+        return hidden
+
+    def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """tokens (B, N) -> logits (B, N, V) that predict them, and the places' positions (B, K, 3), metres."""
+        prompt, places = self.encode_batch(inputs)
         x = torch.cat([prompt, self.embedding(tokens[:, :-1]).to(prompt.dtype)], 1)
-        hidden = self.trunk(x, torch.arange(x.shape[1], device=x.device))
-        return self.head(hidden[:, self.prompt_length - 1 :]), positions
-
-    def prefill(self, prompt: Tensor, cache: Cache) -> Tensor:
-        """Encode a prompt (1, P, E) into an emptied cache -> hidden (1, P, E)."""
-        cache.length = 0
-        return self.trunk(prompt, torch.arange(prompt.shape[1], device=prompt.device), cache)
-
-    def step(self, tokens: Tensor, positions: Tensor, cache: Cache, mask: Tensor | None = None) -> Tensor:
-        """Forward tokens (1, T) at positions (T,) behind the cache -> hidden (1, T, E); mask as in `Trunk`."""
-        return self.trunk(self.embedding(tokens), positions, cache, mask)
+        hidden = self(x, torch.arange(x.shape[1], device=x.device))
+        return self.head(hidden[:, prompt.shape[1] - 1 :]), places
 
 
-def _smooth_table(width: int) -> Tensor:
+def _smooth_table(tokens: int, width: int) -> Tensor:
     """(V, E) initial embedding in which neighbouring bins are neighbours: cosines of the bin's value."""
-    centres = torch.linspace(-1, 1, VOCABULARY)[:, None]
+    centres = torch.linspace(-1, 1, tokens)[:, None]
     generator = torch.Generator().manual_seed(0)
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit
     phase = torch.rand(width, generator=generator) * 2 * torch.pi
     return 0.03 * torch.cos(centres * frequency + phase)
+
+
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
+    """The target in `folder`, ready for inference.
+
+    Raises:
+        CheckpointError: the description is not a compact target's, or the weights do not fit it.
+    """
+    settings = read(TargetSettings, description.settings, str(folder / "target.json"))
+    camera = description.cameras[0] if description.cameras else ""
+    words = WordTokenizer(description.words)
+    target = CompactTarget(settings, description.actions, description.observation, words, camera)
+    load_state(target, folder, "target")
+    target = target.to(device=device, dtype=dtype).eval().requires_grad_(False)
+    target.sha256 = description.sha256
+    target.pack()
+    return target

@@ -1,43 +1,88 @@
-"""The Llama-style trunk: RMSNorm, RoPE, SwiGLU, a static key/value cache, tree masks.
+"""The Llama-style trunk: RMSNorm, RoPE, SwiGLU, a key/value cache in fixed buffers, tree attention.
 
-Everything a forward depends on is a tensor (positions, cache slots, mask), so one compiled or captured graph can serve
-every step. Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
+Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
-There are two paths to the same numbers (up to float32 rounding): these modules, which train and run everywhere, and the
-layers' plans for a frozen trunk on a CPU (`lay_out_for_inference`).
+There are three paths to the same numbers (up to float32 rounding). A cache of fixed shapes writes at a tensor of slots
+and attends to its whole capacity under a mask, so that one captured graph can serve every step; it is what CUDA gets.
+On a CPU slices are faster, and a frozen float32 stack has packed weights (`packed.py`).
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.inference import Planned, plain_path
-
-Turn = tuple[Tensor, Tensor] | Tensor  # cosines and sines, or what a plan turns by
+from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradient
 
 
 class Cache:
-    """Keys and values of every layer in fixed buffers (layers, 2, B, A, capacity, C), and how many slots are valid."""
+    """Keys and values of every layer in fixed buffers (layers, 2, B, A, capacity, C), and how many slots are valid.
 
-    def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
+    fixed: every forward has the same shapes. Who writes into a cache first, modules or packed weights, must go on
+    writing: their keys are laid out differently.
+    """
+
+    def __init__(
+        self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor, fixed: bool | None = None
+    ) -> None:
         self.buffer = like.new_zeros((layers, 2, batch, heads, capacity, channels))
         self.layers = list(self.buffer)  # (2, B, A, capacity, C): keys, values
         self.capacity = capacity
         self.length = 0
+        self.fixed = like.is_cuda if fixed is None else fixed
 
-    def keep(self, start: int, path: Tensor) -> None:
-        """Commit: move the entries at slots `path` (n,) to start, start + 1, …; whatever lay behind them is dropped.
-
-        `path` is increasing and starts at or after `start`, so the copy reads only what it has not overwritten.
-        """
-        n = path.shape[0]
-        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, path)
+    def compact(self, start: int, slots: Tensor) -> None:
+        """Commit a path: move the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, …; all
+        others behind `start` are dropped."""
+        n = slots.shape[0]
+        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length = start + n
 
 
-class Rotary(Planned):
+class Slots:
+    """Where a forward writes into a cache's layers: a slice, or with `index` (T,) a tensor of slots."""
+
+    def __init__(self, cache: Cache, tokens: int) -> None:
+        self.start, self.stop = cache.length, cache.length + tokens
+        self.index: Tensor | None = None
+        if cache.fixed:
+            self.index = torch.arange(self.start, self.stop, device=cache.buffer.device)
+
+    def write(self, layer: Tensor, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """k, v (B, A, T, C) into a layer (2, B, A, capacity, C) -> the keys and values to attend to."""
+        if self.index is not None:
+            layer[0].index_copy_(2, self.index, k)
+            layer[1].index_copy_(2, self.index, v)
+            return layer[0], layer[1]
+        layer[0][:, :, self.start : self.stop] = k
+        layer[1][:, :, self.start : self.stop] = v
+        return (layer[0][:, :, : self.stop], layer[1][:, :, : self.stop]) if self.start else (k, v)
+
+
+def attention_mask(seen: np.ndarray | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
+    """Additive mask of `tokens` new tokens behind a cache: (T, S + T), for one of fixed shapes (T, capacity).
+
+    seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token sees; it sees all that are
+    cached before those. None: the new tokens are causal. The mask is None where attention without one does the same.
+    """
+    cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
+    stop = cached + tokens
+    plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
+    if plain and not fixed:
+        return None
+    if seen is None:
+        seen = np.tri(tokens, dtype=bool)
+    mask = np.zeros((tokens, cache.capacity if cache is not None and fixed else stop), dtype=np.float32)
+    mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
+    mask[:, stop:] = -np.inf
+    return torch.from_numpy(mask).to(device=like.device, dtype=like.dtype)
+
+
+class Rotary(nn.Module):
     """Rotary position embedding, half-split layout; tables are computed once in float32."""
 
     cos: Tensor
@@ -51,10 +96,8 @@ class Rotary(Planned):
         # the sign of the swapped half is folded into the table: x·cos + swap(x)·sin
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
-    def forward(self, positions: Tensor) -> Turn:
-        """positions (T,) -> cos, sin (T, 1, C), to be reused by every layer; with a plan what its layers take."""
-        if self.plan is not None:
-            return self.plan(positions)
+    def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """positions (T,) -> cos, sin (T, 1, C), to be reused by every layer."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
 
@@ -63,13 +106,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
-def cosines_and_sines(turn: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """A plan's complex numbers as `Rotary` gives them without one."""
-    turn = turn[:, None, : channels // 2]
-    return torch.cat([turn.real, turn.real], -1), torch.cat([-turn.imag, turn.imag], -1)
-
-
-class Layer(Planned):
+class Layer(nn.Module):
     """One pre-norm decoder layer with fused projections."""
 
     def __init__(self, width: int, heads: int, feed_forward: int) -> None:
@@ -85,40 +122,32 @@ class Layer(Planned):
     def forward(
         self,
         x: Tensor,
-        rotary: Turn,
+        rotary: tuple[Tensor, Tensor],
         cache: Tensor | None = None,
-        start: int = 0,
+        slots: Slots | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """x (B, T, E); mask (T, S + T) additive, or None for plain causal attention (T = 1 needs none).
-
-        cache (2, B, A, capacity, C) holds keys as this layer's path writes them: one path per cache.
-        """
-        if isinstance(rotary, Tensor):
-            if self.plan is not None and not plain_path(x):
-                return self.plan(x, rotary, cache, start, mask)
-            rotary = cosines_and_sines(rotary, self.channels)
+        """x (B, T, E); cache (2, B, A, capacity, C) of this layer, written at `slots`; mask as `attention_mask` gives
+        it: without one attention is causal."""
         batch, tokens, width = x.shape
         qkv = self.qkv(self.attention_norm(x)).view(batch, tokens, 3 * self.heads, self.channels)
         qk = rotate(qkv[:, :, : 2 * self.heads], *rotary)
         q = qk[:, :, : self.heads].transpose(1, 2)
         k = qk[:, :, self.heads :].transpose(1, 2)
         v = qkv[:, :, 2 * self.heads :].transpose(1, 2)
+        if cache is not None and slots is not None:
+            k, v = slots.write(cache, k, v)
         causal = mask is None and tokens > 1
-        if cache is not None:
-            end = start + tokens
-            cache[0][:, :, start:end] = k
-            cache[1][:, :, start:end] = v
-            if start:
-                k, v = cache[0][:, :, :end], cache[1][:, :, :end]
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal)
         x = x + self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
         gate, up = self.gate_up(self.feed_norm(x)).chunk(2, -1)
         return x + self.down(F.silu(gate) * up)
 
 
-class Trunk(Planned):
-    """Layers and the final norm. Its output is the hidden state that the head and the drafter read."""
+class LayerStack(Packable):
+    """Decoder layers and their rotary embedding: what the trunk and the drafter have in common."""
+
+    packed: PackedLayers | None
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__()
@@ -126,29 +155,49 @@ class Trunk(Planned):
         self.rotary = Rotary(width // heads)
         self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(layers))
         self.norm = nn.RMSNorm(width, eps=1e-5)
+
+    def pack_weights(self) -> Any:
+        return PackedLayers(self)
+
+    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
+        """An empty cache. fixed: of fixed shapes; default: on CUDA."""
+        channels = self.width // self.heads
+        return Cache(len(self.layers), batch, self.heads, capacity, channels, self.norm.weight, fixed)
+
+    def packed_for(self, x: Tensor, cache: Cache | None) -> PackedLayers | None:
+        """The packed weights, where this input can take them."""
+        return None if wants_gradient(x) or (cache is not None and cache.fixed) else self.packed
+
+    def run_layers(self, x: Tensor, positions: Tensor, cache: Cache | None, seen: np.ndarray | None) -> Tensor:
+        """x (B, T, E) at `positions` (T,) through all layers; the cache grows by T. seen as in `attention_mask`."""
+        mask = attention_mask(seen, x.shape[1], cache, x)
+        packed = self.packed_for(x, cache)
+        if packed is not None:
+            x = packed(x, positions, cache, mask)
+        else:
+            rotary, slots = self.rotary(positions), Slots(cache, x.shape[1]) if cache is not None else None
+            for i, layer in enumerate(self.layers):
+                x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
+        if cache is not None:
+            cache.length += x.shape[1]
+        return x
+
+
+class Trunk(LayerStack):
+    """The stack and its final norm. What leaves it is the hidden state that the head and the drafter read."""
+
+    def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
+        super().__init__(width, layers, heads, feed_forward)
         for name, parameter in self.named_parameters():
             if parameter.dim() == 2:
                 nn.init.normal_(parameter, std=0.02)
                 if name.endswith(("out.weight", "down.weight")):
                     parameter.data /= (2 * layers) ** 0.5
 
-    def new_cache(self, batch: int, capacity: int) -> Cache:
-        like = self.norm.weight
-        return Cache(len(self.layers), batch, self.heads, capacity, self.width // self.heads, like)
-
-    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, mask: Tensor | None = None) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,).
-
-        With a cache the keys and values are written behind the valid ones (`cache.length` grows by T); mask
-        (T, length + T) is additive and says which cached and new tokens each new token sees. Without a mask attention
-        is causal, which with a non-empty cache is only defined for T = 1.
-        """
-        rotary = self.rotary(positions)
-        start = cache.length if cache is not None else 0
-        if mask is None and start and x.shape[1] > 1:
-            raise ValueError("several tokens behind a cached prefix need a mask")
-        for i, layer in enumerate(self.layers):
-            x = layer(x, rotary, cache.layers[i] if cache is not None else None, start, mask)
-        if cache is not None:
-            cache.length = start + x.shape[1]
-        return self.norm(x) if self.plan is None or plain_path(x) else self.plan(x)
+    def forward(
+        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
+    ) -> Tensor:
+        """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,), behind what is cached."""
+        packed = self.packed_for(x, cache)
+        x = self.run_layers(x, positions, cache, seen)
+        return self.norm(x) if packed is None else packed.norm(x)

@@ -1,8 +1,8 @@
 """Frames -> vision tokens and image points.
 
 A small convolutional stem. Two things leave it: a coarse grid of tokens for the trunk, and K image points by spatial
-soft-argmax (Finn et al. 2016) on the finest map, because what decides success on Meta-World is where a 4-pixel marker
-lies. No augmentation moves the image: a shift is a lie about where things are.
+soft-argmax (Finn et al. 2016) on the finest map, because what decides success is where a marker of 4 pixels lies. No
+augmentation moves the image: a shift is a lie about where things are.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.inference import Planned
+from kerv_cli.targets.compact.packed import Packable, PackedVision, has_blocked_layouts
 
 
 class Residual(nn.Module):
+    """Two convolutions beside the identity."""
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.norm = nn.GroupNorm(8, channels)
@@ -25,10 +27,11 @@ class Residual(nn.Module):
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
-class VisionEncoder(Planned):
+class VisionEncoder(Packable):
     """(B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
 
     columns: Tensor
+    packed: PackedVision | None
 
     def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int) -> None:
         super().__init__()
@@ -46,9 +49,13 @@ class VisionEncoder(Planned):
         self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
+    def pack_weights(self) -> PackedVision | None:
+        return PackedVision(self) if has_blocked_layouts() else None
+
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        if self.plan is not None and len(images) == 1:
-            return self.plan(images)
+        """Tokens and points of frames, as the class says."""
+        if self.packed is not None and len(images) == 1:
+            return self.packed(images)
         images = images.to(self.patch.weight.dtype) / 255.0 - 0.5
         fine = self.fine(images)
         middle = self.middle(fine)
