@@ -125,7 +125,7 @@ class World(Protocol):
 
     @property
     def gripper(self) -> float:
-        """Opening, 0 closed to 1 open."""
+        """Opening, 0 closed to 1 open; 1 where there is no gripper."""
 
     def close(self) -> None:
         """Frees simulator and graphics; a later reset builds them anew."""

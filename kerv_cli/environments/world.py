@@ -66,7 +66,8 @@ class EpisodeWorld(ABC):
 
     @property
     def gripper(self) -> float:
-        return float(self.observation.proprioception[self.spec.observation.proprioception.index("gripper")])
+        names, felt = self.spec.observation.proprioception, self.observation.proprioception
+        return float(felt[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
         if seed < 0:

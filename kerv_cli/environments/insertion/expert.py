@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.insertion.pose import GRASP, PEG_HALF, Pose, limited, misfit
+from kerv_cli.environments.insertion.pose import GRASP, PEG_HALF, Pose, limited, misfit, turn_between
 from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.spaces import Observation
 
 HOVER = 0.03
 """Metres above mouth or grasp at which the hand waits until it is aligned."""
+_LOW = 0.004  # metres above the mouth where a peg that is nearly aligned waits for its moment
 _DEPTH = 0.045  # metres below the mouth that the tip is sent to
 _NEAR, _ALIGNED = 0.003, 0.06  # metres and radians: aligned with the slot
-_GRASP_NEAR, _GRASP_ALIGNED = 0.006, 0.12  # and with the peg
+_GRASP_NEAR, _GRASP_ALIGNED = 0.009, 0.2  # and with the peg
 _HELD_NEAR = 0.015  # metres from the grasp within which closed fingers hold the peg
 _GAIN = 0.6  # of the remaining way per control step
 
@@ -36,14 +37,14 @@ class InsertionExpert:
         near = float(np.linalg.norm(off.position))
         if opening < 0.5 and near < _HELD_NEAR:
             return self._towards(hand, hand.seen_from(peg).within(_next_peg(peg, slot)), 0.0)
-        if near < _GRASP_NEAR and off.rotation.magnitude() < _GRASP_ALIGNED:
+        if near < _GRASP_NEAR and off.angle < _GRASP_ALIGNED:
             return self._towards(hand, grasp, 0.0)
         beside = float(np.hypot(*off.position[:2]))
-        above = beside > _GRASP_NEAR or off.rotation.magnitude() > _GRASP_ALIGNED
+        above = beside > _GRASP_NEAR or off.angle > _GRASP_ALIGNED
         return self._towards(hand, grasp.along(HOVER) if above else grasp, 1.0)
 
     def _towards(self, hand: Pose, wanted: Pose, gripper: float) -> NDArray[np.float64]:
-        turn = (wanted.rotation * hand.rotation.inv()).as_rotvec()
+        turn = turn_between(hand, wanted)
         move = limited(_GAIN * (wanted.position - hand.position), float(self._high[0]))
         action = np.concatenate([move, limited(_GAIN * turn, float(self._high[3])), [gripper]])
         return np.clip(action, self._low, self._high)
@@ -52,10 +53,9 @@ class InsertionExpert:
 def _next_peg(peg: Pose, slot: Pose) -> Pose:
     """Where the peg should go now: over the mouth until it is aligned, then into the slot."""
     depth, sideways, askew = misfit(peg, slot)
-    inside = depth > 0.003
-    slack = 3.0 if inside else 1.0  # the slot guides a peg that is in it
-    if sideways < slack * _NEAR and askew < slack * _ALIGNED:
+    off = max(sideways / _NEAR, askew / _ALIGNED)
+    if off < (3.0 if depth > 0.002 else 1.0):  # the slot guides a peg that is in it
         return slot.along(PEG_HALF - _DEPTH)
-    if depth > -HOVER / 2 and sideways > 4 * _NEAR:  # low and beside the mouth: up first, as it lies
-        return Pose(peg.position + np.array([0.0, 0.0, HOVER]), peg.rotation)
-    return slot.along(PEG_HALF + HOVER)
+    if depth > -HOVER / 2 and sideways > 5 * _NEAR:  # low and beside the mouth: up first, as it lies
+        return Pose(peg.position + np.array([0.0, 0.0, HOVER]), peg.quaternion)
+    return slot.along(PEG_HALF + (_LOW if off < 4.0 else HOVER))

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+from kerv_cli.environments.camera import load_mujoco
+
+load_mujoco()  # before mujoco is imported, which chooses its GL backend then
+import mujoco  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -16,57 +21,89 @@ PEG_HALF = 0.04
 """Half of the peg's length, metres."""
 
 
+def quaternion_of(vector: Array) -> Array:
+    """Rotation vector (3,), radians -> quaternion (w, x, y, z)."""
+    angle = float(np.linalg.norm(vector))
+    found = np.array([1.0, 0.0, 0.0, 0.0])
+    if angle > 0.0:
+        mujoco.mju_axisAngle2Quat(found, np.asarray(vector) / angle, angle)
+    return found
+
+
+def vector_of(quaternion: Array) -> Array:
+    """Quaternion (w, x, y, z) -> rotation vector (3,), radians, no longer than pi."""
+    found = np.zeros(3)
+    mujoco.mju_quat2Vel(found, quaternion, 1.0)
+    return found
+
+
+def product(first: Array, second: Array) -> Array:
+    """The rotation `second`, then `first`; quaternions."""
+    found = np.zeros(4)
+    mujoco.mju_mulQuat(found, first, second)
+    return found
+
+
+def inverse(quaternion: Array) -> Array:
+    """The rotation back."""
+    return quaternion * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def rotated(quaternion: Array, vector: Array) -> Array:
+    """The vector (3,), turned."""
+    found = np.zeros(3)
+    mujoco.mju_rotVecQuat(found, vector, quaternion)
+    return found
+
+
 @dataclass(frozen=True)
 class Pose:
-    """position (3,), in the world."""
+    """position (3,) metres and quaternion (w, x, y, z), in the world."""
 
     position: Array
-    rotation: Rotation
+    quaternion: Array
 
     @classmethod
     def of(cls, position: Array, vector: Array) -> Pose:
-        """From a rotation vector, radians."""
-        return cls(np.asarray(position, dtype=np.float64), Rotation.from_rotvec(vector))
+        """From a position and a rotation vector, radians."""
+        return cls(np.asarray(position, dtype=np.float64), quaternion_of(vector))
 
-    @classmethod
-    def from_mujoco(cls, joint: Array) -> Pose:
-        """From a free joint's seven numbers: position and quaternion (w, x, y, z)."""
-        return cls(joint[:3].copy(), Rotation.from_quat(joint[3:], scalar_first=True))
-
-    def to_mujoco(self) -> Array:
-        """(7,) as `from_mujoco`."""
-        return np.concatenate([self.position, self.rotation.as_quat(scalar_first=True)])
-
-    @property
+    @cached_property
     def vector(self) -> Array:
         """The rotation vector, radians."""
-        return np.asarray(self.rotation.as_rotvec())
+        return vector_of(self.quaternion)
 
     @property
-    def axis(self) -> Array:
-        """(3,) where its own z points."""
-        return np.asarray(self.rotation.apply([0.0, 0.0, 1.0]))
+    def angle(self) -> float:
+        """How far it is turned, radians."""
+        return float(np.linalg.norm(self.vector))
 
     def along(self, distance: float) -> Pose:
-        """The pose moved along its own axis."""
-        return Pose(self.position + distance * self.axis, self.rotation)
+        """The pose moved along its own z axis, metres."""
+        return Pose(self.position + rotated(self.quaternion, np.array([0.0, 0.0, distance])), self.quaternion)
 
     def seen_from(self, other: Pose) -> Pose:
         """This pose in the other's coordinates."""
-        inverse = other.rotation.inv()
-        return Pose(np.asarray(inverse.apply(self.position - other.position)), inverse * self.rotation)
+        back = inverse(other.quaternion)
+        return Pose(rotated(back, self.position - other.position), product(back, self.quaternion))
 
     def within(self, other: Pose) -> Pose:
-        """The inverse of `seen_from`: coordinates in `other` -> the world's."""
-        return Pose(other.position + other.rotation.apply(self.position), other.rotation * self.rotation)
+        """The inverse of `seen_from`: from the other's coordinates to the world's."""
+        position = other.position + rotated(other.quaternion, self.position)
+        return Pose(position, product(other.quaternion, self.quaternion))
+
+
+def turn_between(start: Pose, end: Pose) -> Array:
+    """The rotation vector in the world's axes that turns `start` like `end`, radians."""
+    return vector_of(product(end.quaternion, inverse(start.quaternion)))
 
 
 def misfit(peg: Pose, slot: Pose) -> tuple[float, float, float]:
     """How a peg lies in a slot: depth of its tip below the mouth and distance of its centre from the slot's axis, in
     metres; angle between the two, radians."""
-    tip = peg.along(-PEG_HALF).seen_from(slot)
     centre = peg.seen_from(slot)
-    return -float(tip.position[2]), float(np.hypot(*centre.position[:2])), float(tip.rotation.magnitude())
+    depth = -float(centre.along(-PEG_HALF).position[2])
+    return depth, float(np.hypot(*centre.position[:2])), centre.angle
 
 
 def limited(vector: Array, most: float) -> Array:

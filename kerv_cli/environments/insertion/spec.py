@@ -18,11 +18,11 @@ SPEC = EnvironmentSpec(
         groups=(Group("position", 3), Group("rotation", 3), Group("gripper", 1)),
         strict=("gripper",),
         control_hz=20.0,
-        low=(-0.02, -0.02, -0.02, -0.15, -0.15, -0.15, 0.0),
-        high=(0.02, 0.02, 0.02, 0.15, 0.15, 0.15, 1.0),
+        low=(-0.01, -0.01, -0.01, -0.06, -0.06, -0.06, 0.0),
+        high=(0.01, 0.01, 0.01, 0.06, 0.06, 0.06, 1.0),
     ),
     observation=ObservationSpace(
-        # hand [0:7]; peg [7:10], slot's mouth [10:13], m; rotation vectors of slot [13:16] and peg [16:19], rad
+        # hand [0:7]; peg [7:10] and mouth of the slot [10:13], m; rotation vectors of slot [13:16] and peg [16:19], rad
         proprioception=("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
         state=19,
         places=(Place("peg", 7), Place("slot", 10)),

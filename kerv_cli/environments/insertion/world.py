@@ -11,10 +11,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from kerv_cli.environments.camera import CameraConfig, load_mujoco
-from kerv_cli.environments.insertion.pose import GRASP, PEG_HALF, Pose, limited, misfit
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.insertion.pose import (
+    GRASP,
+    PEG_HALF,
+    Pose,
+    limited,
+    misfit,
+    mujoco,
+    product,
+    quaternion_of,
+    turn_between,
+)
 from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.environments.world import MujocoWorld
 
@@ -48,17 +57,14 @@ class InsertionWorld(MujocoWorld):
         return self._placement.copy()
 
     def _start(self, seed: int) -> NDArray[np.float64]:
-        load_mujoco()
-        import mujoco
-
         if self._model is None:
             self._model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("model.xml")))
             self._data = mujoco.MjData(self._model)
         mujoco.mj_resetData(self._model, self._data)
         slot, peg, hand = place(self.task, np.random.default_rng([seed, *self.task.encode()]))
         self._placement = np.concatenate([slot.position, slot.vector, peg.position, peg.vector, hand.position])
-        self._data.mocap_pos[0], self._data.mocap_quat[0] = slot.to_mujoco()[:3], slot.to_mujoco()[3:]
-        self._data.qpos[:7], self._data.qpos[7:14] = hand.to_mujoco(), peg.to_mujoco()
+        self._data.mocap_pos[0], self._data.mocap_quat[0] = slot.position, slot.quaternion
+        self._data.qpos[:] = np.concatenate([hand.position, hand.quaternion, peg.position, peg.quaternion])
         self._wanted, held = hand, self.task == "insert-peg"
         self._opening = 0.0 if held else 1.0
         self._data.eq_active[0] = False
@@ -71,20 +77,20 @@ class InsertionWorld(MujocoWorld):
         """Fixes the peg to the hand as it lies now."""
         relative = self._peg.seen_from(self._hand)
         self._model.eq_data[0, :3] = 0.0  # the weld's point, in the peg
-        self._model.eq_data[0, 3:10] = relative.to_mujoco()
+        self._model.eq_data[0, 3:10] = np.concatenate([relative.position, relative.quaternion])
         self._data.eq_active[0] = True
 
     @property
     def _hand(self) -> Pose:
-        return Pose.from_mujoco(self._data.qpos[:7])
+        return Pose(self._data.qpos[:3].copy(), self._data.qpos[3:7].copy())
 
     @property
     def _peg(self) -> Pose:
-        return Pose.from_mujoco(self._data.qpos[7:14])
+        return Pose(self._data.qpos[7:10].copy(), self._data.qpos[10:].copy())
 
     @property
     def _slot(self) -> Pose:
-        return Pose.from_mujoco(np.concatenate([self._data.mocap_pos[0], self._data.mocap_quat[0]]))
+        return Pose(self._data.mocap_pos[0].copy(), self._data.mocap_quat[0].copy())
 
     def _state(self) -> NDArray[np.float64]:
         """(19,) as the spec says."""
@@ -93,8 +99,6 @@ class InsertionWorld(MujocoWorld):
         return np.concatenate([*felt, peg.position, slot.position, slot.vector, peg.vector])
 
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-        import mujoco
-
         hand = self._hand
         self._wanted = self._ahead(hand, action)
         self._data.ctrl[:] = np.concatenate([self._wanted.position, self._wanted.vector])
@@ -107,9 +111,9 @@ class InsertionWorld(MujocoWorld):
     def _ahead(self, hand: Pose, action: NDArray[np.float64]) -> Pose:
         """The wanted pose after one more action."""
         position = hand.position + limited(self._wanted.position + action[:3] - hand.position, LEAD)
-        turned = Rotation.from_rotvec(action[3:6]) * self._wanted.rotation * hand.rotation.inv()
-        rotation = Rotation.from_rotvec(limited(turned.as_rotvec(), TURN_LEAD)) * hand.rotation
-        return Pose(np.clip(position, *_WORKSPACE), rotation)
+        wanted = Pose(position, product(quaternion_of(action[3:6]), self._wanted.quaternion))
+        turn = quaternion_of(limited(turn_between(hand, wanted), TURN_LEAD))
+        return Pose(np.clip(position, *_WORKSPACE), product(turn, hand.quaternion))
 
     def _grip(self, wanted: float, hand: Pose) -> None:
         """Opens or closes the fingers; closing around the peg holds it, opening lets it go."""
@@ -119,14 +123,12 @@ class InsertionWorld(MujocoWorld):
             self._data.eq_active[0] = False
         elif before >= _HOLDS:
             off = hand.seen_from(self._peg.along(GRASP))
-            if np.linalg.norm(off.position) <= _REACH and off.rotation.magnitude() <= _REACH_ANGLE:
+            if np.linalg.norm(off.position) <= _REACH and off.angle <= _REACH_ANGLE:
                 self._hold()
 
     def _drawable(self) -> tuple[Any, Any]:
         # A step leaves poses as they were before its last substep. The next step computes them anew: drawing changes
         # nothing of the physics.
-        import mujoco
-
         for name, side in (("left", 1.0), ("right", -1.0)):
             self._model.geom(name).pos[0] = side * (_FINGER[0] + _FINGER[1] * self._opening)
         mujoco.mj_kinematics(self._model, self._data)
@@ -142,8 +144,9 @@ def place(task: str, random: np.random.Generator) -> tuple[Pose, Pose, Pose]:
     """Slot, peg and hand at the start of an episode. The slot is always turned too far for a peg that is not."""
     yaw = random.choice([-1.0, 1.0]) * random.uniform(0.35, 1.0)
     if task == "insert-peg":
-        tilt = Rotation.from_rotvec([*random.uniform(-0.2, 0.2, 2), 0.0])
-        slot = Pose(np.array([*random.uniform(-0.09, 0.09, 2), 0.08]), tilt * Rotation.from_rotvec([0.0, 0.0, yaw]))
+        tilt = quaternion_of(np.array([*random.uniform(-0.2, 0.2, 2), 0.0]))
+        turn = quaternion_of(np.array([0.0, 0.0, yaw]))
+        slot = Pose(np.array([*random.uniform(-0.09, 0.09, 2), 0.08]), product(tilt, turn))
         hand = Pose.of(np.array([*random.uniform(-0.06, 0.06, 2), random.uniform(0.24, 0.28)]), np.zeros(3))
         return slot, hand.along(-GRASP), hand
     slot = Pose.of(np.array([random.uniform(0.05, 0.11), random.uniform(-0.08, 0.08), 0.07]), np.array([0.0, 0.0, yaw]))
