@@ -185,7 +185,7 @@ class Calibration:
 
 
 def calibration_place(results: str, name: str | None, target: Path) -> Path:
-    """The file of the named calibration, else of the one beside the target. Shipped: in pretrained/<name>; made here: in
+    """The file of the named calibration, else of the one beside the target: shipped in pretrained/<name>, made here in
     artifacts/calibration/<name>."""
     if name is not None:
         return artifact(results, "calibration", name) / FILE

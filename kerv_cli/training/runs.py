@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import nn
 
+from kerv_cli.artifacts import artifact_folder
 from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
 from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.artifacts import artifact_folder
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
