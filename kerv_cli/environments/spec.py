@@ -150,8 +150,9 @@ class EnvironmentSpec:
     begins with the proprioception. tasks: by full name. suites: name in capitals -> full task names. difficulties:
     groups of tasks, in the order of tables. horizon: control steps of an episode, the most that the simulator runs.
     cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
-    with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras whose images come out rotated by
-    180 degrees. suffix: of all full task names, which may be left out. packages: whose versions decide the physics.
+    with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras
+    whose images come out rotated by 180 degrees. suffix: of all full task names, which may be left out. packages:
+    whose versions decide the physics.
     """
 
     name: str
