@@ -18,6 +18,7 @@ from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, v
 
 from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
 from kerv_cli.errors import KervError, StorageError, UsageError
+from kerv_cli.registry import parts
 from kerv_cli.viewing import rerun_log, viewer
 from kerv_cli.viewing.rerun_log import readable, save_episode
 from kerv_cli.viewing.token_outcomes import chunk_size, outcomes_of
@@ -229,6 +230,12 @@ def test_token_lanes_and_modes(tmp_path: Path) -> None:
     for decode, step in zip(record.decodes, record.decode_steps, strict=True):
         shown = changes.get(step, shown)
         assert shown == decode.mode
+
+
+def test_a_modes_colour_is_its_proposers() -> None:
+    assert rerun_log._mode_color("drafter", 0) == parts("proposer")["drafter"].colour * 256 + 255
+    assert rerun_log._mode_color("expert", 0) != rerun_log._mode_color("ar", 0)
+    assert rerun_log._mode_color("mine", 0) != rerun_log._mode_color("mine too", 1)
 
 
 def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:
