@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.decoding.acceptance import accept_by_distance
-from kerv_cli.drafting.tree import ROOT, TokenTree, merge, verify_mask
-from kerv_cli.targets.compact.trunk import Cache, Trunk
+from kerv_cli.drafting.tree import ROOT, TokenTree, merge
+from kerv_cli.targets.compact.trunk import Cache, Trunk, attention_mask
 
 
 @st.composite
@@ -39,20 +39,42 @@ def test_ancestors_are_the_transitive_closure_of_parents(tree: TokenTree) -> Non
     assert tree.depths == tuple(int(row.sum()) - 1 for row in tree.ancestors())
 
 
-@given(trees(), st.integers(0, 9))
-def test_the_mask_shows_the_cache_the_root_and_the_ancestors(tree: TokenTree, cached: int) -> None:
-    mask = verify_mask(tree, cached, torch.zeros(()))
-    if len(tree) == 0:
-        assert mask is None
-        return
-    assert mask is not None
+@given(trees(), st.integers(0, 9), st.integers(1, 6), st.booleans())
+def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
+    tree: TokenTree, cached: int, before: int, fixed: bool
+) -> None:
+    like = torch.zeros(())
+    cache = Cache(1, 1, 1, 40, 1, like, fixed)
+    cache.length = cached
     n = len(tree)
-    assert mask.shape == (1 + n, cached + 1 + n)
+    mask = attention_mask(tree.seen(before), before + n, cache, like)
+    if mask is None:
+        assert before + n == 1
+        assert not fixed
+        return
+    stop = cached + before + n
+    assert mask.shape == (before + n, 40 if fixed else stop)
     seen = mask.numpy() == 0
-    assert seen[:, : cached + 1].all()
-    assert not seen[0, cached + 1 :].any()
-    assert (seen[1:, cached + 1 :] == reachable(tree)).all()
     assert np.isneginf(mask.numpy()[~seen]).all()
+    assert seen[:, :cached].all()
+    assert not seen[:, stop:].any()
+    assert (seen[:before, cached : cached + before] == np.tri(before, dtype=bool)).all()
+    assert not seen[:before, cached + before :].any()
+    assert seen[before:, cached : cached + before].all()
+    assert (seen[before:, cached + before : stop] == reachable(tree)).all()
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_without_a_statement_new_tokens_are_causal(fixed: bool) -> None:
+    like = torch.zeros(())
+    cache = Cache(1, 1, 1, 8, 1, like, fixed)
+    cache.length = 2
+    mask = attention_mask(None, 3, cache, like)
+    assert mask is not None
+    assert (mask.numpy()[:, :5] == 0).tolist() == np.tri(3, 5, 2, dtype=bool).tolist()
+    assert (attention_mask(None, 1, cache, like) is None) == (not fixed)
+    cache.length = 0
+    assert (attention_mask(None, 3, cache, like) is None) == (not fixed)
 
 
 def test_a_child_before_its_parent_is_refused() -> None:
@@ -66,13 +88,6 @@ def test_a_merged_tree_holds_exactly_the_prefixes(chains: list[list[int]]) -> No
     prefixes = {tuple(c[: k + 1]) for c in chains for k in range(len(c))}
     paths = [tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))]
     assert sorted(paths) == sorted(prefixes)
-
-
-@given(trees(), st.integers(0, 5))
-def test_truncation_keeps_the_nodes_above_the_depth(tree: TokenTree, depth: int) -> None:
-    short = tree.truncate(depth)
-    paths = sorted(tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree)) if tree.depths[n] < depth)
-    assert sorted(tuple(short.tokens[i] for i in short.path_to(n)) for n in range(len(short))) == paths
 
 
 def slow_acceptance(tree: TokenTree, target_tokens: list[int], start: int, limits: list[int]) -> tuple[int, int]:
@@ -105,7 +120,7 @@ def test_commit_leaves_the_path_behind_the_prefix(start: int, path: list[int]) -
     cache = Cache(2, 1, 2, 16, 3, torch.zeros(()))
     cache.buffer.copy_(torch.arange(16.0).view(1, 1, 1, 1, 16, 1).expand_as(cache.buffer).clone())
     cache.length = start + 6
-    cache.keep(start, torch.tensor(path) + start)
+    cache.compact(start, torch.tensor(path) + start)
     assert cache.length == start + len(path)
     expected = [*range(start), *(start + p for p in path)]
     assert (cache.layers[1][1][0, 1, : cache.length, 0] == torch.tensor(expected, dtype=torch.float32)).all()
@@ -122,7 +137,7 @@ def test_tree_forward_equals_forwarding_every_path_alone() -> None:
         cache = trunk.new_cache(1, 16)
         trunk(prefix, torch.arange(5), cache)
         positions = torch.tensor([5, *(6 + d for d in tree.depths)])
-        together = trunk(torch.cat([root, nodes], 1), positions, cache, verify_mask(tree, 5, prefix))
+        together = trunk(torch.cat([root, nodes], 1), positions, cache, tree.seen(1))
         for node in range(4):
             alone = torch.cat([prefix, root, nodes[:, tree.path_to(node)]], 1)
             expected = trunk(alone, torch.arange(alone.shape[1]))[0, -1]

@@ -162,7 +162,8 @@ class Loop:
 def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
     """Tensors and progress in one file, so that no kill can leave them of different steps."""
     text = json.dumps(asdict(progress), allow_nan=False)
-    save_tensors(path, tensors, {"progress": text, "sha256": digest(tensors, text)})
+    # one key, because safetensors writes several in any order: equal states are equal bytes
+    save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
 
 
 def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
@@ -174,12 +175,10 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
     again = f"delete {path.parent} to begin again"
     try:
         with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-        tensors = load_tensors(path, "training state")
-        text = metadata["progress"]
-        intact = metadata["sha256"] == digest(tensors, text)
-        value = json.loads(text)
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+            state = json.loads((file.metadata() or {})["state"])
+        tensors, text = load_tensors(path, "training state"), state["progress"]
+        intact, value = state["sha256"] == digest(tensors, text), json.loads(text)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"training state at {path} is damaged ({error}): {again}") from error
     if not intact:
         raise CheckpointError(f"training state at {path} is damaged, its hash does not fit: {again}")
