@@ -122,14 +122,18 @@ class Loop:
 
     def store(self) -> None:
         """Write the resume file, then the log."""
-        import pandas as pd
-
         tensors = {f"model.{k}": v for k, v in self.job.module.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
         progress = Progress(self.identity, self.step, self.best, self.history)
         write_state(self.folder / "resume.safetensors", tensors, progress)
+        self.log()
+
+    def log(self) -> None:
+        """Write `log.csv`, a row per validation."""
+        import pandas as pd
+
         with atomic_path(self.folder / "log.csv") as temporary:
             pd.DataFrame(self.history).to_csv(temporary, index=False, float_format="%.6g")
 
@@ -157,6 +161,7 @@ class Loop:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.best, self.history = progress.step, progress.best, progress.history
+        self.log()  # the run may have been cut before it could
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
