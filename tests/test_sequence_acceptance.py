@@ -15,9 +15,9 @@ from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree
+from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
 from kerv_cli.settings import AcceptanceSettings, MethodSettings, ProposerSettings, TargetSettings
-from kerv_cli.spaces import ActionTokenizer
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 
 POSITION_GRIPPER = kinematic_groups(4)
@@ -178,10 +178,10 @@ class Shifted:
 def test_in_the_loop_paths_end_with_groups_and_a_begun_group_has_one_verdict() -> None:
     torch.manual_seed(0)
     shape = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
-    target = Target(shape, ActionTokenizer(-np.ones(4), np.ones(4)), WordTokenizer.build(["open"])).eval()
+    target = CompactTarget(shape, ACTIONS, OBSERVATION, WordTokenizer.build(["open"])).eval()
     accepted = 0
     for seed in range(20):
-        prompt = torch.randn(1, target.prompt_length, 32, generator=torch.Generator().manual_seed(seed))
+        prompt = torch.randn(1, target.max_prompt, 32, generator=torch.Generator().manual_seed(seed))
         truth = Decoder(target, MethodSettings()).decode_prompt(prompt).tokens
         loose = MethodSettings("x", ProposerSettings("shifted", nodes=16), AcceptanceSettings("sequence"))
         chunk = Decoder(target, loose, Parts(proposer=Shifted(truth, seed))).decode_prompt(prompt)
