@@ -23,7 +23,7 @@ def opening_sources(sources: Iterable[str]) -> list[str]:
 
 @dataclass
 class CameraSettings:
-    name: str = "corner4"
+    name: str = ""  # empty: the environment's first camera
     fovy: float = 45.0
     size: int = 96  # pixels, square
     supersample: int = 2
@@ -32,7 +32,7 @@ class CameraSettings:
 @dataclass
 class WorldSettings:
     camera: CameraSettings = field(default_factory=CameraSettings)
-    horizon: int = 500  # control steps
+    horizon: int = 0  # control steps; 0: the environment's
 
 
 @dataclass
@@ -274,7 +274,7 @@ class TrainTargetSettings:
 class DemosSettings:
     """`kerv demos`."""
 
-    name: str = "mt10"
+    name: str | None = None  # default: the tasks' names, in small letters
     task: list[str] = field(default_factory=lambda: ["MT10"])
     episodes: int = 100  # per task
     seed: int = 0

@@ -16,7 +16,7 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
 
     from kerv_cli.config import compose
     from kerv_cli.drafting.eagle import Drafter, save_drafter
-    from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+    from kerv_cli.environments.metaworld.spec import SPEC
     from kerv_cli.settings import DrafterSettings, TrainTargetSettings
     from kerv_cli.targets.checkpoint import save_target
     from kerv_cli.targets.compact.target import CompactTarget
@@ -25,7 +25,7 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     torch.manual_seed(seed)
     settings = compose("train_target", ["target=nano", f"target.observation={observation}"], TrainTargetSettings)
     camera = settings.world.camera.name
-    target = CompactTarget(settings.target, ACTIONS, OBSERVATION, vocabulary(), camera)
+    target = CompactTarget(settings.target, SPEC.actions, SPEC.observation, vocabulary(SPEC.name), camera)
     provenance = {"parameters": sum(p.numel() for p in target.parameters())}
     digest = save_target(results / "artifacts" / "target" / name, target, "metaworld", provenance)
     drafter = Drafter.beside(DrafterSettings(), target)

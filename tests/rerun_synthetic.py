@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord, Round
+from kerv_cli.environments.metaworld.spec import SPEC
 
 DOFS = 4
 
@@ -112,6 +113,8 @@ def episode(kind: str, horizon: int = 60, chunk: int = 4, frames: int = 0, seed:
         for i in range(step + 1):
             pictures[i] = np.concatenate([base, np.full((frames, frames, 1), i % 256, np.uint8)], axis=2)
     return EpisodeRecord(
+        environment=SPEC.name,
+        space=SPEC.actions,
         task="drawer-open-v3",
         instruction="open the drawer",
         seed=7,
@@ -122,7 +125,7 @@ def episode(kind: str, horizon: int = 60, chunk: int = 4, frames: int = 0, seed:
         actions=np.stack(actions).astype(np.float32),
         path=path.astype(np.float32),
         gripper=(0.5 + 0.5 * np.cos(angle)).astype(np.float32),
-        rand_vec=np.zeros(6),
+        initial_state=np.zeros(6),
         frames=pictures,
         wall_seconds=1.5,
     )

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import RolloutSettings, StudySettings
 from kerv_cli.studies.plan import Cell, plan
 
@@ -31,6 +32,8 @@ def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeR
     """An episode of one control step per decode in which nothing moves: for what is measured of its decodes."""
     steps = len(decodes)
     return EpisodeRecord(
+        environment=SPEC.name,
+        space=SPEC.actions,
         task=task,
         instruction="",
         seed=seed,
@@ -41,7 +44,7 @@ def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeR
         actions=np.zeros((steps, 4), np.float32),
         path=np.zeros((steps + 1, 3), np.float32),
         gripper=np.zeros(steps + 1, np.float32),
-        rand_vec=np.array([float(seed)]),
+        initial_state=np.array([float(seed)]),
         wall_seconds=1.0,
     )
 
@@ -69,13 +72,15 @@ def run_cell(cell: Cell) -> list[EpisodeRecord]:
 
 def episode(cell: Cell, seed: int) -> EpisodeRecord:
     world = generator(cell.task, seed)
-    rand_vec, difficulty = world.uniform(size=3), world.uniform()
+    initial_state, difficulty = world.uniform(size=3), world.uniform()
     rng = generator(cell.task, seed, cell.label)
     r = cell.settings["threshold"]["r"]
     slow = cell.settings["method"] == "ar"
     decodes = tuple(ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25)))
     steps = 4 * len(decodes)
     return EpisodeRecord(
+        environment=SPEC.name,
+        space=SPEC.actions,
         task=cell.task,
         instruction="reach the goal",
         seed=seed,
@@ -86,7 +91,7 @@ def episode(cell: Cell, seed: int) -> EpisodeRecord:
         actions=np.zeros((steps, 4), np.float32),
         path=np.zeros((steps + 1, 3), np.float32),
         gripper=np.zeros(steps + 1, np.float32),
-        rand_vec=rand_vec,
+        initial_state=initial_state,
         wall_seconds=2.0 * sum(d.seconds for d in decodes),
     )
 

@@ -26,7 +26,7 @@ from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.places import find_target
 from kerv_cli.settings import CalibrateSettings, ThresholdSettings
-from kerv_cli.spaces import CENTRES, ActionTokenizer
+from kerv_cli.spaces import CENTRES, ActionTokenizer, Observation
 from kerv_cli.targets.checkpoint import read_target
 from kerv_cli.training.calibration import CalibrationRun, kinematic_variability, reference_level
 from kerv_cli.training.predictor_fit import (
@@ -62,7 +62,7 @@ def made_up_episode(task: str, seed: int, tail: int = 8) -> DemoEpisode:
         states=np.random.default_rng(seed).normal(0, 0.1, (STEPS, 39)).astype(np.float32),
         labels=labels.astype(np.float32),
         executed=np.clip(executed, -1, 1).astype(np.float32),
-        rand_vec=np.zeros(3),
+        initial_state=np.zeros(3),
     )
 
 
@@ -224,7 +224,7 @@ def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
     decoder, _ = run.decoder()
     episode = run.dataset.load(0)
     decoder.reset(episode.task, "reach")
-    record = decoder.decode(None, episode.states[0])
+    record = decoder.decode(Observation(episode.states[0][:4], episode.states[0], "reach"))
     pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.target_tokens, strict=False)]
     drafted, target_tokens = np.array(pairs).T
     assert record.variability == pytest.approx(float(kinematic_variability(drafted, target_tokens)))

@@ -18,7 +18,7 @@ from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.files import sha256_of
 from kerv_cli.settings import (
     AcceptanceSettings,
@@ -34,6 +34,8 @@ from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.protocol import Target
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 STRICT = AcceptanceSettings(kind="strict")
 

@@ -29,7 +29,7 @@ from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.places import early_folder
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
@@ -46,6 +46,8 @@ from kerv_cli.training.early_distillation import (
 )
 from kerv_cli.training.imitation import load_samples, split
 from kerv_cli.training.runs import EarlyRun, drafter_run
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 SMALL = DrafterSettings(kind="early", layers=2, width=32, rank=8, history=2, samples=1000)
 SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10

@@ -9,7 +9,8 @@ import pytest
 
 from kerv_cli.config import compose
 from kerv_cli.decoding.record import PHASES, EpisodeRecord
-from kerv_cli.environments.metaworld.world import World
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.environments.metaworld.world import MetaWorld
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.rollouts import policy as policies_of
 from kerv_cli.rollouts import run
@@ -51,9 +52,10 @@ def test_the_record_of_an_episode_adds_up(policies: Path) -> None:
         assert sum(r.committed for r in decode.rounds) == len(decode.tokens) == 16
         assert decode.variability is not None
         assert decode.variability > 0
-    first = World("drawer-open-v3")
+    assert (record.environment, record.space) == ("metaworld", SPEC.actions)
+    first = SPEC.open_world("drawer-open-v3")
     first.reset(EVALUATION_SEED)
-    assert (record.rand_vec == first.rand_vec).all()
+    assert (record.initial_state == first.initial_state).all()
     first.close()
 
 
@@ -63,10 +65,10 @@ def compose_with(chosen: RolloutSettings, target: str) -> RolloutSettings:
 
 
 def test_a_state_policy_never_draws(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def drawn(self: World, camera: object = None) -> np.ndarray:
+    def drawn(self: MetaWorld, camera: object = None) -> np.ndarray:
         raise AssertionError("a frame was drawn that nobody reads")
 
-    monkeypatch.setattr(World, "frame", drawn)
+    monkeypatch.setattr(MetaWorld, "frame", drawn)
     assert len(episodes(settings(policies, "policy.target=nano-state"), 1)) == 1
     with pytest.raises(AssertionError, match="nobody reads"):
         episodes(settings(policies, "policy.target=nano-vision"), 1)

@@ -13,13 +13,15 @@ from hypothesis import strategies as st
 
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import DrafterSettings, TargetSettings
 from kerv_cli.spaces import Observation, ObservationSpace, Place
 from kerv_cli.targets.compact.packed import FastLinear, has_blocked_layouts, pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 ALONE = ObservationSpace(("x", "y", "z"), 3, (Place("hole", 0),), (0.1, 0.2, 0.3))  # the least there can be
 THREE = ObservationSpace(

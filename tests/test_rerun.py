@@ -20,12 +20,12 @@ from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
 from kerv_cli.errors import KervError, StorageError, UsageError
 from kerv_cli.viewing import rerun_log, viewer
 from kerv_cli.viewing.rerun_log import readable, save_episode
-from kerv_cli.viewing.token_outcomes import chunk_size, fates_of
+from kerv_cli.viewing.token_outcomes import chunk_size, outcomes_of
 from kerv_cli.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
 
 
 def saved(record: EpisodeRecord, folder: Path, method: str = "spec_vla") -> Path:
-    return save_episode(record, folder / "episode.rrd", method=method, tokens_per_step=DOFS)
+    return save_episode(record, folder / "episode.rrd", method=method)
 
 
 def batches(path: Path, entity: str) -> list[Any]:
@@ -127,7 +127,7 @@ def test_a_failure_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []
 
-    def broken(record: EpisodeRecord, method: str, fps: float) -> str:
+    def broken(record: EpisodeRecord, method: str) -> str:
         raise RuntimeError("mistake")
 
     monkeypatch.setattr(rerun_log, "summary", broken)
@@ -157,34 +157,34 @@ def test_finding_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "drawer-open-v3" in read_summary(path)
 
 
-def test_every_place_of_a_chunk_has_its_fate() -> None:
+def test_every_place_of_a_chunk_has_its_outcome() -> None:
     target_tokens = (60, 70, 80, 90, 100, 110, 120)
     rounds = (prefill(50), verify(1, (60, 73, 99), target_tokens[:3], 2), verify(4, (90, 101), target_tokens[3:6], 2))
     decode = decode_of((50, 60, 73, 80, 90, 101, 110, 128), rounds, 2, compensated=1)
-    fates = fates_of(decode, 12, DOFS)
+    outcomes = outcomes_of(decode, 12, DOFS)
     names = ["target", "accepted", "relaxed", "rejected", "accepted", "relaxed", "bonus", "compensated"]
-    assert [f.fate for f in fates] == [*names, *["dropped"] * 4]
-    assert [f.short for f in fates[:4]] == ["50", "60", "73 → 70", "99 → 80"]
-    assert fates[3].token == 80
-    assert [f.round for f in fates[:8]] == [0, 1, 1, 1, 2, 2, 2, None]
-    assert [f.limit for f in fates[1:6]] == [9, 9, 0, 9, 9]
+    assert [f.kind for f in outcomes] == [*names, *["dropped"] * 4]
+    assert [f.short for f in outcomes[:4]] == ["50", "60", "73 → 70", "99 → 80"]
+    assert outcomes[3].token == 80
+    assert [f.round for f in outcomes[:8]] == [0, 1, 1, 1, 2, 2, 2, None]
+    assert [f.limit for f in outcomes[1:6]] == [9, 9, 0, 9, 9]
 
 
 def test_a_rejection_stays_visible_whoever_fills_the_place() -> None:
     refused = Round("verify", "drafter", 1, (60, 99), (60, 70), 1, 1, 20, (9,))
     filled = decode_of((50, 60, 128, 128), (prefill(50), refused), 1, compensated=2)
-    assert [f.fate for f in fates_of(filled, 8, DOFS)[:4]] == ["target", "accepted", "rejected", "compensated"]
+    assert [f.kind for f in outcomes_of(filled, 8, DOFS)[:4]] == ["target", "accepted", "rejected", "compensated"]
     # the papers' preset takes the verdict back: the place is predicted too, and the tokens end before it
     taken_back = decode_of((50, 60), (prefill(50), refused), 1, compensated=2, size=8)
-    assert [f.fate for f in fates_of(taken_back, 8, DOFS)] == ["target", "accepted", "rejected", "compensated"] + [
+    assert [f.kind for f in outcomes_of(taken_back, 8, DOFS)] == ["target", "accepted", "rejected", "compensated"] + [
         "dropped"
     ] * 4
-    assert [f.token for f in fates_of(taken_back, 4, DOFS)] == [50, 60, None, None]
+    assert [f.token for f in outcomes_of(taken_back, 4, DOFS)] == [50, 60, None, None]
     retried = decode_of((50, 60, 71, 80), (prefill(50), refused, verify(2, (71,), (70, 80), 1)), 1)
-    assert [f.fate for f in fates_of(retried, 4, DOFS)] == ["target", "accepted", "rejected", "bonus"]
+    assert [f.kind for f in outcomes_of(retried, 4, DOFS)] == ["target", "accepted", "rejected", "bonus"]
     # two steps were verified, one was executed: the second is dropped, but the place of the rejection is kept
     cut = decode_of((50, 60, 70, 80, 90), (prefill(50), verify(1, (60, 70, 80, 90, 9), (60, 70, 80, 90, 99), 4)), 1)
-    assert [f.fate for f in fates_of(cut, 8, DOFS)[4:]] == ["dropped", "rejected", "dropped", "dropped"]
+    assert [f.kind for f in outcomes_of(cut, 8, DOFS)[4:]] == ["dropped", "rejected", "dropped", "dropped"]
 
 
 def test_a_chunk_of_which_nothing_was_executed_to_the_end_keeps_its_size(tmp_path: Path) -> None:
@@ -195,10 +195,12 @@ def test_a_chunk_of_which_nothing_was_executed_to_the_end_keeps_its_size(tmp_pat
 
 
 def test_decodes_without_rounds_are_told_apart() -> None:
-    held = decode_of((), (), 1, forwards=0, mode="hold")
-    assert {f.fate for f in fates_of(held, DOFS, DOFS)} == {"skipped"}
+    held = decode_of((9,) * DOFS, (), 1, forwards=0, mode="hold")
+    assert {f.kind for f in outcomes_of(held, DOFS, DOFS)} == {"skipped"}
+    scripted = decode_of((), (), 1, forwards=0, mode="expert")
+    assert {f.kind for f in outcomes_of(scripted, DOFS, DOFS)} == {"scripted"}
     skipped = skipped_decode(np.random.default_rng(0))
-    assert {f.fate for f in fates_of(skipped, 16, DOFS)} == {"skipped"}
+    assert {f.kind for f in outcomes_of(skipped, 16, DOFS)} == {"skipped"}
 
 
 @pytest.mark.parametrize("kind", ["ar", "drafter", "mixed"])
@@ -206,12 +208,12 @@ def test_drawn_tokens_add_up_with_the_records(kind: str) -> None:
     for decode in episode(kind).decodes:
         size = chunk_size([decode], DOFS)
         assert size == 16
-        fates = [f.fate for f in fates_of(decode, size, DOFS)]
+        outcomes = [f.kind for f in outcomes_of(decode, size, DOFS)]
         rounds = [r for r in decode.rounds if r.tree_size and r.mode != "skip"]
-        assert fates.count("accepted") + fates.count("relaxed") == sum(r.accepted for r in rounds)
-        assert fates.count("rejected") == sum(r.accepted < len(r.drafted) for r in rounds)
-        assert fates.count("compensated") == decode.compensated
-        first = fates.index("rejected") if "rejected" in fates else None
+        assert outcomes.count("accepted") + outcomes.count("relaxed") == sum(r.accepted for r in rounds)
+        assert outcomes.count("rejected") == sum(r.accepted < len(r.drafted) for r in rounds)
+        assert outcomes.count("compensated") == decode.compensated
+        first = outcomes.index("rejected") if "rejected" in outcomes else None
         assert first is None or decode.first_rejected in (first, decode.size)
 
 
@@ -220,8 +222,8 @@ def test_token_lanes_and_modes(tmp_path: Path) -> None:
     path = saved(record, tmp_path)
     lanes = [column(path, f"/tokens/step_{i}", "state") for i in range(4)]
     for i, decode in enumerate(record.decodes):
-        drawn = [fate for lane in lanes for fate in lane[i]]
-        assert drawn == [f.fate for f in fates_of(decode, 16, DOFS)]
+        drawn = [kind for lane in lanes for kind in lane[i]]
+        assert drawn == [f.kind for f in outcomes_of(decode, 16, DOFS)]
     changes = dict(zip(starts(path, "/mode"), (row[0] for row in column(path, "/mode", "state")), strict=True))
     shown = None
     for decode, step in zip(record.decodes, record.decode_steps, strict=True):
@@ -321,7 +323,8 @@ def test_frames_are_the_episodes_at_their_steps(tmp_path: Path) -> None:
 
 
 def test_time_is_simulated_time(tmp_path: Path) -> None:
-    path = save_episode(episode("ar", horizon=5), tmp_path / "e.rrd", method="ar", tokens_per_step=DOFS, fps=20.0)
+    record = episode("ar", horizon=5)
+    path = saved(replace(record, space=replace(record.space, control_hz=20.0)), tmp_path)
     seconds = [t.total_seconds() for batch in batches(path, "/actions") for t in batch["time"].to_pylist()]
     assert seconds == pytest.approx([0.0, 0.05, 0.1, 0.15, 0.2])
     assert timelines(path) == {"step", "time"}

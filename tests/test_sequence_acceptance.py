@@ -15,10 +15,12 @@ from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import AcceptanceSettings, MethodSettings, ProposerSettings, TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 POSITION_GRIPPER = kinematic_groups(4)
 LIMITS = (15, 15, 15, 0)

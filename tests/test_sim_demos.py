@@ -1,5 +1,6 @@
 """Recorded demonstrations on real Meta-World: contents, resuming, refusals, damage."""
 
+import hashlib
 import itertools
 import json
 import shutil
@@ -9,14 +10,18 @@ import numpy as np
 import pytest
 
 from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.dataset import DemoDataset, DemoManifest
 from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.environments.demos.recording import DemoConfig, DemoDataset, record
-from kerv_cli.environments.metaworld.world import Expert, World
+from kerv_cli.environments.demos.recording import DemoConfig, record
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.manifests import read_file
 
 CONFIG = DemoConfig(
     tasks=("reach",), episodes=6, frame_stride=10, camera=CameraConfig(size=24, supersample=1), workers=1, tail=5
 )
+
+GOLDEN_NOISE = "da22e466a3c803b9b3d044c2cfe817eb4241429e2422b91622f51c340dc4a442"
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +30,7 @@ def recorded(tmp_path_factory):
     progress = []
     manifest = record(CONFIG, out, lambda done, total: progress.append((done, total)))
     assert progress[-1] == (6, 6)
-    assert manifest == json.loads((out / "manifest.json").read_text())
+    assert manifest == read_file(DemoManifest, out / "manifest.json", "a manifest")
     return out
 
 
@@ -42,18 +47,18 @@ def noise_of(episode):
     if not episode.perturbed:
         return lambda action: action
     noise = (CONFIG.noise_low, CONFIG.noise_high)
-    return Perturbation(episode.task, episode.seed, noise, CONFIG.burst_probability)
+    return Perturbation(episode.task, episode.seed, SPEC.actions, noise, CONFIG.burst_probability)
 
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
     episode = DemoDataset.open(recorded).load(index)
-    expert, perturb, frames = Expert("reach"), noise_of(episode), []
-    with World("reach", CONFIG.camera) as world:
+    expert, perturb, frames = SPEC.expert("reach"), noise_of(episode), []
+    with SPEC.open_world("reach", CONFIG.camera) as world:
         observation = world.reset(episode.seed)
-        assert world.rand_vec.tobytes() == episode.rand_vec.tobytes()
+        assert world.initial_state.tobytes() == episode.initial_state.tobytes()
         for step in range(episode.steps):
-            assert not observation.success
+            assert not world.success
             if step % CONFIG.frame_stride == 0:
                 frames.append(world.frame())
             label = expert(observation)
@@ -62,7 +67,7 @@ def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
             assert label.astype(np.float32).tobytes() == episode.labels[step].tobytes()
             assert action.astype(np.float32).tobytes() == episode.executed[step].tobytes()
             observation = world.step(action)
-        assert observation.success
+        assert world.success
         for label in episode.labels[episode.steps :]:
             assert expert(observation).astype(np.float32).tobytes() == label.tobytes()
             observation = world.step(expert(observation))
@@ -98,12 +103,15 @@ def test_noise_moves_the_hand_and_never_the_gripper(recorded):
 
 def test_the_manifest_tells_what_was_recorded(recorded):
     manifest = DemoDataset.open(recorded).manifest
-    assert manifest["config"]["tasks"] == ["reach-v3"]
-    assert manifest["seeds"] == {"first": 0, "last": 5}
-    assert (manifest["episodes"], manifest["missing"]) == (6, 0)
-    assert set(manifest["versions"]) == {"metaworld", "mujoco", "numpy", "python"}
-    task = manifest["tasks"]["reach-v3"]
-    assert task["mean_steps"] == pytest.approx(np.mean([entry["steps"] for entry in task["episodes"]]), abs=0.01)
+    assert manifest.environment == "metaworld"
+    assert (manifest.actions, manifest.observation) == (SPEC.actions, SPEC.observation)
+    assert manifest.config["tasks"] == ["reach-v3"]
+    assert (manifest.config["camera"]["name"], manifest.config["horizon"]) == ("corner4", 500)
+    assert manifest.seeds == {"first": 0, "last": 5}
+    assert (manifest.episodes, manifest.missing) == (6, 0)
+    assert set(manifest.versions) == {"metaworld", "mujoco", "numpy", "python"}
+    task = manifest.tasks["reach-v3"]
+    assert task.mean_steps == pytest.approx(np.mean([entry.steps for entry in task.episodes]), abs=0.01)
 
 
 def test_a_killed_recording_goes_on(copied):
@@ -115,7 +123,7 @@ def test_a_killed_recording_goes_on(copied):
     (copied / "manifest.json").unlink()
     with pytest.raises(CheckpointError, match="unfinished"):
         DemoDataset.open(copied)
-    assert record(CONFIG, copied, None)["sha256"] == before.sha256
+    assert record(CONFIG, copied, None).sha256 == before.sha256
     again = files_of(copied / "episodes")
     assert {path.name for path in again if again[path] != kept[path]} == {missing.name, damaged.name}
 
@@ -139,12 +147,12 @@ def test_failed_seeds_are_replaced_by_the_next_ones(recorded, tmp_path):
     horizon = sorted(steps.values())[3]
     config = replace(CONFIG, episodes=3, horizon=horizon)
     manifest = record(config, tmp_path / "short")
-    task = manifest["tasks"]["reach-v3"]
-    succeeded = [entry["seed"] for entry in task["episodes"]]
+    task = manifest.tasks["reach-v3"]
+    succeeded = [entry.seed for entry in task.episodes]
     fast = [seed for seed in steps if steps[seed] <= horizon]
     assert succeeded == fast[:3]
-    assert task["failed_seeds"] == [seed for seed in range(succeeded[-1]) if seed not in succeeded]
-    assert task["failed_seeds"], "choose a horizon that some seed misses"
+    assert task.failed_seeds == tuple(seed for seed in range(succeeded[-1]) if seed not in succeeded)
+    assert task.failed_seeds, "choose a horizon that some seed misses"
     tried = files_of(tmp_path / "short" / "failed")
     assert record(config, tmp_path / "short") == manifest
     assert files_of(tmp_path / "short" / "failed") == tried  # a known failure is not run again
@@ -160,8 +168,11 @@ def test_an_expert_that_never_succeeds_ends_the_recording(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"first_seed": 99_998}, "for evaluation"),
-        ({"first_seed": -1}, "first seed"),
+        ({"first_seed": 49_998}, "seed 50003 is for selection"),
+        ({"first_seed": 100_000}, "seed 100000 is for evaluation"),
+        ({"first_seed": -1}, "seed -1"),
+        ({"tasks": ("reach", "insert-peg")}, "cannot be mixed"),
+        ({"camera": CameraConfig("front")}, "unknown camera"),
         ({"tasks": ()}, "at least one task"),
         ({"episodes": 0}, "episodes"),
         ({"perturbed": 1.5}, "perturbed"),
@@ -179,7 +190,7 @@ def test_impossible_settings_are_refused(change, message):
 
 
 def test_no_seed_beyond_the_training_range_is_ever_tried():
-    assert replace(CONFIG, first_seed=99_990).seed_limit == 100_000
+    assert replace(CONFIG, first_seed=49_990).seed_limit == 50_000
     assert CONFIG.seed_limit == 2 * 6 + 20
 
 
@@ -196,15 +207,49 @@ def test_damage_is_found(copied, tmp_path):
     path.write_bytes(data[:-1])
     with pytest.raises(CheckpointError, match="cut short"):
         DemoDataset.open(copied)
-    manifest = dataset.manifest
+    manifest = json.loads((copied / "manifest.json").read_text())
     manifest["tasks"]["reach-v3"]["episodes"].pop()
     (copied / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(CheckpointError, match="hash does not fit"):
+        DemoDataset.open(copied)
+    manifest["tasks"]["reach-v3"]["episodes"][0]["steps"] = "many"
+    (copied / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(CheckpointError, match=r"damaged: tasks\.reach-v3\.episodes\.0\.steps"):
         DemoDataset.open(copied)
     for text in ("{}", "[]", "{", '{"format": 1, "tasks": 3}'):
         (copied / "manifest.json").write_text(text)
         with pytest.raises(CheckpointError, match="manifest"):
             DemoDataset.open(copied)
+
+
+def as_format_1(folder):
+    """Rewrites a dataset's JSON as it was before environments had names."""
+    for name in ("manifest.json", "recording.json"):
+        value = json.loads((folder / name).read_text())
+        for key in ("environment", "actions", "observation"):
+            del value[key]
+        (folder / name).write_text(json.dumps({**value, "format": 1}))
+
+
+def test_a_dataset_of_format_1_is_metaworlds_and_can_be_gone_on_with(copied):
+    before = DemoDataset.open(copied)
+    as_format_1(copied)
+    opened = DemoDataset.open(copied)
+    assert opened.manifest == before.manifest
+    assert opened.load(1).labels.tobytes() == before.load(1).labels.tobytes()
+    (copied / "manifest.json").unlink()
+    opened.episodes[1].path.unlink()
+    assert record(CONFIG, copied).sha256 == before.sha256
+    (copied / "manifest.json").write_text('{"format": 3}')
+    with pytest.raises(CheckpointError, match="has format 3, this kerv reads 2 and 1"):
+        DemoDataset.open(copied)
+
+
+def test_noise_is_what_it_was_in_every_dataset_so_far():
+    """Datasets recorded before must come out bit-equal when they are recorded again."""
+    perturb = Perturbation("reach-v3", 1, SPEC.actions, (0.2, 0.6), 0.02)
+    executed = np.array([perturb(np.array([0.1, -0.2, 0.3, -1.0])) for _ in range(200)])
+    assert hashlib.sha256(executed.tobytes()).hexdigest() == GOLDEN_NOISE
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5, 1.0])
@@ -215,7 +260,7 @@ def test_noisy_episodes_are_spread_evenly(fraction):
 
 
 def test_bursts_last_three_to_eight_steps_in_one_direction():
-    perturb = Perturbation("reach-v3", 7, (0.2, 0.6), burst_probability=0.1)
+    perturb = Perturbation("reach-v3", 7, SPEC.actions, (0.2, 0.6), burst_probability=0.1)
     executed = [perturb(np.array([0.1, 0.2, 0.3, 0.5])) for _ in range(3000)]
     runs = [1]
     for last, now in itertools.pairwise(executed):

@@ -7,14 +7,17 @@ from collections import Counter
 
 import pytest
 
-from kerv_cli.environments.metaworld.tasks import DIFFICULTIES, SUITES, TASKS, resolve_tasks, task
-from kerv_cli.errors import UnknownName
+from kerv_cli.environments import resolve_tasks, spec_of, specs, task_names
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.environments.metaworld.tasks import DIFFICULTIES, SUITES, TASKS
+from kerv_cli.environments.spec import Seeds
+from kerv_cli.errors import UnknownName, UsageError
 
 
 def test_the_names_are_those_of_metaworld():
-    from kerv_cli.environments.metaworld.world import load_simulator
+    from kerv_cli.environments.camera import load_mujoco
 
-    load_simulator()
+    load_mujoco()
     from metaworld.policies import ENV_POLICY_MAP
 
     assert set(TASKS) == set(ENV_POLICY_MAP)
@@ -29,10 +32,10 @@ def test_instructions_are_distinct_and_short():
 
 
 def test_confusable_tasks_are_told_apart():
-    assert "clockwise" in task("faucet-close").instruction.split()
-    assert "counterclockwise" in task("faucet-open").instruction.split()
-    assert "back" in task("push-back").instruction.split()
-    assert "back" not in task("push").instruction.split()
+    assert "clockwise" in SPEC.task("faucet-close").instruction.split()
+    assert "counterclockwise" in SPEC.task("faucet-open").instruction.split()
+    assert "back" in SPEC.task("push-back").instruction.split()
+    assert "back" not in SPEC.task("push").instruction.split()
 
 
 def test_difficulty_groups_have_the_published_sizes():
@@ -43,12 +46,13 @@ def test_difficulty_groups_have_the_published_sizes():
 
 @pytest.mark.parametrize("name", ["drawer-open", "drawer-open-v3"])
 def test_the_version_suffix_is_optional(name):
-    assert task(name) is TASKS["drawer-open-v3"]
+    assert SPEC.task(name) is TASKS["drawer-open-v3"]
+    assert spec_of(name) is SPEC
 
 
 def test_a_misspelled_task_names_its_neighbour():
     with pytest.raises(UnknownName, match="unknown task 'drawer-opn-v3': did you mean drawer-open-v3"):
-        task("drawer-opn-v3")
+        SPEC.task("drawer-opn-v3")
 
 
 def test_suites_expand_in_order_without_duplicates():
@@ -59,9 +63,48 @@ def test_suites_expand_in_order_without_duplicates():
     assert resolve_tasks(["mt50"]) == tuple(TASKS)
     with pytest.raises(UnknownName, match="MT10"):
         resolve_tasks(["MT11"])
+    with pytest.raises(UsageError, match="at least one"):
+        resolve_tasks([])
 
 
-def test_importing_the_table_loads_nothing_heavy():
+def test_names_are_looked_for_in_every_environment():
+    assert list(specs()) == ["metaworld", "insertion"]
+    assert spec_of("fetch-peg") is specs()["insertion"]
+    assert resolve_tasks(["insertion"]) == ("insert-peg", "fetch-peg")
+    with pytest.raises(UnknownName, match="did you mean insert-peg"):
+        resolve_tasks(["inser-peg"])
+    with pytest.raises(UnknownName, match="did you mean drawer-open-v3"):
+        spec_of("drawer-opn-v3")
+    assert {"MT10", "INSERTION", "reach-v3", "insert-peg"} <= set(task_names())
+
+
+def test_tasks_of_two_environments_are_not_mixed():
+    with pytest.raises(UsageError, match=r"tasks of metaworld and insertion cannot be mixed"):
+        resolve_tasks(["reach", "insert-peg"])
+
+
+def test_every_spec_fits_together():
+    for spec in specs().values():
+        assert {task.difficulty for task in spec.tasks.values()} == set(spec.difficulties)
+        assert all(name in spec.tasks for suite in spec.suites.values() for name in suite)
+        assert set(spec.upside_down) <= set(spec.cameras)
+        assert len({task.instruction for task in spec.tasks.values()}) == len(spec.tasks)
+        assert spec.observation.state >= len(spec.observation.proprioception) > 3
+
+
+def test_seeds_of_one_purpose_are_refused_for_another():
+    seeds = SPEC.seeds
+    seeds.check([100_000, 2_000_000], "evaluation", "seed")
+    with pytest.raises(UsageError, match="seed: seed 99999 is for selection; seeds for evaluation are 100000 to"):
+        seeds.check([100_000, 99_999], "evaluation", "seed")
+    with pytest.raises(UsageError, match="seed -1 is none; seeds for training are 0 to 49999"):
+        seeds.check([-1], "training", "demos")
+    with pytest.raises(ValueError, match="overlap"):
+        Seeds(range(10), range(9, 20), range(20, 30))
+
+
+def test_completion_and_tables_load_nothing_heavy():
     heavy = "('numpy', 'mujoco', 'metaworld')"
-    code = f"import sys, kerv_cli.environments.metaworld.tasks; sys.exit(any(m in sys.modules for m in {heavy}))"
+    listed = "import sys; from kerv_cli.environments import task_names; print(len(list(task_names())))"
+    code = f"{listed}; sys.exit(any(m in sys.modules for m in {heavy}))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from kerv_cli.environments import camera as camera_module
-from kerv_cli.environments.camera import CAMERAS, CameraConfig, box_average, choose_backend
-from kerv_cli.environments.metaworld.world import Expert, World
+from kerv_cli.environments.camera import CameraConfig, box_average, choose_backend
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import KervError, RenderingUnavailable, UnknownName, UsageError
 
 # One task for nearly all: a benchmark's 50 placements cost up to a second per seed block. Its poses are stale at reset.
@@ -20,7 +20,7 @@ TASK = "window-close"
 
 def episode(world, seed, steps=25, draw=False):
     """States of the expert's first steps, (steps + 1, 39)."""
-    expert, observation = Expert(TASK), world.reset(seed)
+    expert, observation = SPEC.expert(TASK), world.reset(seed)
     states = [observation.state]
     for _ in range(steps):
         if draw:
@@ -32,7 +32,7 @@ def episode(world, seed, steps=25, draw=False):
 
 @pytest.fixture(scope="module")
 def world():
-    with World(TASK) as world:
+    with SPEC.open_world(TASK) as world:
         yield world
 
 
@@ -40,7 +40,7 @@ def test_a_seed_names_one_episode_to_the_last_bit_drawn_or_not(world):
     first = episode(world, 57, draw=True)
     other = episode(world, 3)
     again = episode(world, 57)
-    with World(TASK) as fresh:
+    with SPEC.open_world(TASK) as fresh:
         untouched = episode(fresh, 57)
     assert first.tobytes() == again.tobytes() == untouched.tobytes()
     assert first.tobytes() != other.tobytes()
@@ -51,19 +51,23 @@ def test_seeds_map_to_benchmark_tasks_in_blocks_of_50(world):
 
     world.reset(57)
     expected = pickle.loads(metaworld.MT1("window-close-v3", seed=1).train_tasks[7].data)["rand_vec"]
-    assert world.rand_vec.tobytes() == np.asarray(expected, dtype=np.float64).tobytes()
-    world.rand_vec[:] = 0  # a copy: the caller cannot move the goal
-    assert world.rand_vec.tobytes() == np.asarray(expected, dtype=np.float64).tobytes()
+    assert world.initial_state.tobytes() == np.asarray(expected, dtype=np.float64).tobytes()
+    world.initial_state[:] = 0  # a copy: the caller cannot move the goal
+    assert world.initial_state.tobytes() == np.asarray(expected, dtype=np.float64).tobytes()
 
 
 def test_reset_and_step_report_what_happened(world):
     start = world.reset(0)
-    assert (start.step, start.success, world.succeeded, world.done) == (0, False, False, False)
+    assert (world.steps, world.success, world.succeeded, world.done) == (0, False, False, False)
     assert start.state.shape == (39,)
     assert start.state.dtype == np.float64
     assert world.instruction == "slide the window closed"
     moved = world.step([0.0, 0.0, 1.0, -1.0])
-    assert moved.step == 1
+    assert world.steps == 1
+    assert moved.instruction == world.instruction
+    assert moved.proprioception.tolist() == moved.state[:4].tolist()
+    assert world.gripper == moved.state[3]
+    assert not moved.images
     assert world.end_effector.tolist() == moved.state[:3].tolist()
     assert moved.state[18:36].tolist() == start.state[:18].tolist()
 
@@ -81,11 +85,11 @@ def test_an_action_that_is_not_four_finite_numbers_is_refused(world, action):
     world.reset(0)
     with pytest.raises(KervError, match="4 finite numbers"):
         world.step(action)
-    assert world.observation.step == 0
+    assert world.steps == 0
 
 
 def test_the_episode_ends_at_the_horizon():
-    with World(TASK, horizon=2) as short:
+    with SPEC.open_world(TASK, horizon=2) as short:
         short.reset(0)
         short.step(np.zeros(4))
         assert not short.done
@@ -98,28 +102,30 @@ def test_the_episode_ends_at_the_horizon():
 
 
 def test_success_at_any_step_counts_and_reset_forgets_it(world):
-    expert, observation = Expert(TASK), world.reset(1)
+    expert, observation = SPEC.expert(TASK), world.reset(1)
     while not world.done:
         action = expert(observation)
         assert action.shape == (4,)
         assert np.abs(action).max() <= 1.0
         observation = world.step(action)
-    assert observation.success
-    assert 30 < observation.step < 200
-    flags = [world.step([-1.0, -1.0, 1.0, -1.0]).success for _ in range(3)]
-    assert world.succeeded, flags
-    assert not world.reset(1).success
+    assert world.success
+    assert 30 < world.steps < 200
+    for _ in range(3):
+        world.step([-1.0, -1.0, 1.0, -1.0])
+    assert world.succeeded
+    world.reset(1)
+    assert not world.success
     assert not world.succeeded
 
 
 def test_wrong_requests_are_told_before_anything_is_built():
     with pytest.raises(UnknownName, match="window-close-v3"):
-        World("window-clos")
-    for horizon in (0, 501):
+        SPEC.open_world("window-clos")
+    for horizon in (-1, 501):
         with pytest.raises(UsageError, match="horizon"):
-            World(TASK, horizon=horizon)
-    unused = World(TASK)
-    for use in (lambda: unused.step(np.zeros(4)), unused.frame, lambda: unused.done, lambda: unused.rand_vec):
+            SPEC.open_world(TASK, horizon=horizon)
+    unused = SPEC.open_world(TASK)
+    for use in (lambda: unused.step(np.zeros(4)), unused.frame, lambda: unused.done, lambda: unused.initial_state):
         with pytest.raises(KervError, match="reset the world"):
             use()
     with pytest.raises(UsageError, match="seed"):
@@ -156,9 +162,22 @@ def test_other_views_get_their_own_camera(world):
     assert world.frame().tobytes() == usual.tobytes()
 
 
+def test_images_are_drawn_only_for_the_cameras_asked_for(world):
+    world.reset(0)
+    seen = world.observe(["corner4", "gripperPOV"])
+    assert list(seen.images) == ["corner4", "gripperPOV"]
+    assert seen.images["corner4"].tobytes() == world.frame().tobytes()
+    assert seen.images["gripperPOV"].shape == (96, 96, 3)
+    assert seen.state.tobytes() == world.observation.state.tobytes()
+    assert not world.observe([]).images
+    with pytest.raises(UnknownName, match="camera"):
+        world.observe(["front"])
+
+
 def test_impossible_views_are_refused():
+    wrong_name = CameraConfig("corner44")
     with pytest.raises(UnknownName, match="corner4"):
-        CameraConfig("corner44")
+        SPEC.open_world(TASK, wrong_name)
     for wrong in ({"fovy": 0.0}, {"fovy": 180.0}, {"size": 0}, {"supersample": 17}):
         with pytest.raises(UsageError, match="camera"):
             CameraConfig(**wrong)
@@ -167,7 +186,7 @@ def test_impossible_views_are_refused():
 def test_every_model_has_the_cameras(world):
     world.reset(0)
     model = world._env.model
-    assert {model.camera(index).name for index in range(model.ncam)} == set(CAMERAS)
+    assert {model.camera(index).name for index in range(model.ncam)} == set(SPEC.cameras)
 
 
 def test_supersampling_is_a_rounded_box_mean(world):
@@ -194,7 +213,7 @@ def test_frames_are_fast(world):
 
 
 def test_a_world_can_be_closed_twice_and_used_again():
-    world = World(TASK)
+    world = SPEC.open_world(TASK)
     world.close()
     state = world.reset(5).state
     world.frame()
@@ -255,14 +274,14 @@ def run_python(code, **environment):
 def test_physics_works_where_nothing_can_be_drawn():
     code = f"""
 from kerv_cli.errors import RenderingUnavailable
-from kerv_cli.environments.metaworld.world import World
-world = World("{TASK}")
+from kerv_cli.environments.metaworld.spec import SPEC
+world = SPEC.open_world("{TASK}")
 world.reset(0)
 world.step([0, 0, 0, 0])
 try:
     world.frame()
 except RenderingUnavailable as error:
-    print(world.observation.step, error)
+    print(world.steps, error)
 """
     result = run_python(code, MUJOCO_GL="disable")
     assert result.stdout == "1 MUJOCO_GL=disable switches drawing off: unset it, or set it to egl\n", result.stderr
@@ -272,8 +291,8 @@ def test_open_cameras_are_closed_before_the_interpreter_ends():
     """Otherwise a context may outlive the display, which prints an EGLError."""
     code = f"""
 import atexit
-from kerv_cli.environments.metaworld.world import World
-world = World("{TASK}")
+from kerv_cli.environments.metaworld.spec import SPEC
+world = SPEC.open_world("{TASK}")
 atexit.register(lambda: print([camera._renderer for camera in world._cameras.values()]))  # runs last
 world.reset(0)
 print(world.frame().shape)

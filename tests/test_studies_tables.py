@@ -197,12 +197,12 @@ def test_a_row_says_everything(data: StudyData) -> None:
 
 
 def write_reach(tmp_path: Path, **harm: Any) -> dict[str, Any]:
-    """The reach cells, the setting's harmed: status or rand_vec; its row of the table."""
+    """The reach cells, the setting's harmed: status or initial_state; its row of the table."""
     store = StudyStore(tmp_path, "hand")
     cells = hand_cells()[:2]
     records = records_of(cells[1])
-    if "rand_vec" in harm:
-        records[0] = replace(records[0], rand_vec=np.array([harm.pop("rand_vec")]))
+    if "initial_state" in harm:
+        records[0] = replace(records[0], initial_state=np.array([harm.pop("initial_state")]))
     store.write_cell(cells[0], records_of(cells[0]), STATUS)
     store.write_cell(cells[1], records, {**STATUS, **harm})
     store.write_plan(StudySettings("hand", "", "ar"), cells)
@@ -218,7 +218,7 @@ def test_other_devices_are_not_compared(tmp_path: Path) -> None:
 
 
 def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:
-    row = write_reach(tmp_path, rand_vec=0.5)
+    row = write_reach(tmp_path, initial_state=0.5)
     assert row["pairs"] == 1
     assert row["speedup"] == pytest.approx(0.3 / 0.05)
     assert math.isnan(row["speedup_low"])

@@ -20,7 +20,7 @@ from torch import nn
 from kerv_cli import files
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import sha256_of
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainSettings
@@ -29,6 +29,8 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 TINY = TrainSettings(steps=12, batch=4, lr=0.01, warmup=2, validate_every=4, ema=0.9)
 
@@ -138,7 +140,7 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
 
 def test_weights_can_be_stored_in_half_precision(tmp_path: Path) -> None:
     settings = TargetSettings(observation="state", width=32, layers=1, heads=2, feed_forward=48, scene_tokens=2)
-    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary())
+    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld"))
     sizes = {}
     for half in (False, True):
         digest = save_target(tmp_path / str(half), target, "metaworld", {}, half)
@@ -182,7 +184,7 @@ def test_batched_greedy_decoding_is_the_decoders() -> None:
 
     torch.manual_seed(0)
     settings = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
-    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary()).eval().requires_grad_(False)
+    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld")).eval().requires_grad_(False)
     prompts = torch.randn(3, target.max_prompt, 32)
     tokens, hidden = greedy(target, prompts)
     assert hidden.shape == (3, target.max_prompt + target.chunk * 4 - 1, 32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,16 +15,17 @@ from safetensors.torch import load_file
 from kerv_cli.config import compose
 from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TrainDrafterSettings, TrainTargetSettings
-from kerv_cli.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training import runs
 from kerv_cli.training.loop import read_state
 from kerv_cli.training.runs import TargetRun
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 OLD = dataclasses.replace(ACTIONS, low=(-0.5, -1.0, -1.0, -1.0), high=(0.5, 1.0, 2.0, 1.0))
 WORDS = WordTokenizer.build(["pull the drawer open", "jump"])
@@ -32,11 +34,9 @@ WORDS = WordTokenizer.build(["pull the drawer open", "jump"])
 class Demos:
     """Four made-up episodes of a task."""
 
-    sha256, path, environment = "d" * 64, Path("demos"), "metaworld"
-    actions: ActionSpace = ACTIONS
-    observation: ObservationSpace = OBSERVATION
-    manifest = {"config": {}}  # noqa: RUF012
-    episodes = tuple(DemoEntry("drawer-open-v3", seed, False, 6, Path(), 0, "") for seed in range(4))
+    sha256, path = "d" * 64, Path("demos")
+    manifest = SimpleNamespace(config={}, environment=SPEC.name, actions=ACTIONS, observation=OBSERVATION)
+    episodes = tuple(DemoEntry(seed, False, 6, 0, "", "drawer-open-v3", Path()) for seed in range(4))
 
     def load(self, index: int) -> DemoEpisode:
         rng = np.random.default_rng(index)

@@ -28,9 +28,9 @@ def complete_overrides(incomplete: str) -> list[str]:
         group = incomplete.split("=", 1)[0]
         words = [f"{group}={name}" for name in known.get(group, [])]
         if group == "task":
-            from kerv_cli.environments.metaworld.tasks import SUITES, TASKS
+            from kerv_cli.environments import task_names
 
-            words = [f"task={name}" for name in [*SUITES, *TASKS]]
+            words = [f"task={name}" for name in task_names()]
     else:
         words = [f"{name}=" for name in [*known, "task", "results"]]
     return [word for word in words if word.startswith(incomplete)]

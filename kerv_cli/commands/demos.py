@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import typer
 
 from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+
+if TYPE_CHECKING:
+    from kerv_cli.environments.demos.dataset import DemoManifest
 
 
 @edge
 def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset."""
     from kerv_cli.config import compose, to_yaml
-    from kerv_cli.environments.metaworld.tasks import resolve_tasks
+    from kerv_cli.environments import resolve_tasks, spec_of
     from kerv_cli.settings import DemosSettings, as_plain
 
     settings = compose("demos", overrides or [], DemosSettings)
@@ -21,9 +26,9 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         return
     from kerv_cli.places import artifact
 
-    folder = artifact(settings.results, "demos", settings.name)
+    folder = artifact(settings.results, "demos", settings.name or "-".join(settings.task).lower())
     if plan:
-        steps = 85 * settings.episodes * len(tasks)
+        steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
         minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
         typer.echo(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
         return
@@ -45,10 +50,10 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
     _summary(manifest, folder)
 
 
-def _summary(manifest: dict, folder: object) -> None:
+def _summary(manifest: DemoManifest, folder: object) -> None:
     from rich.table import Table
 
     table = Table("task", "episodes", "mean steps", "failed seeds", title=f"demonstrations in {folder}")
-    for name, row in manifest["tasks"].items():
-        table.add_row(name, str(len(row["episodes"])), f"{row['mean_steps']:.0f}", str(len(row["failed_seeds"])))
+    for name, row in manifest.tasks.items():
+        table.add_row(name, str(len(row.episodes)), f"{row.mean_steps:.0f}", str(len(row.failed_seeds)))
     console().print(table)

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import typer
 
 from kerv_cli.commands.common import Overrides, ShowConfig, console, edge
+
+if TYPE_CHECKING:
+    from kerv_cli.environments.spec import EnvironmentSpec
+    from kerv_cli.settings import DoctorSettings
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         return
-    findings = [_versions(), _rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
+    findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
     from rich.table import Table
 
     table = Table("check", "", "finding")
@@ -43,43 +48,45 @@ def _versions() -> Finding:
     return Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items()))
 
 
-def _rendering(settings: object) -> Finding:
+def _rendering(settings: DoctorSettings) -> list[Finding]:
+    """One finding per environment."""
+    from kerv_cli.environments import specs
+
+    return [_drawn(f"rendering {spec.name}", spec, settings) for spec in specs().values()]
+
+
+def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
     """Draws real frames of a real world: a backend that loads but cannot draw is no backend."""
     import time
 
+    from kerv_cli.environments.camera import CameraConfig, choose_backend
     from kerv_cli.errors import KervError
-    from kerv_cli.settings import DoctorSettings
+    from kerv_cli.settings import as_plain
 
-    assert isinstance(settings, DoctorSettings)
+    first = next(iter(spec.suites.values()), tuple(spec.tasks))[0]
     try:
-        from kerv_cli.environments.camera import choose_backend
-        from kerv_cli.environments.metaworld.world import World
-        from kerv_cli.rollouts.run import camera_config
-
         backend = choose_backend()
-        with World("reach-v3", camera_config(settings.world.camera)) as world:
+        with spec.open_world(first, CameraConfig(**{**as_plain(settings.world.camera), "name": ""})) as world:
             world.reset(settings.seed)
             world.frame()
             began = time.perf_counter()
             spread = [int(world.frame().std()) for _ in range(20)][-1]
             milliseconds = 1000 * (time.perf_counter() - began) / 20
     except KervError as error:
-        return Finding("rendering", False, str(error))
+        return Finding(what, False, str(error))
     size = settings.world.camera.size
     if spread == 0:
-        return Finding("rendering", False, f"{backend} draws empty frames: try MUJOCO_GL=osmesa kerv doctor")
-    return Finding("rendering", milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
+        return Finding(what, False, f"{backend} draws empty frames: try MUJOCO_GL=osmesa kerv doctor")
+    return Finding(what, milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
 
 
-def _torch(settings: object) -> Finding:
+def _torch(settings: DoctorSettings) -> Finding:
     import torch
 
     from kerv_cli.errors import KervError
     from kerv_cli.provenance import device_name
     from kerv_cli.runtime import set_up
-    from kerv_cli.settings import DoctorSettings
 
-    assert isinstance(settings, DoctorSettings)
     try:
         device, _ = set_up(settings.runtime)
     except KervError as error:
@@ -88,7 +95,7 @@ def _torch(settings: object) -> Finding:
     return Finding("torch", True, f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}")
 
 
-def _policies(settings: object) -> list[Finding]:
+def _policies(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.errors import KervError
     from kerv_cli.places import find_target, shipped_dir
     from kerv_cli.settings import DoctorSettings
@@ -106,15 +113,13 @@ def _policies(settings: object) -> list[Finding]:
     return findings or [Finding("policies", True, "none shipped here: 'kerv train target' trains one")]
 
 
-def _disk(settings: object) -> Finding:
+def _disk(settings: DoctorSettings) -> Finding:
     import shutil
 
     from kerv_cli.errors import StorageError
     from kerv_cli.files import atomic_path
     from kerv_cli.places import results_dir
-    from kerv_cli.settings import DoctorSettings
 
-    assert isinstance(settings, DoctorSettings)
     folder = results_dir(settings.results)
     probe = folder / ".kerv-doctor"
     try:

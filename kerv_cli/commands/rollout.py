@@ -37,9 +37,10 @@ def rollout(
 
 
 def _run(settings: RolloutSettings, plan: bool) -> None:
-    from kerv_cli.environments.metaworld.tasks import resolve_tasks
+    from kerv_cli.environments import resolve_tasks, settled, spec_of
 
     tasks = resolve_tasks(settings.task)
+    settings.world = settled(settings.world, spec_of(tasks[0]))
     from kerv_cli.rollouts.policy import check
     from kerv_cli.rollouts.run import close_worlds, run_task
 
@@ -73,7 +74,7 @@ def _save(record: EpisodeRecord, folder: Path, settings: RolloutSettings) -> Pat
     from kerv_cli.viewing.rerun_log import save_episode
 
     path = folder / f"{record.task}-{record.seed}.rrd"
-    return save_episode(record, path, method=settings.method, tokens_per_step=4)
+    return save_episode(record, path, method=settings.method)
 
 
 def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[EpisodeRecord]) -> None:

@@ -20,12 +20,14 @@ SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core take
 def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Run a study: every setting on every task with the same seeds. Complete cells are reused."""
     from kerv_cli.config import to_yaml
-    from kerv_cli.environments.metaworld.tasks import resolve_tasks
+    from kerv_cli.environments import resolve_tasks, settled, spec_of
     from kerv_cli.studies.resolve import resolve
 
     resolved = resolve(overrides or [])
     first = next(iter(resolved.settings.values()))
     tasks = resolve_tasks(first.task)
+    for settings in resolved.settings.values():
+        settings.world = settled(settings.world, spec_of(tasks[0]))
     if cfg:
         typer.echo(to_yaml(resolved.study), nl=False)
         for label, settings in resolved.settings.items():

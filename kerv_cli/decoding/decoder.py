@@ -57,15 +57,14 @@ class Decoder:
         nodes = max(method.proposer.nodes, method.opening.nodes, self.size)
         self.cache = target.new_cache(1, target.max_prompt + self.size + nodes + 1)
         self.situation = Situation("", ActionHistory(target.actions.dofs))
-        self.instruction = ""
 
     @property
-    def needs_frame(self) -> bool:
-        return bool(self.target.cameras)
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the images that the target reads."""
+        return self.target.cameras
 
     def reset(self, task: str, instruction: str, seed: int = 0) -> None:
         """A new episode begins."""
-        self.instruction = instruction
         random = episode_generator(self.method.boundary, task, seed)
         self.situation = Situation(task, ActionHistory(self.target.actions.dofs), random=random)
         self.threshold.reset()
@@ -84,12 +83,9 @@ class Decoder:
             self.parts.skip.finish(success)
 
     @torch.inference_mode()
-    def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
-        """frame (s, s, 3) uint8 or None, state (39,) -> the chunk's actions and the record of its decode."""
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """What is known now -> the chunk's actions and the record of its decode."""
         clock = Clock(self.target.device)
-        images = {} if frame is None else dict.fromkeys(self.target.cameras, frame)
-        observation = Observation(state[:4], state, self.instruction, images)
-        clock.lap("preprocess")
         prompt = self.target.encode(observation)
         clock.lap("vision")
         chunk = self.decode_prompt(prompt, clock)

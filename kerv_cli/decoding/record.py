@@ -10,6 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from kerv_cli.spaces import ActionSpace
+
 PHASES = ("preprocess", "vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`."""
 
@@ -75,17 +77,19 @@ class DecodeRecord:
 class EpisodeRecord:
     """One episode: a task, a seed, and everything the decoder did."""
 
+    environment: str  # name of the task's environment
+    space: ActionSpace  # the environment's
     task: str
     instruction: str
     seed: int
-    success: bool  # Meta-World's flag at any step within the horizon
+    success: bool  # the task's flag at any step within the horizon
     steps: int  # T, control steps executed
     decodes: tuple[DecodeRecord, ...]
     decode_steps: tuple[int, ...]  # control step at which each decode's actions begin, same length as `decodes`
-    actions: np.ndarray  # (T, D) float32, executed, environment units, clipped to [-1, 1]
+    actions: np.ndarray  # (T, D) float32, executed, environment units, within the space's limits
     path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
     gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
-    rand_vec: np.ndarray  # Meta-World's random vector: with the task it rebuilds the initial state
+    initial_state: np.ndarray  # (n,) float64, with the task it tells this episode's start from others
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
     wall_seconds: float = 0.0  # whole episode, simulation and rendering included
 

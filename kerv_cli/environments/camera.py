@@ -18,13 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.errors import RenderingUnavailable, UnknownName, UsageError
+from kerv_cli.errors import RenderingUnavailable, UsageError
 
 if TYPE_CHECKING:
     import mujoco
 
-CAMERAS = ("corner", "corner2", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")
-"""The views that every Meta-World model has."""
 _PACKAGES = "libegl1 libosmesa6 libgl1-mesa-dri libgl1"
 _HEADLESS = ("egl", "osmesa")
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
@@ -41,23 +39,21 @@ class CameraConfig:
     """What a frame shows.
 
     Attributes:
-        name: camera of the Meta-World models: `corner4` (the literature's view), `gripperPOV`, `topview`, ...
+        name: of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.
         fovy: vertical field of view in degrees; 45 doubles the pixels on hand and object that 60 gives.
         size: width and height of a frame in pixels.
         supersample: each pixel is the mean of supersample x supersample rendered ones.
 
     Raises:
-        UnknownName, UsageError: no such camera; impossible numbers.
+        UsageError: impossible numbers.
     """
 
-    name: str = "corner4"
+    name: str = ""
     fovy: float = 45.0
     size: int = 96
     supersample: int = 2
 
     def __post_init__(self) -> None:
-        if self.name not in CAMERAS:
-            raise UnknownName("camera", self.name, CAMERAS)
         if not 0.0 < self.fovy < 180.0:
             raise UsageError(f"camera fovy must lie between 0 and 180 degrees, not {self.fovy}")
         if self.size < 1 or not 1 <= self.supersample <= 16:
@@ -132,11 +128,21 @@ def _probe_backends() -> str:
     raise RenderingUnavailable(f"no OpenGL backend can draw here: {install_command()}")
 
 
+def load_mujoco() -> None:
+    """Imports mujoco with a GL backend where there is one; physics alone works without."""
+    try:
+        choose_backend()
+    except RenderingUnavailable:
+        # Without this mujoco asks for glfw, which fails where no display is. A Camera raises the reason when opened.
+        os.environ.setdefault("MUJOCO_GL", "disable")
+    import mujoco  # noqa: F401
+
+
 class Camera:
     """Draws one view of one model. Drawing reads the physics and never changes it."""
 
-    def __init__(self, model: mujoco.MjModel, config: CameraConfig) -> None:
-        """Opens an offscreen context for `model`.
+    def __init__(self, model: mujoco.MjModel, config: CameraConfig, upside_down: bool = False) -> None:
+        """Opens an offscreen context for `model`. upside_down: its images come out rotated by 180 degrees.
 
         Raises:
             RenderingUnavailable: the GL backend cannot open a context.
@@ -144,7 +150,7 @@ class Camera:
         backend = choose_backend()
         import mujoco
 
-        self.config = config
+        self.config, self._upside_down = config, upside_down
         self._model = model
         self._camera = int(model.camera(config.name).id)
         pixels = config.size * config.supersample
@@ -168,8 +174,8 @@ class Camera:
         """A frame of the state in `data`.
 
         Returns:
-            (size, size, 3) uint8 RGB, upright: Meta-World mounts its corner cameras upside down, so these views are
-            turned by 180 degrees (flipping one axis would mirror the world).
+            (size, size, 3) uint8 RGB, upright: views that are upside down are turned by 180 degrees (flipping one axis
+            would mirror the world).
 
         Raises:
             RenderingUnavailable: the camera was closed.
@@ -184,7 +190,7 @@ class Camera:
             self._model.cam_fovy[self._camera] = fovy
         self._renderer.render(out=self._pixels)
         frame = box_average(self._pixels, self.config.supersample)
-        return np.ascontiguousarray(frame[::-1, ::-1] if self.config.name.startswith("corner") else frame)
+        return np.ascontiguousarray(frame[::-1, ::-1] if self._upside_down else frame)
 
     def close(self) -> None:
         """Frees the context; safe to call twice. An open context at interpreter exit prints an EGLError."""

@@ -22,11 +22,11 @@ from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.decoding.rectify import DRAFT, Compensation
 from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
 from kerv_cli.drafting.kinematics import FILTERS, MINIMUM, Predictor, build_predictor
+from kerv_cli.environments import spec_of
 from kerv_cli.rollouts.composition import check_composition
-from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.policy import Policy
-from kerv_cli.settings import SPARE, CameraSettings, MethodSettings, RolloutSettings
-from kerv_cli.spaces import GRIPPER
+from kerv_cli.settings import SPARE, MethodSettings, RolloutSettings
+from kerv_cli.spaces import GRIPPER, Observation
 
 WARM_UP_DECODES = 6
 PREDICTED_FROM = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: see kinematics
@@ -135,21 +135,21 @@ class Sampled:
         self.decoder, self.reference, self.every, self.count = decoder, reference, every, 0
 
     @property
-    def needs_frame(self) -> bool:
-        return self.decoder.needs_frame
+    def cameras(self) -> tuple[str, ...]:
+        return self.decoder.cameras
 
     def reset(self, task: str, instruction: str, seed: int = 0) -> None:
         self.count = 0
         self.decoder.reset(task, instruction, seed)
         self.reference.reset(task, instruction, seed)
 
-    def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
-        record = self.decoder.decode(frame, state)
+    def decode(self, observation: Observation) -> DecodeRecord:
+        record = self.decoder.decode(observation)
         self.count += 1
         if self.count % self.every:
             return record
         tokenizer = self.decoder.target.actions
-        wanted = self.reference.decode(frame, state).actions[: len(record.actions)]
+        wanted = self.reference.decode(observation).actions[: len(record.actions)]
         gap = np.abs(tokenizer.normalise(record.actions) - tokenizer.normalise(wanted))
         return dataclasses.replace(record, deviation=float(gap.mean()))
 
@@ -160,7 +160,7 @@ class Sampled:
         self.decoder.finish(success)
 
 
-def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> ActionDecoder:
+def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> Decoder | Sampled:
     """The method's decoder, with the task's own reference level where the threshold follows one."""
     method = settings.parts()
     if policy.calibration is not None:
@@ -171,11 +171,13 @@ def episode_decoder(policy: Policy, settings: RolloutSettings, task: str) -> Act
     return Sampled(decoder, Decoder(policy.target, MethodSettings(chunk=method.chunk)), settings.deviation_every)
 
 
-def warm_up(decoder: ActionDecoder, task: str, camera: CameraSettings) -> None:
+def warm_up(decoder: Decoder | Sampled, task: str, size: int) -> None:
     """First calls allocate, choose kernels and fault pages in: they are no part of any inference time. The hand moves,
-    so that parts which wait for a history or a path take their turn."""
+    so that parts which wait for a history or a path take their turn. size: pixels of the images."""
     decoder.reset(task, "", 0)
-    frame = np.zeros((camera.size, camera.size, 3), dtype=np.uint8)
+    space, frame = spec_of(task).observation, np.zeros((size, size, 3), dtype=np.uint8)
+    images = dict.fromkeys(decoder.cameras, frame)
+    nothing = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
     for i in range(WARM_UP_DECODES):
-        for action in decoder.decode(frame, np.zeros(39)).actions:
+        for action in decoder.decode(nothing).actions:
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

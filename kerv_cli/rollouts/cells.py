@@ -11,7 +11,6 @@ from typing import Any, Protocol
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.rollouts.run import run_task
 from kerv_cli.settings import RolloutSettings
-from kerv_cli.viewing.rerun_log import save_episode
 
 
 class CellLike(Protocol):
@@ -36,12 +35,14 @@ class CellRunner:
     rollouts: Path
 
     def __call__(self, cell: CellLike) -> list[EpisodeRecord]:
+        from kerv_cli.viewing.rerun_log import save_episode  # rerun is needed only where an episode is drawn
+
         settings = settings_from(cell.settings)
         records = []
         for record in run_task(settings, cell.task, cell.seeds):
             if record.frames:
                 name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{record.seed}-{cell.id[:6]}.rrd"
-                save_episode(record, self.rollouts / name, method=cell.label, tokens_per_step=4)
+                save_episode(record, self.rollouts / name, method=cell.label)
             records.append(dataclasses.replace(record, frames={}))
         return records
 

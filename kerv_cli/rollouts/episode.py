@@ -10,21 +10,22 @@ import numpy as np
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
 from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.metaworld.world import World
+from kerv_cli.environments.spec import World
+from kerv_cli.spaces import Observation
 
 
 class ActionDecoder(Protocol):
     """What an episode needs of a decoder."""
 
     @property
-    def needs_frame(self) -> bool:
-        """Whether decode() reads a frame; none is rendered otherwise."""
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the images that decode() reads; no others are drawn for it."""
 
     def reset(self, task: str, instruction: str, seed: int) -> None:
         """A new episode begins: histories are cleared."""
 
-    def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
-        """(h, w, 3) uint8 or None, (39,) float64 -> the actions to execute and all that happened."""
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """What is known now, with the images of `cameras` -> the actions to execute and all that happened."""
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """An action (D,) was executed and the end effector is now at (3,) metres."""
@@ -40,50 +41,65 @@ class Recording:
     camera: CameraConfig | None = None
 
 
+class _Trace:
+    """What the loop gathers step by step: executed actions, positions, gripper and logged frames."""
+
+    def __init__(self, world: World, camera: CameraConfig | None) -> None:
+        self.world, self.camera = world, camera
+        self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
+        self.path: list[np.ndarray] = []
+        self.gripper: list[float] = []
+        self.frames: dict[int, np.ndarray] = {}
+        self._look()
+
+    def add(self, action: np.ndarray) -> None:
+        """Executes `action` and keeps what followed."""
+        self.world.step(action)
+        space = self.world.spec.actions
+        self.actions.append(np.clip(action, space.low, space.high).astype(np.float32))
+        self._look()
+
+    def _look(self) -> None:
+        self.path.append(self.world.end_effector)
+        self.gripper.append(self.world.gripper)
+        if self.camera:
+            self.frames[len(self.actions)] = self.world.frame(self.camera)
+
+
 def run_episode(world: World, decoder: ActionDecoder, seed: int, recording: Recording | None = None) -> EpisodeRecord:
     """One episode, closed loop: decode a chunk, execute it whole, until success or the horizon.
 
     Simulation and rendering lie outside the decoder and so outside inference time.
     """
     began = time.perf_counter()
-    logged = recording.camera if recording else None
-    observation = world.reset(seed)
+    world.reset(seed)
     decoder.reset(world.task, world.instruction, seed)
+    trace = _Trace(world, recording.camera if recording else None)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
-    actions: list[np.ndarray] = []
-    path, gripper = [world.end_effector], [float(observation.state[3])]
-    frames: dict[int, np.ndarray] = {}
-    if logged:
-        frames[0] = world.frame(logged)
     while not world.done:
-        frame = world.frame() if decoder.needs_frame else None
-        record = decoder.decode(frame, observation.state)
-        decodes.append(record)
-        decode_steps.append(len(actions))
-        for action in record.actions:
-            observation = world.step(action)
-            actions.append(np.clip(action, -1.0, 1.0).astype(np.float32))
-            path.append(world.end_effector)
-            gripper.append(float(observation.state[3]))
-            decoder.observe(actions[-1], path[-1])
-            if logged:
-                frames[len(actions)] = world.frame(logged)
+        decodes.append(decoder.decode(world.observe(decoder.cameras)))
+        decode_steps.append(len(trace.actions))
+        for action in decodes[-1].actions:
+            trace.add(action)
+            decoder.observe(trace.actions[-1], trace.path[-1])
             if world.done:
                 break
     decoder.finish(world.succeeded)
     return EpisodeRecord(
+        environment=world.spec.name,
+        space=world.spec.actions,
         task=world.task,
         instruction=world.instruction,
         seed=seed,
         success=world.succeeded,
-        steps=len(actions),
+        steps=len(trace.actions),
         decodes=tuple(decodes),
         decode_steps=tuple(decode_steps),
-        actions=np.stack(actions),
-        path=np.stack(path).astype(np.float32),
-        gripper=np.asarray(gripper, dtype=np.float32),
-        rand_vec=world.rand_vec,
-        frames=frames,
+        actions=np.stack(trace.actions),
+        path=np.stack(trace.path).astype(np.float32),
+        gripper=np.asarray(trace.gripper, dtype=np.float32),
+        initial_state=world.initial_state,
+        frames=trace.frames,
         wall_seconds=time.perf_counter() - began,
     )

@@ -1,4 +1,4 @@
-"""The scripted expert in the policy's place: what success tables are read against (METHODS §6)."""
+"""The scripted expert in the policy's place: what success tables are read against (docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -7,43 +7,47 @@ import torch
 
 from kerv_cli.decoding.chunk import Clock
 from kerv_cli.decoding.record import DecodeRecord
-from kerv_cli.environments.metaworld.world import ACTION_SIZE, Expert, Observation
+from kerv_cli.environments import spec_of
+from kerv_cli.environments.spec import Expert
 from kerv_cli.errors import KervError
+from kerv_cli.spaces import Observation
 
 MODE = "expert"
 
 
 class ExpertDecoder:
-    """Meta-World's scripted policy of the episode's task, asked anew at every control step.
+    """The environment's scripted controller of the episode's task, asked anew at every control step.
 
     It reads the whole state, object and goal included: privileged, as `observation=state` is. It has no target, so its
     records have no forwards, rounds and tokens, and what is measured per verification is undefined for it. Its time is
     a few scalar formulas': no speedup of any decoding method.
     """
 
-    needs_frame = False
+    cameras: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self.task: str | None = None
         self.expert: Expert | None = None
+        self.dofs = 0
 
     def reset(self, task: str, instruction: str, seed: int = 0) -> None:
-        """Raises UnknownName for a task that does not exist."""
+        """Raises UnknownName for a task that no environment has."""
         if self.expert is None or task != self.task:
-            self.task, self.expert = task, Expert(task)
+            spec = spec_of(task)
+            self.task, self.expert, self.dofs = task, spec.expert(task), spec.actions.dofs
 
-    def decode(self, frame: np.ndarray | None, state: np.ndarray) -> DecodeRecord:
-        """state (39,) -> one control step's action (1, 4) in [-1, 1].
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The state -> one control step's action (1, D) in environment units.
 
         Raises:
-            KervError: before the first reset, or a state whose answer is not four finite numbers.
+            KervError: before the first reset, or a state whose answer is not D finite numbers.
         """
         if self.expert is None:
             raise KervError("the expert does not know its task yet: reset it before decoding")
         clock = Clock(torch.device("cpu"))
-        action = self.expert(Observation(state, step=0, success=False))
+        action = self.expert(observation)
         seconds = clock.stop()
-        if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
+        if action.shape != (self.dofs,) or not np.isfinite(action).all():
             raise KervError(f"the expert of {self.task} answered {action} to a state it cannot read")
         return DecodeRecord(
             tokens=(),

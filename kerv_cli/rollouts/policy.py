@@ -11,7 +11,7 @@ from kerv_cli.drafting.datastore import Datastore, check_backend, check_target, 
 from kerv_cli.drafting.eagle import Drafter, load_drafter, read_drafter
 from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
 from kerv_cli.drafting.kinematics import FILTERS
-from kerv_cli.environments.metaworld.tasks import resolve_tasks
+from kerv_cli.environments import resolve_tasks
 from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import drafter_folder, early_folder, find_target

@@ -10,10 +10,11 @@ import numpy as np
 
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.metaworld.world import World
+from kerv_cli.environments.spec import World
 from kerv_cli.rollouts.assemble import episode_decoder, warm_up
-from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.episode import ActionDecoder, Recording, run_episode
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.rollouts.policy import is_expert, load_policy
 from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings, WorldSettings
@@ -26,7 +27,7 @@ def camera_config(settings: CameraSettings) -> CameraConfig:
 
 @functools.lru_cache(maxsize=1)
 def _world(task: str, camera: CameraConfig, horizon: int) -> World:
-    return World(task, camera, horizon)
+    return spec_of(task).open_world(task, camera, horizon)
 
 
 _opened: list[World] = []
@@ -51,9 +52,12 @@ def close_worlds() -> None:
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
     """One method on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
-    decoder = ExpertDecoder() if is_expert(settings) else episode_decoder(load_policy(settings), settings, task)
-    warm_up(decoder, task, settings.world.camera)
     world = open_world(task, settings.world)
+    decoder: ActionDecoder = ExpertDecoder()
+    if not is_expert(settings):
+        decoded = episode_decoder(load_policy(settings), settings, task)
+        warm_up(decoded, task, settings.world.camera.size)
+        decoder = decoded
     logged = dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
     for number, seed in enumerate(seeds):
         recorded = settings.record < 0 or number < settings.record
@@ -62,7 +66,9 @@ def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iter
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share of successful AR episodes over tasks and seeds."""
-    decoder = Decoder(target, MethodSettings())
-    outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
+    decoder, outcomes = Decoder(target, MethodSettings()), []
+    for task in tasks:
+        world = open_world(task, settings)
+        outcomes += [run_episode(world, decoder, seed).success for seed in seeds]
     close_worlds()
     return float(np.mean(outcomes))

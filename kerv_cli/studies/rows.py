@@ -115,7 +115,7 @@ def episode_row(record: EpisodeRecord, worker_pid: int, started: str) -> dict[st
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),
         "wall_seconds": record.wall_seconds,
-        "rand_vec": np.asarray(record.rand_vec, dtype=np.float64).ravel().tolist(),
+        "rand_vec": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
         "worker_pid": worker_pid,
         "started": started,
     }

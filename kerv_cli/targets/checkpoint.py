@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
 from kerv_cli.manifests import read
@@ -121,12 +121,12 @@ def with_spaces(value: dict[str, Any]) -> dict[str, Any]:
     actions = value.get("actions", {})
     if not isinstance(actions, dict) or "names" in actions:
         return value
-    value = {**value, "actions": {**ACTIONS.as_dict(), **actions}}
+    value = {**value, "actions": {**SPEC.actions.as_dict(), **actions}}
     if value["kind"] == "target" and isinstance(value.get("settings"), dict):
         settings = {k: v for k, v in value["settings"].items() if k != "dofs"}
         cameras = ["corner4"] if settings.get("observation") == "vision" else []
-        of_target = {"settings": settings, "observation": OBSERVATION.as_dict(), "cameras": cameras}
-        value |= {"family": "compact", "environment": "metaworld", **of_target}
+        of_target = {"settings": settings, "observation": SPEC.observation.as_dict(), "cameras": cameras}
+        value |= {"family": "compact", "environment": SPEC.name, **of_target}
     return value
 
 

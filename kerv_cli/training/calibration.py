@@ -14,14 +14,14 @@ import numpy as np
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration, save_calibration
 from kerv_cli.drafting.kinematics import MINIMUM
+from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.metaworld.tasks import resolve_tasks, task
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, MethodSettings, RolloutSettings, as_plain
-from kerv_cli.spaces import CENTRES, ActionTokenizer, values_of
+from kerv_cli.spaces import CENTRES, ActionTokenizer, Observation, values_of
 from kerv_cli.training.predictor_fit import (
     HISTORIES,
     Windows,
@@ -32,8 +32,8 @@ from kerv_cli.training.predictor_fit import (
 )
 
 if TYPE_CHECKING:
+    from kerv_cli.decoding.decoder import Decoder
     from kerv_cli.environments.demos.episode_file import DemoEpisode
-    from kerv_cli.rollouts.episode import ActionDecoder
 
 Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # episodes per task that pre-sampling spreads its decodes over, where there are so many
@@ -65,7 +65,7 @@ def reference_level(levels: Sequence[float]) -> float:
     return max(float(np.median(levels)), float(CENTRES[1] - CENTRES[0]))
 
 
-def presample(decoder: ActionDecoder, episode: DemoEpisode, instruction: str, decodes: int) -> list[float]:
+def presample(decoder: Decoder, episode: DemoEpisode, instruction: str, decodes: int) -> list[float]:
     """K of up to `decodes` decodes, spread evenly over the observations of a demonstration.
 
     The decoder sees every executed action in between, so that methods with a history have one.
@@ -78,8 +78,9 @@ def presample(decoder: ActionDecoder, episode: DemoEpisode, instruction: str, de
         for t in range(seen, step):
             decoder.observe(episode.executed[t], episode.end_effector[t + 1])
         seen = step
-        frame = episode.frames[index] if decoder.needs_frame else None
-        record = decoder.decode(frame, episode.states[step])
+        images = dict.fromkeys(decoder.cameras, episode.frames[index])
+        felt = episode.states[step][: len(spec_of(episode.task).observation.proprioception)]
+        record = decoder.decode(Observation(felt, episode.states[step], instruction, images))
         if record.variability is not None:
             levels.append(record.variability)
     return levels
@@ -188,12 +189,12 @@ class CalibrationRun:
             levels: list[float] = []
             for index in self._training(name):
                 episode = self.dataset.load(index)
-                if decoder.needs_frame and episode.frames.shape[1] != size:
+                if decoder.cameras and episode.frames.shape[1] != size:
                     raise CheckpointError(
                         f"the demonstrations' frames have {episode.frames.shape[1]} pixels, not {size}"
                     )
                 budget = min(share, self.settings.decodes - len(levels))
-                levels += presample(decoder, episode, task(name).instruction, budget)
+                levels += presample(decoder, episode, spec_of(name).task(name).instruction, budget)
                 if len(levels) >= self.settings.decodes:
                     break
             if not levels:
@@ -205,7 +206,7 @@ class CalibrationRun:
     def _training(self, name: str) -> list[int]:
         return [i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name]
 
-    def decoder(self) -> tuple[ActionDecoder, int]:
+    def decoder(self) -> tuple[Decoder, int]:
         """The decoder that pre-samples, and the pixels of the frames it takes."""
         from kerv_cli.rollouts.assemble import build_decoder
         from kerv_cli.rollouts.policy import load_policy

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 
 from kerv_cli.drafting.datastore import FILES, FORMAT, Datastore, check_seeds, prompt_key
+from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import resolve_tasks, task
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, write_json
 from kerv_cli.places import artifact, beside, find_target
@@ -27,7 +27,7 @@ from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, TargetSettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.training.imitation import observed
+from kerv_cli.training.imitation import instruction_of, observed
 
 BATCH = 128  # observations encoded at once
 WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
@@ -79,7 +79,7 @@ def entries_of(target: CompactTarget, episode: DemoEpisode, segments: list[str],
     steps = observed_steps(episode, settings)[::stride]
     felt, states = (torch.from_numpy(x) for x in observed(episode, steps, target.observation))
     frames = torch.from_numpy(episode.frames[::stride]).permute(0, 3, 1, 2) if target.cameras else None
-    words = target.words_of(task(episode.task).instruction)
+    words = target.words_of(instruction_of(episode.task))
     keys = []
     for rows in torch.arange(len(steps)).split(BATCH):
         images = frames[rows].to(target.device) if frames is not None else None

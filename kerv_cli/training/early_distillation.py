@@ -77,7 +77,7 @@ def teach_early(
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
     """
-    stride = int(dataset.manifest["config"]["frame_stride"]) if target.cameras else 1
+    stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1
     share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
     parts: list[EarlySamples] = []
     waiting: list[Observations] = []

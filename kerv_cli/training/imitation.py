@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.environments import spec_of, specs
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import TASKS, task
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
 from kerv_cli.spaces import ObservationSpace
@@ -77,7 +77,7 @@ def load_samples(
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
         frames, steps = _frames_and_steps(episode, settings)
-        felt, states = observed(episode, steps, dataset.observation)
+        felt, states = observed(episode, steps, dataset.manifest.observation)
         ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
         parts.append(
             {
@@ -97,7 +97,7 @@ def load_samples(
 
 def instruction_of(name: str) -> str:
     """What the robot is told in a task."""
-    return task(name).instruction
+    return spec_of(name).task(name).instruction
 
 
 def observed(episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace) -> tuple[np.ndarray, np.ndarray]:
@@ -231,8 +231,9 @@ def new_target(
 ) -> CompactTarget:
     """A fresh policy of the dataset's spaces with the samples' action statistics."""
     torch.manual_seed(seed)
-    actions = dataset.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    return CompactTarget(replace(settings), actions, dataset.observation, words, camera)
+    manifest = dataset.manifest
+    actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
+    return CompactTarget(replace(settings), actions, manifest.observation, words, camera)
 
 
 def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:
@@ -264,17 +265,17 @@ def check_spaces(target: CompactTarget, dataset: DemoDataset) -> None:
     Raises:
         CheckpointError: other actions or observations.
     """
-    target.actions.check_same(dataset.actions, "the target", f"the demonstrations in {dataset.path}")
-    if target.observation != dataset.observation:
+    target.actions.check_same(dataset.manifest.actions, "the target", f"the demonstrations in {dataset.path}")
+    if target.observation != dataset.manifest.observation:
         raise CheckpointError(
             f"the demonstrations in {dataset.path} have other observations than the target was trained on: "
             "they are of another environment"
         )
 
 
-def vocabulary() -> WordTokenizer:
+def vocabulary(environment: str) -> WordTokenizer:
     """All words of the environment's instructions."""
-    return WordTokenizer.build(t.instruction for t in TASKS.values())
+    return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())
 
 
 def imitation_job(

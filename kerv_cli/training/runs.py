@@ -14,8 +14,8 @@ from torch import nn
 
 from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
+from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.metaworld.tasks import resolve_tasks
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.places import artifact, drafter_folder, early_folder, find_target
 from kerv_cli.provenance import provenance
@@ -107,7 +107,7 @@ class TargetRun:
             assert self.begun is not None
             self.origin = {"init": described.sha256}
             check_spaces(self.begun, self.dataset)
-        words = self.begun.words if self.begun else vocabulary()
+        words = self.begun.words if self.begun else vocabulary(self.dataset.manifest.environment)
         self.samples = load_samples(self.dataset, self.settings.target, words, self.tasks, progress)
 
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
@@ -116,7 +116,8 @@ class TargetRun:
         settings = self.settings
         if self.begun is None:
             camera = settings.world.camera.name
-            target = new_target(settings.target, self.dataset, self.samples, vocabulary(), camera, settings.train.seed)
+            words = vocabulary(self.dataset.manifest.environment)
+            target = new_target(settings.target, self.dataset, self.samples, words, camera, settings.train.seed)
         else:
             target = continued_target(settings.target, self.begun)
         target = target.to(self.device)
@@ -147,12 +148,12 @@ class TargetRun:
             "command": "kerv train target",
             "settings": asdict(self.settings),
             **self.origin,
-            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
         }
-        save_target(self.folder, module, self.dataset.environment, made, self.settings.train.half)
+        save_target(self.folder, module, self.dataset.manifest.environment, made, self.settings.train.half)
 
 
 class DrafterRun:
@@ -222,7 +223,7 @@ class DrafterRun:
         made = {
             "command": "kerv train drafter",
             "settings": asdict(self.settings),
-            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest["config"]},
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),

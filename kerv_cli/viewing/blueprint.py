@@ -105,7 +105,7 @@ def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
     high = (max(meta.chunk_steps, KEY_ROWS) + 0.9) * CELL_HEIGHT
     chunk = rrb.Spatial2DView(
         origin="/chunk",
-        name="Current chunk: draft → verdict",
+        name="Current chunk: draft → target token",
         background=[13, 16, 17],
         visual_bounds=rrb.VisualBounds2D(x_range=[left, left + wide], y_range=[above, above + high]),
     )

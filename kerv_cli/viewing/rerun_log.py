@@ -23,10 +23,10 @@ from rerun.error_utils import catch_and_log_exceptions
 from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord
 from kerv_cli.files import atomic_path
 from kerv_cli.viewing.blueprint import CELL_HEIGHT, CELL_WIDTH, KEY_ROWS, SIGNALS, STEP, TIME, EpisodeMeta, blueprint
-from kerv_cli.viewing.token_outcomes import FATES, TokenFate, acceptance, chunk_size, decode_table, dof_names, fates_of
+from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, acceptance, chunk_size, decode_table, outcomes_of
 
 JPEG_QUALITY = 85
-_SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in FATES.values()}
+_SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in OUTCOMES.values()}
 _MODE_COLORS = {
     "ar": 0x6E7B8BFF,
     "drafter": 0x56B4E9FF,
@@ -43,6 +43,9 @@ _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86B
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 _CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
 
+Chunks = Sequence[Sequence[TokenOutcome]]
+"""Per decode, what became of each token of its chunk."""
+
 
 @dataclass(frozen=True)
 class Entity:
@@ -54,17 +57,13 @@ class Entity:
     columns: Iterable[Any] = ()  # rerun columns of as many rows
 
 
-def save_episode(
-    record: EpisodeRecord, path: Path, *, method: str, tokens_per_step: int = 4, fps: float = 80.0
-) -> Path:
+def save_episode(record: EpisodeRecord, path: Path, *, method: str) -> Path:
     """Writes an episode as a recording that carries its own layout; the file is complete or absent.
 
     Args:
         record: frames may be missing; then the recording has no camera.
         path: the .rrd file; its folder is created.
         method: name of the method, for the summary; recordings of one method share their layout in the viewer.
-        tokens_per_step: D.
-        fps: control steps per second of simulated time.
 
     Returns:
         `path`.
@@ -73,13 +72,13 @@ def save_episode(
         StorageError: the disk is full or read-only, or the folder may not be written to.
     """
     with catch_and_log_exceptions(strict=True):  # a mistake must raise here, not become a warning and a missing view
-        content = _encode(record, method, tokens_per_step, fps)
+        content = _encode(record, method)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
 
 
-def _encode(record: EpisodeRecord, method: str, dofs: int, fps: float) -> bytes:
+def _encode(record: EpisodeRecord, method: str) -> bytes:
     """The .rrd file's bytes."""
     recording = rr.RecordingStream("kerv_" + re.sub(r"\W+", "_", method, flags=re.ASCII))
     memory = recording.memory_recording()
@@ -88,26 +87,26 @@ def _encode(record: EpisodeRecord, method: str, dofs: int, fps: float) -> bytes:
     outcome = "success" if record.success else "failure"
     recording.send_recording_name(readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
     recording.send_property("episode", rr.AnyValues(**_facts(record, method)))
-    size = chunk_size(record.decodes, dofs)
-    fates = [fates_of(d, size, dofs) for d in record.decodes]
-    for entity in _entities(record, method, dofs, fates, fps):
+    size = chunk_size(record.decodes, record.space.dofs)
+    chunks = [outcomes_of(d, size, record.space.dofs) for d in record.decodes]
+    for entity in _entities(record, method, chunks):
         for archetype in entity.static:
             recording.log(entity.path, archetype, static=True)
         if entity.steps is not None and len(entity.steps):
-            recording.send_columns(entity.path, _times(entity.steps, fps), entity.columns)
-    recording.send_blueprint(blueprint(meta_of(record, fates, dofs)))
+            recording.send_columns(entity.path, _times(entity.steps, record.space.control_hz), entity.columns)
+    recording.send_blueprint(blueprint(meta_of(record, chunks)))
     return bytes(memory.drain_as_bytes())
 
 
-def meta_of(record: EpisodeRecord, fates: Sequence[Sequence[TokenFate]], dofs: int) -> EpisodeMeta:
+def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
     """What of the episode decides the layout."""
     low, high = record.path.min(axis=0), record.path.max(axis=0)
     x, y, z = ((low + high) / 2).tolist()
     return EpisodeMeta(
-        chunk_steps=len(fates[0]) // dofs if fates else 1,
-        dofs=dof_names(dofs),
+        chunk_steps=len(chunks[0]) // record.space.dofs if chunks else 1,
+        dofs=record.space.names,
         frames=bool(record.frames),
-        drafted=any(f.fate not in ("target", "dropped") for chunk in fates for f in chunk),
+        drafted=any(o.kind not in ("target", "scripted", "dropped") for chunk in chunks for o in chunk),
         verified=any(d.verifications for d in record.decodes),
         threshold=any(_threshold(d) for d in record.decodes),
         signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
@@ -122,25 +121,24 @@ def readable(text: str) -> str:
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
 
 
-def _times(steps: NDArray[np.int64], fps: float) -> list[rr.TimeColumn]:
-    nanoseconds = np.round(steps * (1e9 / fps)).astype("timedelta64[ns]")
+def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
+    nanoseconds = np.round(steps * (1e9 / control_hz)).astype("timedelta64[ns]")
     return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
 
 
-def _entities(
-    record: EpisodeRecord, method: str, dofs: int, fates: Sequence[Sequence[TokenFate]], fps: float
-) -> list[Entity]:
+def _entities(record: EpisodeRecord, method: str, chunks: Chunks) -> list[Entity]:
     starts = np.asarray(record.decode_steps, dtype=np.int64)
+    names = record.space.names
     return [
-        Entity("summary", (_markdown(summary(record, method, fps)),)),
+        Entity("summary", (_markdown(summary(record, method)),)),
         *_camera(record),
         *_world(record),
-        *_actions(record, dofs),
+        *_actions(record),
         _modes(record, starts),
-        *_token_lanes(fates, starts, dofs),
-        *_current_chunk(fates, starts, dofs),
-        _tables(record, fates, starts, dofs),
-        *_series_per_decode(record, starts, dofs),
+        *_token_lanes(chunks, starts, len(names)),
+        *_current_chunk(chunks, starts, names),
+        _tables(record, chunks, starts),
+        *_series_per_decode(record, starts),
     ]
 
 
@@ -171,7 +169,7 @@ def _world(record: EpisodeRecord) -> list[Entity]:
     steps = np.arange(len(record.path), dtype=np.int64)
     opening = np.clip(record.gripper, 0.0, 1.0)[:, None]
     colors = np.round(_OPEN * opening + _CLOSED * (1 - opening)).astype(np.uint8)
-    end_color = FATES["accepted" if record.success else "rejected"].color
+    end_color = OUTCOMES["accepted" if record.success else "rejected"].color
     ends = rr.Points3D(
         record.path[[0, -1]],
         radii=0.006,
@@ -188,11 +186,11 @@ def _world(record: EpisodeRecord) -> list[Entity]:
     ]
 
 
-def _actions(record: EpisodeRecord, dofs: int) -> list[Entity]:
+def _actions(record: EpisodeRecord) -> list[Entity]:
     steps = np.arange(record.steps, dtype=np.int64)
     opening = np.asarray(record.gripper, dtype=np.float64)[:, None]
     return [
-        Entity("actions", (_named(dof_names(dofs), _DOF_COLORS),), steps, _rows(record.actions)),
+        Entity("actions", (_named(record.space.names, _DOF_COLORS),), steps, _rows(record.actions)),
         Entity("gripper", (_named(["gripper opening"], [0xF0E442FF]),), np.arange(len(opening)), _rows(opening)),
     ]
 
@@ -211,39 +209,40 @@ def _modes(record: EpisodeRecord, starts: NDArray[np.int64]) -> Entity:
     return Entity("mode", (style,), starts[changes], columns)
 
 
-def _token_lanes(fates: Sequence[Sequence[TokenFate]], starts: NDArray[np.int64], dofs: int) -> list[Entity]:
+def _token_lanes(chunks: Chunks, starts: NDArray[np.int64], dofs: int) -> list[Entity]:
     """One entity per control step of the chunk with a lane per DoF: a map of all tokens over time."""
     style = rr.StateConfiguration(
-        values=list(FATES),
-        labels=[s.symbol for s in FATES.values()],
-        colors=np.array([s.color for s in FATES.values()], dtype=np.uint32),
+        values=list(OUTCOMES),
+        labels=[s.symbol for s in OUTCOMES.values()],
+        colors=np.array([s.color for s in OUTCOMES.values()], dtype=np.uint32),
     )
     entities = []
-    for first in range(0, len(fates[0]) if fates else 0, dofs):
-        states = [fate.fate for chunk in fates for fate in chunk[first : first + dofs]]
-        columns = rr.StateChange.columns(state=states).partition([dofs] * len(fates))
+    for first in range(0, len(chunks[0]) if chunks else 0, dofs):
+        states = [outcome.kind for chunk in chunks for outcome in chunk[first : first + dofs]]
+        columns = rr.StateChange.columns(state=states).partition([dofs] * len(chunks))
         entities.append(Entity(f"tokens/step_{first // dofs}", (style,), starts, columns))
     return entities
 
 
-def _current_chunk(fates: Sequence[Sequence[TokenFate]], starts: NDArray[np.int64], dofs: int) -> list[Entity]:
+def _current_chunk(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[str]) -> list[Entity]:
     """A picture of the chunk that is being executed: a coloured cell per token, rows are control steps."""
-    size = len(fates[0]) if fates else 0
+    size, dofs = len(chunks[0]) if chunks else 0, len(names)
     centres = np.array([[i % dofs + 0.5, i // dofs + 0.5] for i in range(size)]) * _CELL
-    colors = np.array([FATES[f.fate].color for chunk in fates for f in chunk], dtype=np.uint32)
-    labels = [f.short for chunk in fates for f in chunk]
-    heads = [((i + 0.5, -0.45), name) for i, name in enumerate(dof_names(dofs))]
+    colors = np.array([OUTCOMES[o.kind].color for chunk in chunks for o in chunk], dtype=np.uint32)
+    labels = [o.short for chunk in chunks for o in chunk]
+    heads = [((i + 0.5, -0.45), name) for i, name in enumerate(names)]
     heads += [((-0.4, i + 0.5), f"step {i}") for i in range(size // dofs)]
-    used = [name for name in FATES if any(f.fate == name for chunk in fates for f in chunk)]
+    used = [kind for kind in OUTCOMES if any(o.kind == kind for chunk in chunks for o in chunk)]
     rows = max(size // dofs, KEY_ROWS)  # the key stands to the right, column by column
     keys = np.array([[dofs + 1.0 + 1.1 * (i // rows), i % rows + 0.5] for i in range(len(used))]) * _CELL
-    partitions = [size] * len(fates)
+    cells = rr.LineStrips2D.columns(colors=colors).partition([size] * len(chunks))
+    texts = rr.Points2D.columns(labels=labels).partition([size] * len(chunks))
     return [
-        Entity("chunk/cells", (_cells(centres),), starts, rr.LineStrips2D.columns(colors=colors).partition(partitions)),
-        Entity("chunk/text", (_texts(centres),), starts, rr.Points2D.columns(labels=labels).partition(partitions)),
+        Entity("chunk/cells", (_cells(centres),), starts, cells),
+        Entity("chunk/text", (_texts(centres),), starts, texts),
         Entity("chunk/names", (_texts(np.array([at for at, _ in heads]) * _CELL, [name for _, name in heads]),)),
-        Entity("chunk/legend", (_cells(keys, [FATES[name].color for name in used]),)),
-        Entity("chunk/legend/text", (_texts(keys, [f"{FATES[name].symbol} {name}" for name in used]),)),
+        Entity("chunk/legend", (_cells(keys, [OUTCOMES[kind].color for kind in used]),)),
+        Entity("chunk/legend/text", (_texts(keys, [f"{OUTCOMES[kind].symbol} {kind}" for kind in used]),)),
     ]
 
 
@@ -261,19 +260,18 @@ def _texts(centres: NDArray[np.float64], labels: Sequence[str] | None = None) ->
     return rr.Points2D(above, radii=0.0, colors=[255, 255, 255], labels=labels, show_labels=True, draw_order=40.0)
 
 
-def _tables(
-    record: EpisodeRecord, fates: Sequence[Sequence[TokenFate]], starts: NDArray[np.int64], dofs: int
-) -> Entity:
-    decodes = zip(record.decodes, record.decode_steps, fates, strict=True)
-    texts = [decode_table(d, i, step, chunk, dofs) for i, (d, step, chunk) in enumerate(decodes)]
+def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) -> Entity:
+    decodes = zip(record.decodes, record.decode_steps, chunks, strict=True)
+    names = record.space.names
+    texts = [decode_table(d, i, step, chunk, names) for i, (d, step, chunk) in enumerate(decodes)]
     kinds = ["text/markdown"] * len(texts)
     return Entity("decode/table", (), starts, rr.TextDocument.columns(text=texts, media_type=kinds))
 
 
-def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], dofs: int) -> list[Entity]:
+def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64]) -> list[Entity]:
     """Numbers per decode; a decode without the number has no row, a number that no decode has no entity."""
     decodes = record.decodes
-    limits, limit_names = _thresholds(decodes, dofs)
+    limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
     series = [
         Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0xE0E4E8FF]),
@@ -317,20 +315,22 @@ def _threshold(decode: DecodeRecord) -> tuple[int, ...]:
     return next((r.threshold for r in decode.rounds if r.threshold), ())
 
 
-def _thresholds(decodes: Sequence[DecodeRecord], dofs: int) -> tuple[list[tuple[int, ...]], list[str]]:
-    """r of every decode, one number per group of DoFs that share it all along, and the groups' names."""
+def _thresholds(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> tuple[list[tuple[int, ...]], list[str]]:
+    """r of every decode, one number per set of DoFs that share it all along, and the sets' names. dofs: D names."""
     limits = [_threshold(d) for d in decodes]
     groups: dict[tuple[int, ...], list[int]] = {}  # a DoF's r over the episode -> the DoFs that have it
-    for dof in range(dofs):
+    for dof in range(len(dofs)):
         groups.setdefault(tuple(r[dof % len(r)] for r in limits if r), []).append(dof)
     if len(groups) == 1:
         return [r[:1] for r in limits], ["r"]
-    names = ["r " + " ".join(dof_names(dofs)[i] for i in members) for members in groups.values()]
+    names = ["r " + " ".join(dofs[i] for i in members) for members in groups.values()]
     return [tuple(r[members[0]] for members in groups.values()) if r else () for r in limits], names
 
 
 def _named(names: Sequence[str], colors: Sequence[int] | None = None, held: bool = False) -> rr.SeriesLines:
-    colored = None if colors is None else np.array(colors[: len(names)], dtype=np.uint32)
+    colored = (
+        None if colors is None else np.resize(np.array(colors, dtype=np.uint32), len(names))
+    )  # then from the first
     return rr.SeriesLines(names=list(names), colors=colored, interpolation_mode="StepAfter" if held else None)
 
 
@@ -347,6 +347,7 @@ def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
     """The episode in single values, kept as properties of the recording."""
     rounds = [r for d in record.decodes for r in d.rounds if r.tree_size > 0 and r.mode != "skip"]
     facts: dict[str, Any] = {
+        "environment": readable(record.environment),
         "task": readable(record.task),
         "instruction": readable(record.instruction),
         "method": readable(method),
@@ -368,14 +369,14 @@ def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
     return facts
 
 
-def summary(record: EpisodeRecord, method: str, fps: float) -> str:
+def summary(record: EpisodeRecord, method: str) -> str:
     """The episode as Markdown, with the key to the tokens' colours."""
     facts = _facts(record, method)
     outcome = "SUCCESS" if record.success else "FAILURE"
     lines = [f"| {facts['task']} | {outcome} |", "|:--|:--|"]
     lines += [f"| instruction | {facts['instruction']} |"]
     lines += [f"| method, seed | {facts['method']}, {record.seed} |"]
-    lines.append(f"| control steps | {record.steps} ({record.steps / fps:.2f} s) |")
+    lines.append(f"| control steps | {record.steps} ({record.steps / record.space.control_hz:.2f} s) |")
     modes = [d.mode for d in record.decodes]
     counts = ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes))
     lines.append(f"| decodes | {counts} |")
@@ -387,5 +388,5 @@ def summary(record: EpisodeRecord, method: str, fps: float) -> str:
     lines.append(f"| decodes without verification | {facts['skipped_decodes']} |")
     lines.append(f"| inference per step | {facts['ms_per_step']:.2f} ms |")
     lines += ["", "| token | what became of it |", "|:--|:--|"]
-    lines += [f"| {style.symbol} {name} | {style.meaning} |" for name, style in FATES.items()]
+    lines += [f"| {style.symbol} {name} | {style.meaning} |" for name, style in OUTCOMES.items()]
     return "\n".join(lines)

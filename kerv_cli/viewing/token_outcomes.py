@@ -3,56 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from kerv_cli.decoding.record import DecodeRecord, Round
 
 
 @dataclass(frozen=True)
-class FateStyle:
-    """How a fate is drawn. Colours tell apart for colour-blind eyes too (Okabe-Ito); the symbol says it again."""
+class OutcomeStyle:
+    """How an outcome is drawn. Colours tell apart for colour-blind eyes too (Okabe-Ito); the symbol says it again."""
 
     symbol: str
     color: int  # 0xRRGGBBAA
     meaning: str
 
 
-FATES: dict[str, FateStyle] = {
-    "accepted": FateStyle("✓", 0x009E73FF, "draft equal to the target's verdict"),
-    "relaxed": FateStyle("≈", 0x7BCB8FFF, "draft off the verdict by 1 to r bins, and kept"),
-    "rejected": FateStyle("×", 0xD1321FFF, "draft refused: here the path ended"),
-    "bonus": FateStyle("+", 0x56B4E9FF, "the target's verdict after a wholly accepted draft"),
-    "target": FateStyle("·", 0x6E7B8BFF, "decoded by the target without a draft"),
-    "compensated": FateStyle("~", 0xE69F00FF, "filled by a prediction instead of the target"),
-    "skipped": FateStyle("»", 0xF0E442FF, "executed without a verification"),
-    "dropped": FateStyle("–", 0x2E3238FF, "not executed: the rest of the chunk was dropped"),
+OUTCOMES: dict[str, OutcomeStyle] = {
+    "accepted": OutcomeStyle("✓", 0x009E73FF, "draft equal to the target token"),
+    "relaxed": OutcomeStyle("≈", 0x7BCB8FFF, "draft off the target token by 1 to r bins, and kept"),
+    "rejected": OutcomeStyle("×", 0xD1321FFF, "draft refused: here the path ended"),
+    "bonus": OutcomeStyle("+", 0x56B4E9FF, "the target token after a wholly accepted draft"),
+    "target": OutcomeStyle("·", 0x6E7B8BFF, "decoded by the target without a draft"),
+    "compensated": OutcomeStyle("~", 0xE69F00FF, "filled by a prediction instead of the target"),
+    "skipped": OutcomeStyle("»", 0xF0E442FF, "executed without a verification"),
+    "scripted": OutcomeStyle("=", 0x4E79A7FF, "an action without tokens: a scripted expert's"),
+    "dropped": OutcomeStyle("–", 0x2E3238FF, "not executed: the rest of the chunk was dropped"),
 }
-_DOF_NAMES = {4: ("dx", "dy", "dz", "gripper"), 7: ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")}
 
 
 @dataclass(frozen=True)
-class TokenFate:
-    """One place of a chunk. None where there was none: no draft, no verdict, no limit, no token known."""
+class TokenOutcome:
+    """One place of a chunk. None where there was none: no draft, no target token, no limit, no token known."""
 
-    fate: str  # a key of FATES
+    kind: str  # a key of OUTCOMES
     token: int | None = None  # what was committed
     draft: int | None = None
-    verdict: int | None = None
+    target: int | None = None
     limit: int | None = None  # r of this token's DoF, in bins
     round: int | None = None  # which round of the decode decided
 
     @property
     def short(self) -> str:
-        """`draft → verdict` where they differ, else the one token that there is; at most 9 characters."""
-        if self.draft is not None and self.verdict is not None and self.draft != self.verdict:
-            return f"{self.draft} → {self.verdict}"
-        known = next((x for x in (self.draft, self.verdict, self.token) if x is not None), None)
-        return FATES[self.fate].symbol if known is None else str(known)
-
-
-def dof_names(dofs: int) -> tuple[str, ...]:
-    """Names of the D degrees of freedom of one control step (METHODS §0)."""
-    return _DOF_NAMES.get(dofs, tuple(f"dof {i}" for i in range(dofs)))
+        """`draft → target token` where they differ, else the one token that there is; at most 9 characters."""
+        if self.draft is not None and self.target is not None and self.draft != self.target:
+            return f"{self.draft} → {self.target}"
+        known = next((x for x in (self.draft, self.target, self.token) if x is not None), None)
+        return OUTCOMES[self.kind].symbol if known is None else str(known)
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
@@ -64,71 +59,81 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
     return -(-most // dofs) * dofs
 
 
-def fates_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenFate]:
-    """The fate of each of the `size` tokens of a decode's chunk, in chunk order.
+def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome]:
+    """The outcome of each of the `size` tokens of a decode's chunk, in chunk order.
 
     A rejected place stays rejected, whoever filled it later; any other place that was not executed is dropped.
     """
-    fates: list[TokenFate | None] = [None] * size
+    outcomes: list[TokenOutcome | None] = [None] * size
     for number, played in enumerate(decode.rounds):
-        for place, fate in _fates_of_round(played, number):
-            before = fates[place]
-            if before is None or before.fate != "rejected":
-                fates[place] = fate
+        for place, outcome in _outcomes_of_round(played, number):
+            before = outcomes[place]
+            if before is None or before.kind != "rejected":
+                outcomes[place] = outcome
     executed = len(decode.actions) * dofs
     for place in range(max(0, executed - decode.compensated), executed):  # the prediction fills up the last steps
-        before = fates[place]
-        if before is None or before.fate != "rejected":
-            fates[place] = TokenFate("compensated")
-    return [_settled(fate, decode, place, place < executed) for place, fate in enumerate(fates)]
+        before = outcomes[place]
+        if before is None or before.kind != "rejected":
+            outcomes[place] = TokenOutcome("compensated")
+    return [_settled(outcome, decode, place, place < executed) for place, outcome in enumerate(outcomes)]
 
 
-def _fates_of_round(played: Round, number: int) -> list[tuple[int, TokenFate]]:
-    """(index in the chunk, fate) of what one round judged."""
+def _outcomes_of_round(played: Round, number: int) -> list[tuple[int, TokenOutcome]]:
+    """(index in the chunk, outcome) of what one round judged."""
     found = []
     for i in range(max(len(played.drafted), len(played.target_tokens))):
         draft = played.drafted[i] if i < len(played.drafted) else None
-        verdict = played.target_tokens[i] if i < len(played.target_tokens) else None
+        target = played.target_tokens[i] if i < len(played.target_tokens) else None
         place = played.start + i
         if played.mode == "skip":
-            fate = "skipped"
+            kind = "skipped"
         elif draft is None:
-            fate = "bonus" if played.drafted else "target"
+            kind = "bonus" if played.drafted else "target"
         elif i >= played.accepted:
-            fate = "rejected"
+            kind = "rejected"
         else:
-            fate = "accepted" if draft == verdict else "relaxed"
+            kind = "accepted" if draft == target else "relaxed"
         limit = played.threshold[place % len(played.threshold)] if played.threshold and draft is not None else None
-        found.append((place, TokenFate(fate, None, draft, verdict, limit, number)))
+        found.append((place, TokenOutcome(kind, None, draft, target, limit, number)))
     return found
 
 
-def _settled(fate: TokenFate | None, decode: DecodeRecord, place: int, executed: bool) -> TokenFate:
-    """The fate with its committed token, once it is known which control steps were executed."""
+def _settled(outcome: TokenOutcome | None, decode: DecodeRecord, place: int, executed: bool) -> TokenOutcome:
+    """The outcome with its committed token, once it is known which control steps were executed."""
     token = decode.tokens[place] if place < len(decode.tokens) else None
-    if fate is None:
-        fate = TokenFate("skipped" if decode.skipped or not decode.forwards else "target")
-    name = fate.fate if executed or fate.fate == "rejected" else "dropped"
-    return TokenFate(name, token, fate.draft, fate.verdict, fate.limit, fate.round)
+    if outcome is None:
+        outcome = TokenOutcome(_unjudged(decode))
+    kind = outcome.kind if executed or outcome.kind == "rejected" else "dropped"
+    return replace(outcome, kind=kind, token=token)
 
 
-def decode_table(decode: DecodeRecord, number: int, step: int, fates: Sequence[TokenFate], dofs: int) -> str:
-    """A decode as Markdown: one line about it and a row per token."""
-    names = dof_names(dofs)
+def _unjudged(decode: DecodeRecord) -> str:
+    """What a place is that no round of the decode tells about."""
+    if not decode.skipped and not decode.rounds and not decode.tokens:
+        return "scripted"
+    return "skipped" if decode.skipped or not decode.forwards else "target"
+
+
+def decode_table(
+    decode: DecodeRecord, number: int, step: int, outcomes: Sequence[TokenOutcome], names: Sequence[str]
+) -> str:
+    """A decode as Markdown: one line about it and a row per token. names: of the D DoFs."""
     lines = [
         f"**Decode {number} at step {step}: {decode.mode}**  ",
         decode_line(decode),
         "",
-        "| token | step | DoF | round | draft | verdict | off by | r | kept | fate |",
+        "| token | step | DoF | round | draft | target | off by | r | kept | outcome |",
         "|--:|--:|:--|--:|--:|--:|--:|--:|--:|:--|",
     ]
-    for place, fate in enumerate(fates):
-        both = fate.draft is not None and fate.verdict is not None
-        off = abs((fate.draft or 0) - (fate.verdict or 0)) if both else None
-        numbers = [_cell(x) for x in (fate.round, fate.draft, fate.verdict, off, fate.limit, fate.token)]
-        word = f"{FATES[fate.fate].symbol} {fate.fate}"
-        word = f"**{word}**" if fate.fate == "rejected" else word
-        lines.append(f"| {place} | {place // dofs} | {names[place % dofs]} | {' | '.join(numbers)} | {word} |")
+    for place, outcome in enumerate(outcomes):
+        off = None
+        if outcome.draft is not None and outcome.target is not None:
+            off = abs(outcome.draft - outcome.target)
+        numbers = (outcome.round, outcome.draft, outcome.target, off, outcome.limit, outcome.token)
+        word = f"{OUTCOMES[outcome.kind].symbol} {outcome.kind}"
+        word = f"**{word}**" if outcome.kind == "rejected" else word
+        row = (place, place // len(names), names[place % len(names)], *map(_cell, numbers), word)
+        lines.append(f"| {' | '.join(map(str, row))} |")
     return "\n".join(lines)
 
 
@@ -147,7 +152,7 @@ def decode_line(decode: DecodeRecord) -> str:
 
 
 def acceptance(decode: DecodeRecord) -> tuple[float, float]:
-    """AL (tokens committed per verification) and accepted per round (METHODS §7) of a decode that verified."""
+    """AL (tokens committed per verification) and accepted per round (docs/methods.md §7) of a decode that verified."""
     rounds = [r for r in decode.rounds if r.tree_size > 0 and r.mode != "skip"]
     return sum(r.committed for r in rounds) / len(rounds), sum(r.accepted for r in rounds) / len(rounds)
 

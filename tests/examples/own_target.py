@@ -1,8 +1,8 @@
 """Example: a target of your own in one file. It needs no transformer, only `kerv_cli/targets/protocol.py`.
 
-Its hidden state is a sum over all that is visible, weighted by position, so a wrong mask, position or cache entry changes
-its tokens: the tests of the decode loop run on it. `KERV_PLUGINS=own_target` registers it, and every command then loads
-targets whose `target.json` says `"family": "mock"`.
+Its hidden state is a sum over all that is visible, weighted by position, so a wrong mask, position or cache entry
+changes its tokens: the tests of the decode loop run on it. `KERV_PLUGINS=examples.own_target` registers it, and every
+command then loads targets whose `target.json` says `"family": "mock"`.
 """
 
 from __future__ import annotations

@@ -4,15 +4,70 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, load_episode
-from kerv_cli.environments.metaworld.spec import ACTIONS, OBSERVATION
+from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of
+from kerv_cli.manifests import read
 from kerv_cli.spaces import ActionSpace, ObservationSpace
+
+FORMAT = 2
+"""Of manifests. Format 1 did not name the environment, since there was only Meta-World."""
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """What the manifest tells of one episode; `steps` are control steps up to the success, `sha256` is the file's."""
+
+    seed: int
+    perturbed: bool
+    steps: int
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """The episodes of one task, by seed."""
+
+    episodes: tuple[EpisodeEntry, ...]
+    mean_steps: float = 0.0
+    failed_seeds: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class DemoManifest:
+    """What `kerv demos` recorded.
+
+    environment, actions, observation: of the tasks' environment. config: the fields of DemoConfig but for the workers.
+    versions: of the packages that the physics and the frames depend on. sha256: over the hashes of all episode files.
+    seeds: the first and the last. missing: episodes that were asked for and whose experts failed.
+    """
+
+    format: int
+    environment: str
+    actions: ActionSpace
+    observation: ObservationSpace
+    config: dict[str, Any]
+    tasks: dict[str, TaskEntry]
+    sha256: str
+    versions: dict[str, str] = field(default_factory=dict)
+    seeds: dict[str, int] = field(default_factory=dict)
+    episodes: int = 0
+    missing: int = 0
+
+
+def with_environment(value: Mapping[str, Any]) -> dict[str, Any]:
+    """A recording's or a manifest's JSON in today's format: one of format 1 is of Meta-World."""
+    if value["format"] != 1:
+        return dict(value)
+    from kerv_cli.environments.metaworld.spec import SPEC
+
+    spaces = {"actions": SPEC.actions.as_dict(), "observation": SPEC.observation.as_dict()}
+    return {**value, "format": FORMAT, "environment": SPEC.name, **spaces}
 
 
 def episode_path(out: Path, task: str, seed: int) -> Path:
@@ -21,7 +76,7 @@ def episode_path(out: Path, task: str, seed: int) -> Path:
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Hex hash over the episode files' hashes, for a manifest's `tasks`."""
+    """Hex hash over the episode files' hashes, for the JSON of a manifest's `tasks`."""
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
         for episode in summary["episodes"]:
@@ -30,16 +85,11 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class DemoEntry:
-    """What the manifest tells of one episode; `steps` are control steps up to the success, `sha256` is the file's."""
+class DemoEntry(EpisodeEntry):
+    """An episode of a dataset, and its file."""
 
     task: str
-    seed: int
-    perturbed: bool
-    steps: int
     path: Path
-    bytes: int
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -48,33 +98,18 @@ class DemoDataset:
 
     Attributes:
         path: the dataset's folder.
-        manifest: as `record` returned it.
+        manifest: what was recorded.
         episodes: one entry per episode, by task in the recording's order, then by seed.
     """
 
     path: Path
-    manifest: dict[str, Any]
+    manifest: DemoManifest
     episodes: list[DemoEntry]
 
     @property
     def sha256(self) -> str:
         """Hex hash over the hashes of all episode files: two datasets with the same hash are the same."""
-        return str(self.manifest["sha256"])
-
-    @property
-    def environment(self) -> str:
-        """Name of the environment it was recorded in; what was recorded before there was more than one has none."""
-        return str(self.manifest.get("environment", "metaworld"))
-
-    @property
-    def actions(self) -> ActionSpace:
-        """Its environment's action space."""
-        return ACTIONS
-
-    @property
-    def observation(self) -> ObservationSpace:
-        """Its environment's observation space."""
-        return OBSERVATION
+        return self.manifest.sha256
 
     @classmethod
     def open(cls, path: Path) -> DemoDataset:
@@ -88,20 +123,12 @@ class DemoDataset:
             if (path / "recording.json").exists():
                 raise CheckpointError(f"the demonstrations in {path} are unfinished: run 'kerv demos' again to go on")
             raise CheckpointError(f"no demonstrations in {path}: record them with 'kerv demos'")
-        manifest = read_json(path / "manifest.json")
-        try:
-            if manifest["format"] != FORMAT:
-                raise CheckpointError(f"{path} has format {manifest['format']}, this kerv reads {FORMAT}")
-            entries = [
-                DemoEntry(task, path=episode_path(path, task, entry["seed"]), **entry)
-                for task, summary in manifest["tasks"].items()
-                for entry in summary["episodes"]
-            ]
-            intact = manifest["sha256"] == dataset_hash(manifest["tasks"])
-        except (KeyError, TypeError, AttributeError) as error:
-            raise CheckpointError(f"{path / 'manifest.json'} is damaged: {error}") from error
-        if not intact:
-            raise CheckpointError(f"{path / 'manifest.json'} is damaged: its hash does not fit its episodes")
+        manifest = _read_manifest(path / "manifest.json")
+        entries = [
+            DemoEntry(**asdict(entry), task=task, path=episode_path(path, task, entry.seed))
+            for task, summary in manifest.tasks.items()
+            for entry in summary.episodes
+        ]
         for entry in entries:
             if not entry.path.is_file() or entry.path.stat().st_size != entry.bytes:
                 raise CheckpointError(f"{entry.path} is missing or cut short: run 'kerv demos' again to restore it")
@@ -116,4 +143,16 @@ class DemoDataset:
         entry = self.episodes[index]
         if sha256_of(entry.path) != entry.sha256:
             raise CheckpointError(f"{entry.path} changed since it was recorded: delete it and run 'kerv demos' again")
-        return load_episode(entry.path)
+        return load_episode(entry.path, self.manifest.actions, self.manifest.observation)
+
+
+def _read_manifest(path: Path) -> DemoManifest:
+    value = read_json(path)
+    found = value.get("format") if isinstance(value, dict) else None
+    if found not in (1, FORMAT):
+        raise CheckpointError(f"{path} has format {found}, this kerv reads {FORMAT} and 1")
+    value = with_environment(value)
+    manifest = read(DemoManifest, value, str(path))
+    if manifest.sha256 != dataset_hash(value["tasks"]):
+        raise CheckpointError(f"{path} is damaged: its hash does not fit its episodes")
+    return manifest

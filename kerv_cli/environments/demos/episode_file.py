@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.metaworld.world import ACTION_SIZE, STATE_SIZE
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path
+from kerv_cli.spaces import ActionSpace, ObservationSpace
 
 FORMAT = 1
+"""Of episode files."""
+_INITIAL_STATE = "rand_vec"  # the tensor's name in files: format 1 took it from Meta-World
 _LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
 
 
@@ -31,10 +33,10 @@ class DemoEpisode:
         steps: T.
         frames: (n, size, size, 3) uint8, the frames before the actions of `frame_steps`.
         frame_steps: (n,) int64.
-        states: (T, 39) float32, privileged state before each action.
-        labels: (T + tail, 4) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
-        executed: (T, 4) float32, the actions that moved the robot.
-        rand_vec: (3,) or (6,) float64, object and goal placement.
+        states: (T, s) float32, privileged state before each action; it begins with the proprioception.
+        labels: (T + tail, D) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
+        executed: (T, D) float32, the actions that moved the robot.
+        initial_state: (n,) float64, what distinguishes the episode's start from others, e.g. object and goal placement.
     """
 
     task: str
@@ -46,11 +48,11 @@ class DemoEpisode:
     states: NDArray[np.float32]
     labels: NDArray[np.float32]
     executed: NDArray[np.float32]
-    rand_vec: NDArray[np.float64]
+    initial_state: NDArray[np.float64]
 
     @property
     def end_effector(self) -> NDArray[np.float32]:
-        """(T, 3) float32: the hand's position in metres before each action."""
+        """(T, 3) float32: its position in metres before each action."""
         return self.states[:, :3]
 
 
@@ -70,7 +72,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "states": episode.states,
         "labels": episode.labels,
         "executed": episode.executed,
-        "rand_vec": episode.rand_vec,
+        _INITIAL_STATE: episode.initial_state,
     }
     metadata = {
         "format": str(FORMAT),
@@ -99,11 +101,11 @@ def _with_sorted_metadata(data: bytes) -> bytes:
     return _LENGTH.pack(len(text)) + text + data[start:]
 
 
-def load_episode(path: Path) -> DemoEpisode:
-    """Reads one episode.
+def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace) -> DemoEpisode:
+    """Reads one episode of an environment with these spaces.
 
     Raises:
-        CheckpointError: the file is missing, damaged or of another format.
+        CheckpointError: the file is missing, damaged, of another format or of other spaces.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -113,18 +115,24 @@ def load_episode(path: Path) -> DemoEpisode:
             if metadata.get("format") != str(FORMAT):
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        return _episode_from(arrays, metadata)
+        return _episode_from(arrays, metadata, actions.dofs, observation.state)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error
 
 
-def _episode_from(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> DemoEpisode:
+def _episode_from(
+    arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str], dofs: int, state: int
+) -> DemoEpisode:
     offsets, png = arrays["png_offsets"], arrays["png"].tobytes()
     frames = [_decode_png(png[start:end]) for start, end in itertools.pairwise(offsets)]
     steps = int(metadata["steps"])
-    if arrays["states"].shape != (steps, STATE_SIZE) or arrays["executed"].shape != (steps, ACTION_SIZE):
-        raise ValueError(f"the arrays do not hold {steps} steps")
-    if len(arrays["labels"]) < steps or len(arrays["frame_steps"]) != len(frames):
+    if arrays["states"].shape != (steps, state) or arrays["executed"].shape != (steps, dofs):
+        raise ValueError(f"the arrays do not hold {steps} steps of {state} state numbers and {dofs} DoFs")
+    if (
+        len(arrays["labels"]) < steps
+        or arrays["labels"].shape[1:] != (dofs,)
+        or len(arrays["frame_steps"]) != len(frames)
+    ):
         raise ValueError("labels or frames are too few")
     return DemoEpisode(
         task=metadata["task"],
@@ -136,7 +144,7 @@ def _episode_from(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str
         states=arrays["states"],
         labels=arrays["labels"],
         executed=arrays["executed"],
-        rand_vec=arrays["rand_vec"],
+        initial_state=arrays[_INITIAL_STATE],
     )
 
 

@@ -20,19 +20,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.camera import CameraConfig, choose_backend
-from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry, dataset_hash, episode_path
-from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, load_episode, save_episode
+from kerv_cli.environments.demos.dataset import FORMAT, DemoManifest, dataset_hash, episode_path, with_environment
+from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.environments.metaworld.tasks import resolve_tasks
-from kerv_cli.environments.metaworld.world import MAX_HORIZON, Expert, Observation, World
+from kerv_cli.environments.spec import EnvironmentSpec, Expert, World
 from kerv_cli.errors import CheckpointError, KervError, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
+from kerv_cli.manifests import read
+from kerv_cli.spaces import Observation
 
-__all__ = ["DemoConfig", "DemoDataset", "DemoEntry", "DemoEpisode", "record", "run_expert"]
-
-MAX_TRAINING_SEED = 99_999
-"""Demonstrations use seeds up to this one; evaluation starts at 100000, so the two never meet."""
 _SEEDS_PER_JOB = 5
 _EXTRA_ATTEMPTS = 20
 """Seeds tried beyond the requested range: this many, plus one per requested episode."""
@@ -43,17 +41,18 @@ class DemoConfig:
     """What to record.
 
     Attributes:
-        tasks: tasks and suites.
+        tasks: tasks and suites of one environment.
         episodes: successful episodes per task.
-        first_seed: seeds start here, per task.
+        first_seed: seeds start here, per task; seeds for selection and evaluation are refused.
         perturbed: fraction of episodes executed with noise; which ones follows from the seed.
-        noise_low, noise_high: range of the Gaussian noise's standard deviation on xyz, drawn once per episode.
+        noise_low, noise_high: range of the Gaussian noise's standard deviation on the DoFs that are not strict, drawn
+            once per episode; half of a DoF's range is 1.
         burst_probability: chance per step that a burst starts: 3 to 8 steps in one random direction.
-        camera: the frames' view.
+        camera: the frames' view; the environment's first camera unless it is named.
         frame_stride: control steps per recorded frame.
         tail: labels recorded beyond success, so that an action chunk that starts near the end has true labels.
         workers: processes; changes nothing in the result.
-        horizon: control steps within which the expert must succeed.
+        horizon: control steps within which the expert must succeed; 0: the environment's.
     """
 
     tasks: tuple[str, ...]
@@ -67,52 +66,58 @@ class DemoConfig:
     frame_stride: int = 1
     tail: int = 8
     workers: int = 2
-    horizon: int = MAX_HORIZON
+    horizon: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
-        last = self.first_seed + self.episodes - 1
+        object.__setattr__(self, "camera", self.spec.camera(self.camera))
+        object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon))
+        most = self.spec.horizon
         checks = {
-            "name at least one task": bool(self.tasks),
             f"episodes must be 1 or more, not {self.episodes}": self.episodes >= 1,
-            f"the first seed must be 0 or more, not {self.first_seed}": self.first_seed >= 0,
-            f"seeds from {MAX_TRAINING_SEED + 1} on are for evaluation: {last} is too high": last <= MAX_TRAINING_SEED,
             f"perturbed must lie between 0 and 1, not {self.perturbed}": 0.0 <= self.perturbed <= 1.0,
             "noise must satisfy 0 <= noise_low <= noise_high": 0.0 <= self.noise_low <= self.noise_high,
             "burst_probability must lie between 0 and 1": 0.0 <= self.burst_probability <= 1.0,
             f"frame_stride must be 1 or more, not {self.frame_stride}": self.frame_stride >= 1,
-            f"tail must lie between 0 and {MAX_HORIZON - 1}, not {self.tail}": 0 <= self.tail < MAX_HORIZON,
+            f"tail must lie between 0 and {most - 1}, not {self.tail}": 0 <= self.tail < most,
             f"workers must be 1 or more, not {self.workers}": self.workers >= 1,
-            f"horizon must lie between 1 and {MAX_HORIZON}": 1 <= self.horizon <= MAX_HORIZON,
         }
         wrong = [message for message, holds in checks.items() if not holds]
         if wrong:
             raise UsageError(f"demonstrations: {wrong[0]}")
+        ends = self.first_seed, self.first_seed + self.episodes - 1
+        self.spec.seeds.check(ends, "training", "demonstrations")
+
+    @property
+    def spec(self) -> EnvironmentSpec:
+        """The tasks' environment."""
+        return spec_of(self.tasks[0])
 
     @property
     def seed_limit(self) -> int:
         """One past the last seed that may be tried when experts fail."""
-        return min(self.first_seed + 2 * self.episodes + _EXTRA_ATTEMPTS, MAX_TRAINING_SEED + 1)
+        return min(self.first_seed + 2 * self.episodes + _EXTRA_ATTEMPTS, self.spec.seeds.training.stop)
 
 
 def run_expert(world: World, seed: int, config: DemoConfig) -> DemoEpisode | None:
     """Runs one episode; None when the expert did not succeed within the horizon.
 
-    An episode also counts as failed when its tail would not fit the simulator's 500 steps.
+    An episode also counts as failed when its tail would not fit the steps that the simulator runs.
     """
-    expert = Expert(world.task)
+    expert = world.spec.expert(world.task)
     perturbed = is_perturbed(seed, config.perturbed)
     noise = (config.noise_low, config.noise_high)
-    perturb = Perturbation(world.task, seed, noise, config.burst_probability) if perturbed else None
+    space = world.spec.actions
+    perturb = Perturbation(world.task, seed, space, noise, config.burst_probability) if perturbed else None
     observation = world.reset(seed)
     states, labels, executed, frames, frame_steps = [], [], [], [], []
-    last_step = min(config.horizon, MAX_HORIZON - config.tail)
-    while not observation.success:
-        if observation.step >= last_step:
+    last_step = min(config.horizon, world.horizon - config.tail)
+    while not world.success:
+        if world.steps >= last_step:
             return None
-        if observation.step % config.frame_stride == 0:
+        if world.steps % config.frame_stride == 0:
             frames.append(world.frame())
-            frame_steps.append(observation.step)
+            frame_steps.append(world.steps)
         label = expert(observation)
         action = perturb(label) if perturb else label
         states.append(observation.state)
@@ -130,7 +135,7 @@ def run_expert(world: World, seed: int, config: DemoConfig) -> DemoEpisode | Non
         states=np.array(states, dtype=np.float32),
         labels=np.array(labels, dtype=np.float32),
         executed=np.array(executed, dtype=np.float32),
-        rand_vec=world.rand_vec,
+        initial_state=world.initial_state,
     )
 
 
@@ -142,7 +147,7 @@ def _tail_labels(world: World, expert: Expert, observation: Observation, tail: i
     return labels
 
 
-def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None = None) -> dict[str, Any]:
+def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None = None) -> DemoManifest:
     """Records demonstrations into the folder `out`; a killed run goes on where it stopped.
 
     A seed whose expert fails is replaced by the next one beyond the range, up to `config.seed_limit`. Which episodes
@@ -173,7 +178,7 @@ def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None
         _release_world()
     manifest = {**identity, **_summary(config, kept, failed)}
     write_json(out / "manifest.json", manifest)
-    return manifest
+    return read(DemoManifest, manifest, str(out / "manifest.json"))
 
 
 _Entries = dict[str, list[dict[str, Any]]]  # task -> the manifest's entries
@@ -210,10 +215,19 @@ def _next_seeds(config: DemoConfig, kept: int, tried: range) -> range:
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
-    settings = json.loads(json.dumps(asdict(config)))
+    settings = asdict(config)
     del settings["workers"]
-    versions = {name: version(name) for name in ("metaworld", "mujoco", "numpy")}
-    return {"format": FORMAT, "config": settings, "versions": {**versions, "python": platform.python_version()}}
+    spec = config.spec
+    versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
+    identity = {
+        "format": FORMAT,
+        "environment": spec.name,
+        "actions": spec.actions.as_dict(),
+        "observation": spec.observation.as_dict(),
+        "config": settings,
+        "versions": versions,
+    }
+    return dict(json.loads(json.dumps(identity)))  # as it will be read back: lists for tuples
 
 
 def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
@@ -222,8 +236,9 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
         write_json(path, identity)
         return
     there = read_json(path)
+    packages = spec_of(identity["config"]["tasks"][0]).packages
     try:
-        here, before = _comparable(identity), _comparable(there)
+        here, before = _comparable(identity, packages), _comparable(there, packages)
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} is damaged: {error} is not in it") from error
     if here != before:
@@ -233,11 +248,12 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
         )
 
 
-def _comparable(identity: Mapping[str, Any]) -> dict[str, Any]:
+def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[str, Any]:
     # Another Python or numpy may go on with a recording; another simulator would be another world.
-    versions = identity["versions"]
-    simulator = {name: versions[name] for name in ("metaworld", "mujoco")}
-    return {"format": identity["format"], **identity["config"], **simulator}
+    identity = json.loads(json.dumps(with_environment(identity)))
+    same = ("environment", "format", "actions", "observation")
+    versions = {name: identity["versions"].get(name) for name in packages}
+    return {**{key: identity[key] for key in same}, **identity["config"], **versions}
 
 
 _Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, None where the expert failed
@@ -267,7 +283,7 @@ def _record_seed(config: DemoConfig, out: Path, task: str, seed: int) -> dict[st
     path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
     if failure.exists():
         return None
-    episode = _valid_episode(path, task, seed)
+    episode = _valid_episode(path, task, seed, config.spec)
     if episode is None:
         episode = run_expert(_world_for(task, config), seed, config)
         if episode is None:
@@ -287,7 +303,7 @@ def _world_for(task: str, config: DemoConfig) -> World:
     global _world
     if _world is None or (_world.task, _world.camera) != (task, config.camera):
         _release_world()
-        _world = World(task, config.camera)
+        _world = config.spec.open_world(task, config.camera)
     return _world
 
 
@@ -298,9 +314,9 @@ def _release_world() -> None:
     _world = None
 
 
-def _valid_episode(path: Path, task: str, seed: int) -> DemoEpisode | None:
+def _valid_episode(path: Path, task: str, seed: int, spec: EnvironmentSpec) -> DemoEpisode | None:
     try:
-        episode = load_episode(path)
+        episode = load_episode(path, spec.actions, spec.observation)
     except CheckpointError:
         return None
     return episode if (episode.task, episode.seed) == (task, seed) else None

@@ -1,26 +1,44 @@
-"""Meta-World's spaces: what its robot observes and does."""
+"""Meta-World v3: all numbers of it that anything else needs."""
 
 from __future__ import annotations
 
+from kerv_cli.environments.metaworld.tasks import DIFFICULTIES, SUFFIX, SUITES, TASKS
+from kerv_cli.environments.spec import EnvironmentSpec, Seeds
 from kerv_cli.spaces import ActionSpace, Group, ObservationSpace, Place
 
-ACTIONS = ActionSpace(
-    names=("dx", "dy", "dz", "gripper"),
-    groups=(Group("position", 3), Group("gripper", 1)),
-    strict=("gripper",),
-    control_hz=80.0,
-    low=(-1.0,) * 4,
-    high=(1.0,) * 4,
-)
-"""End-effector displacement per control step, and the gripper."""
+_OBJECTS = 18  # numbers of a time step: hand xyz, gripper opening, then position and rotation of two objects
 
-OBSERVATION = ObservationSpace(
-    proprioception=("x", "y", "z", "gripper"),
-    state=39,
-    places=(Place("object", 4), Place("goal", 36)),
-    centre=(0.0, 0.7, 0.15),
-    extra_places=(Place("second object", 11),),
-    extra=tuple(range(7, 18)),  # rotation of the object, the second object
-    previous=(18, 18),
+SPEC = EnvironmentSpec(
+    name="metaworld",
+    actions=ActionSpace(
+        # hand displacement per axis (1 is 1 cm) and gripper (+1 closes)
+        names=("dx", "dy", "dz", "gripper"),
+        groups=(Group("position", 3), Group("gripper", 1)),
+        strict=("gripper",),
+        control_hz=80.0,
+        low=(-1.0, -1.0, -1.0, -1.0),
+        high=(1.0, 1.0, 1.0, 1.0),
+    ),
+    observation=ObservationSpace(
+        # hand [0:4], first object [4:11], second object [11:18], the step before's 18 numbers [18:36], goal [36:39]
+        proprioception=("x", "y", "z", "gripper"),
+        state=39,
+        places=(Place("object", 4), Place("goal", 36)),
+        centre=(0.0, 0.7, 0.15),
+        extra_places=(Place("second object", 11),),
+        extra=tuple(range(7, _OBJECTS)),
+        previous=(_OBJECTS, _OBJECTS),
+    ),
+    tasks=TASKS,
+    suites=SUITES,
+    difficulties=DIFFICULTIES,
+    horizon=500,  # the simulator refuses the step after
+    # corner4 is the literature's view
+    cameras=("corner4", "corner", "corner2", "corner3", "topview", "behindGripper", "gripperPOV"),
+    upside_down=("corner", "corner2", "corner3", "corner4"),
+    seeds=Seeds(training=range(50_000), selection=range(50_000, 100_000), evaluation=range(100_000, 2**31)),
+    world_class="kerv_cli.environments.metaworld.world:MetaWorld",
+    expert_class="kerv_cli.environments.metaworld.world:MetaWorldExpert",
+    suffix=SUFFIX,
+    packages=("metaworld", "mujoco"),
 )
-"""The state holds hand, gripper, two objects, the same of the step before, and the goal."""

@@ -5,31 +5,17 @@ Tasks are joined by name, never by index: published tables order them differentl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from types import MappingProxyType
+from collections.abc import Mapping
 
-from kerv_cli.errors import UnknownName
+from kerv_cli.environments.spec import Task
 
+SUFFIX = "-v3"
 DIFFICULTIES = ("easy", "medium", "hard", "very_hard")
+"""The groups that published macro averages use."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """One manipulation task.
-
-    Attributes:
-        name: Meta-World v3 name, e.g. `drawer-open-v3`.
-        instruction: what the robot is told: lower-case words, ten at most, unique among the 50.
-        difficulty: `easy`, `medium`, `hard` or `very_hard` (the groups that published macro averages use).
-    """
-
-    name: str
-    instruction: str
-    difficulty: str
-
-
-# The public table has one sentence for push and push-back. These 50 are distinct, and say what the experts do.
+# Lower-case words, ten at most, by stem of the task's name. The public table has one sentence for push and push-back;
+# these 50 are distinct, and say what the experts do.
 _INSTRUCTIONS: dict[str, dict[str, str]] = {
     "easy": {
         "button-press": "press the button",
@@ -107,44 +93,18 @@ _MT10 = (
 
 def _all_tasks() -> Mapping[str, Task]:
     tasks = [
-        Task(f"{stem}-v3", instruction, difficulty)
+        Task(f"{stem}{SUFFIX}", instruction, difficulty)
         for difficulty, group in _INSTRUCTIONS.items()
         for stem, instruction in group.items()
     ]
-    return MappingProxyType({task.name: task for task in sorted(tasks, key=lambda task: task.name)})
+    return {task.name: task for task in sorted(tasks, key=lambda task: task.name)}
 
 
 TASKS: Mapping[str, Task] = _all_tasks()
 """All 50 tasks by full name, in alphabetical order."""
 
-SUITES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"MT10": tuple(f"{stem}-v3" for stem in _MT10), "MT50": tuple(TASKS)}
-)
+SUITES: Mapping[str, tuple[str, ...]] = {"MT10": tuple(f"{stem}{SUFFIX}" for stem in _MT10), "MT50": tuple(TASKS)}
 """Suite name -> full task names."""
 
-
-def task(name: str) -> Task:
-    """The task called `name`; the `-v3` suffix may be left out.
-
-    Raises:
-        UnknownName: no such task; the message names the nearest ones.
-    """
-    found = TASKS.get(name) or TASKS.get(f"{name}-v3")
-    if found is None:
-        raise UnknownName("task", name, TASKS)
-    return found
-
-
-def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
-    """Full task names for a list of tasks and suites (`MT10`, `mt50`): order kept, duplicates dropped.
-
-    Raises:
-        UnknownName: a name that is neither a task nor a suite.
-    """
-    resolved: dict[str, None] = {}
-    for name in names:
-        suite = SUITES.get(name.upper())
-        if suite is None and name not in TASKS and f"{name}-v3" not in TASKS:
-            raise UnknownName("task or suite", name, [*SUITES, *TASKS])
-        resolved.update(dict.fromkeys(suite or (task(name).name,)))
-    return tuple(resolved)
+NAMES = (*SUITES, *TASKS)
+"""Suites and tasks, for completion."""

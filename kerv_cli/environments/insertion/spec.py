@@ -1,0 +1,41 @@
+"""Insertion: a free-flying gripper with OpenVLA's seven degrees of freedom, a flat peg and a slot that it fits one way.
+
+Small on purpose: it shows that nothing of Meta-World is built into kerv, and its tasks need rotation.
+"""
+
+from __future__ import annotations
+
+from kerv_cli.environments.insertion.tasks import DIFFICULTIES, SUITES, TASKS
+from kerv_cli.environments.spec import EnvironmentSpec, Seeds
+from kerv_cli.spaces import ActionSpace, Group, ObservationSpace, Place
+
+SPEC = EnvironmentSpec(
+    name="insertion",
+    actions=ActionSpace(
+        # per control step: displacement in metres, rotation vector in radians, both in the world's axes; the gripper's
+        # wanted opening, 0 closed, 1 open
+        names=("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper"),
+        groups=(Group("position", 3), Group("rotation", 3), Group("gripper", 1)),
+        strict=("gripper",),
+        control_hz=20.0,
+        low=(-0.01, -0.01, -0.01, -0.06, -0.06, -0.06, 0.0),
+        high=(0.01, 0.01, 0.01, 0.06, 0.06, 0.06, 1.0),
+    ),
+    observation=ObservationSpace(
+        # hand [0:7]; peg [7:10] and mouth of the slot [10:13], metres; rotation vectors of slot [13:16] and peg [16:19]
+        proprioception=("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
+        state=19,
+        places=(Place("peg", 7), Place("slot", 10)),
+        centre=(0.0, 0.0, 0.12),
+        extra=tuple(range(13, 19)),
+    ),
+    tasks=TASKS,
+    suites=SUITES,
+    difficulties=DIFFICULTIES,
+    horizon=120,
+    cameras=("front", "top", "wrist"),
+    seeds=Seeds(training=range(50_000), selection=range(50_000, 100_000), evaluation=range(100_000, 2**31)),
+    world_class="kerv_cli.environments.insertion.world:InsertionWorld",
+    expert_class="kerv_cli.environments.insertion.expert:InsertionExpert",
+    packages=("mujoco",),
+)

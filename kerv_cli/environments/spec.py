@@ -1,0 +1,234 @@
+"""What kerv knows of an environment, as data, and what it needs of a simulator: a world and an expert.
+
+Imports nothing heavy, so that tables of tasks can be read for completion.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.registry import load
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
+
+    from kerv_cli.environments.camera import CameraConfig
+    from kerv_cli.spaces import ActionSpace, Observation, ObservationSpace
+
+
+@dataclass(frozen=True)
+class Task:
+    """One manipulation task.
+
+    name: unique over all environments. instruction: what the robot is told. difficulty: the group whose tasks are
+    averaged together.
+    """
+
+    name: str
+    instruction: str
+    difficulty: str
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Three ranges of episode seeds, so that what is trained, what is tuned and what is reported never share a world.
+
+    Raises:
+        ValueError: two ranges overlap.
+    """
+
+    training: range
+    selection: range
+    evaluation: range
+
+    def __post_init__(self) -> None:
+        ordered = sorted((self.training, self.selection, self.evaluation), key=lambda seeds: seeds.start)
+        if any(a.stop > b.start for a, b in itertools.pairwise(ordered)):
+            raise ValueError(f"ranges of seeds overlap: {ordered}")
+
+    def check(self, seeds: Iterable[int], purpose: str, what: str) -> None:
+        """Refuse seeds that are not for `purpose`: training, selection or evaluation. what: names them in the message.
+
+        Raises:
+            UsageError: the first seed outside the range.
+        """
+        allowed: range = getattr(self, purpose)
+        wrong = next((seed for seed in seeds if seed not in allowed), None)
+        if wrong is None:
+            return
+        kinds = [name for name in ("training", "selection", "evaluation") if wrong in getattr(self, name)]
+        kind = f"is for {kinds[0]}" if kinds else "is none"
+        raise UsageError(f"{what}: seed {wrong} {kind}; seeds for {purpose} are {allowed.start} to {allowed.stop - 1}")
+
+
+class World(Protocol):
+    """One task's simulator, reused over episodes; one per process, made after the process started.
+
+    spec: its environment. task: full name. instruction: what the robot is told. camera: what `frame()` draws.
+    horizon: control steps per episode. steps: executed since the reset. success: the task's flag at this step; it may
+    be lost again. succeeded: whether it was set at any step of this episode.
+    """
+
+    spec: EnvironmentSpec
+    task: str
+    instruction: str
+    camera: CameraConfig
+    horizon: int
+    steps: int
+    success: bool
+    succeeded: bool
+
+    def reset(self, seed: int) -> Observation:
+        """Starts the episode that `seed` names: the same on every machine with the same simulator versions.
+
+        Raises:
+            UsageError: a negative seed.
+        """
+
+    def step(self, action: ArrayLike) -> Observation:
+        """Executes one control step of an action (D,) in environment units, clipped to the action space's limits.
+
+        Raises:
+            KervError: past the horizon, before the first reset, or an action that is not D finite numbers.
+        """
+
+    def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
+        """(size, size, 3) uint8 RGB, upright, of the current state.
+
+        Raises:
+            RenderingUnavailable: nothing can be drawn here.
+        """
+
+    def observe(self, cameras: Sequence[str]) -> Observation:
+        """The latest observation with an image of each of these cameras, drawn now; nothing else is drawn."""
+
+    @property
+    def observation(self) -> Observation:
+        """The latest observation, without images. Raises KervError before the first reset."""
+
+    @property
+    def done(self) -> bool:
+        """Whether the episode succeeded at any step so far, or reached the horizon."""
+
+    @property
+    def initial_state(self) -> NDArray[np.float64]:
+        """(n,) all that distinguishes this episode's start from others of the task, e.g. where the object lies."""
+
+    @property
+    def end_effector(self) -> NDArray[np.float64]:
+        """(3,) metres, in the simulator's world frame."""
+
+    @property
+    def gripper(self) -> float:
+        """Opening, 0 closed to 1 open; 1 where there is no gripper."""
+
+    def close(self) -> None:
+        """Frees simulator and graphics; a later reset builds them anew."""
+
+    def __enter__(self) -> World: ...
+
+    def __exit__(self, *exception: object) -> None: ...
+
+
+class Expert(Protocol):
+    """A scripted controller of one task. It reads the privileged state and keeps none of its own."""
+
+    def __call__(self, observation: Observation) -> NDArray[np.float64]:
+        """The action (D,) in environment units, within the action space's limits."""
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """An environment: everything about it that is not its simulator.
+
+    name: as registered. actions: with the environment's limits as normalisation. observation: the privileged state
+    begins with the proprioception. tasks: by full name. suites: name in capitals -> full task names. difficulties:
+    groups of tasks, in the order of tables. horizon: control steps of an episode, the most that the simulator runs.
+    cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
+    with (spec, task, camera, horizon) and with (spec, task). upside_down: cameras whose images come out rotated by
+    180 degrees. suffix: of all full task names, which may be left out. packages: whose versions decide the physics.
+    """
+
+    name: str
+    actions: ActionSpace
+    observation: ObservationSpace
+    tasks: Mapping[str, Task]
+    suites: Mapping[str, tuple[str, ...]]
+    difficulties: tuple[str, ...]
+    horizon: int
+    cameras: tuple[str, ...]
+    seeds: Seeds
+    world_class: str
+    expert_class: str
+    upside_down: tuple[str, ...] = ()
+    suffix: str = ""
+    packages: tuple[str, ...] = ()
+
+    def full_name(self, task: str) -> str | None:
+        """The task's full name; None when it is none of this environment's."""
+        return next((name for name in (task, task + self.suffix) if name in self.tasks), None)
+
+    def task(self, name: str) -> Task:
+        """The task of that full or short name.
+
+        Raises:
+            UnknownName: there is none; the message names the nearest ones.
+        """
+        full = self.full_name(name)
+        if full is None:
+            raise UnknownName("task", name, self.tasks)
+        return self.tasks[full]
+
+    def expand(self, name: str) -> tuple[str, ...]:
+        """Full names of the suite's tasks, or of the one task; empty when the environment knows neither."""
+        suite = self.suites.get(name.upper())
+        full = self.full_name(name)
+        return suite or ((full,) if full else ())
+
+    def camera_name(self, name: str = "") -> str:
+        """The camera itself, or the environment's first where none is named.
+
+        Raises:
+            UnknownName: the environment has no such camera.
+        """
+        if name and name not in self.cameras:
+            raise UnknownName("camera", name, self.cameras)
+        return name or self.cameras[0]
+
+    def camera(self, config: CameraConfig | None = None) -> CameraConfig:
+        """The view with its camera named; raises as `camera_name`."""
+        from dataclasses import replace
+
+        from kerv_cli.environments.camera import CameraConfig
+
+        config = config or CameraConfig()
+        return replace(config, name=self.camera_name(config.name))
+
+    def control_steps(self, horizon: int = 0) -> int:
+        """Control steps of an episode; 0: the environment's own horizon.
+
+        Raises:
+            UsageError: more than the simulator runs.
+        """
+        if not 0 <= horizon <= self.horizon:
+            raise UsageError(f"horizon must lie between 1 and {self.horizon} control steps in {self.name}: {horizon}")
+        return horizon or self.horizon
+
+    def open_world(self, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> World:
+        """A world of the task; its simulator is built at the first reset.
+
+        Raises:
+            UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
+        """
+        world: World = load(self.world_class)(self, task, camera, horizon)
+        return world
+
+    def expert(self, task: str) -> Expert:
+        """The scripted expert of the task. Raises UnknownName for a task that does not exist."""
+        expert: Expert = load(self.expert_class)(self, task)
+        return expert

@@ -1,0 +1,138 @@
+"""What every world does alike: an environment writes its start, its step and its frame."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kerv_cli.environments.camera import Camera, CameraConfig
+from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.errors import KervError, UsageError
+from kerv_cli.spaces import Observation
+
+
+class EpisodeWorld(ABC):
+    """The World protocol (`environments/spec.py`) but for the simulator itself. Not thread-safe."""
+
+    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
+        """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
+
+        Raises:
+            UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
+        """
+        found = spec.task(task)
+        self.spec = spec
+        self.task, self.instruction = found.name, found.instruction
+        self.camera = spec.camera(camera)
+        self.horizon = spec.control_steps(horizon)
+        self.steps, self.success, self.succeeded = 0, False, False
+        self._observation: Observation | None = None
+
+    @abstractmethod
+    def _start(self, seed: int) -> NDArray[np.float64]:
+        """Puts the simulator into the episode's initial state; returns the privileged state (s,)."""
+
+    @abstractmethod
+    def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+        """Executes an action (D,) within the limits; returns the privileged state (s,) and the success flag."""
+
+    @abstractmethod
+    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+        """(size, size, 3) uint8 RGB, upright."""
+
+    @property
+    @abstractmethod
+    def initial_state(self) -> NDArray[np.float64]: ...
+
+    @property
+    def observation(self) -> Observation:
+        if self._observation is None:
+            raise KervError(f"{self.task}: reset the world before using it")
+        return self._observation
+
+    @property
+    def done(self) -> bool:
+        self.observation  # noqa: B018 - raises before the first reset
+        return self.succeeded or self.steps >= self.horizon
+
+    @property
+    def end_effector(self) -> NDArray[np.float64]:
+        return self.observation.proprioception[:3].copy()
+
+    @property
+    def gripper(self) -> float:
+        names, felt = self.spec.observation.proprioception, self.observation.proprioception
+        return float(felt[names.index("gripper")]) if "gripper" in names else 1.0
+
+    def reset(self, seed: int) -> Observation:
+        if seed < 0:
+            raise UsageError(f"episode seed must be 0 or more, not {seed}")
+        state = self._start(seed)
+        self.steps, self.success, self.succeeded = 0, False, False
+        return self._told(state)
+
+    def step(self, action: ArrayLike) -> Observation:
+        executed = np.asarray(action, dtype=np.float64)
+        space = self.spec.actions
+        if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
+            raise KervError(f"{self.task}: an action is {space.dofs} finite numbers, not {action!r}")
+        self.observation  # noqa: B018 - raises before the first reset
+        if self.steps >= self.horizon:
+            raise KervError(
+                f"{self.task}: the episode ended at step {self.steps}, its horizon; reset before stepping on"
+            )
+        state, self.success = self._advance(np.clip(executed, space.low, space.high))
+        self.succeeded = self.succeeded or self.success
+        self.steps += 1
+        return self._told(state)
+
+    def _told(self, state: NDArray[np.float64]) -> Observation:
+        felt = state[: len(self.spec.observation.proprioception)]
+        self._observation = Observation(felt, state, self.instruction)
+        return self._observation
+
+    def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
+        self.observation  # noqa: B018 - raises before the first reset
+        return self._draw(self.camera if camera is None else self.spec.camera(camera))
+
+    def observe(self, cameras: Sequence[str]) -> Observation:
+        images = {name: self.frame(replace(self.camera, name=name)) for name in cameras}
+        return self.observation.with_images(images)
+
+    def close(self) -> None:
+        self._observation = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class MujocoWorld(EpisodeWorld):
+    """A world with a MuJoCo model: each view gets a graphics context that is kept."""
+
+    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
+        super().__init__(spec, task, camera, horizon)
+        self._cameras: dict[CameraConfig, Camera] = {}
+
+    @abstractmethod
+    def _drawable(self) -> tuple[Any, Any]:
+        """The MjModel, and MjData in which all poses are up to date."""
+
+    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+        model, data = self._drawable()
+        if camera not in self._cameras:
+            self._cameras[camera] = Camera(model, camera, camera.name in self.spec.upside_down)
+        return self._cameras[camera].render(data)
+
+    def close(self) -> None:
+        for camera in self._cameras.values():
+            camera.close()
+        self._cameras.clear()
+        super().close()

@@ -1,0 +1,73 @@
+"""An environment in one file of its own: registered, found, run and drawn like those that kerv ships."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kerv_cli import registry
+from kerv_cli.environments import resolve_tasks, spec_of, task_names
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.errors import KervError, UsageError
+from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.expert import ExpertDecoder
+from kerv_cli.viewing.rerun_log import save_episode
+from kerv_cli.viewing.viewer import read_back
+
+TESTS = Path(__file__).parent
+
+
+@pytest.fixture
+def spec(monkeypatch: pytest.MonkeyPatch) -> EnvironmentSpec:
+    """The example's, registered for one test."""
+    monkeypatch.setitem(registry._PARTS, "environment", dict(registry.parts("environment")))
+    monkeypatch.delitem(sys.modules, "examples.point_mass", raising=False)
+    module = importlib.import_module("examples.point_mass")
+    found: EnvironmentSpec = module.SPEC
+    return found
+
+
+def test_it_is_found_beside_the_others(spec: EnvironmentSpec) -> None:
+    assert spec_of("push-point") is spec
+    assert resolve_tasks(["point"]) == ("push-point",)
+    assert {"POINT", "push-point", "MT10"} <= set(task_names())
+    with pytest.raises(UsageError, match="tasks of metaworld and point-mass cannot be mixed"):
+        resolve_tasks(["MT10", "push-point"])
+
+
+def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) -> None:
+    with spec.open_world("push-point") as world:
+        record = run_episode(world, ExpertDecoder(), 100_000, Recording(CameraConfig(size=24)))
+        world.reset(100_000)
+        assert record.initial_state.tolist() == world.initial_state.tolist()
+        with pytest.raises(KervError, match="2 finite numbers"):
+            world.step([0.0, 0.0, 0.0])
+    assert record.success
+    assert (record.environment, record.space) == ("point-mass", spec.actions)
+    assert record.actions.shape == (record.steps, 2)
+    assert np.abs(record.actions).max() <= np.float32(0.05)
+    assert record.gripper.tolist() == [1.0] * (record.steps + 1)
+    assert record.frames[0].shape == (24, 24, 3)
+    found = read_back(save_episode(record, tmp_path / "point.rrd", method="expert"))
+    assert found["timelines"]["time"] == (0, record.steps * 100_000_000)
+
+
+def test_a_plugin_is_named_by_an_environment_variable() -> None:
+    code = "from kerv_cli.environments import resolve_tasks; print(*resolve_tasks(['POINT']))"
+    paths = os.pathsep.join([str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "KERV_PLUGINS": "examples.point_mass", "PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("push-point\n", "")
+
+
+def test_rollouts_do_not_need_rerun() -> None:
+    modules = "kerv_cli.rollouts.cells, kerv_cli.rollouts.run, kerv_cli.rollouts.expert"
+    code = f"import sys, {modules}; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
