@@ -13,7 +13,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from kerv_cli import registry
 from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.parts import METHOD_KINDS, PREFILL
 
 T = TypeVar("T")
 
@@ -29,20 +31,32 @@ def conf_dir() -> Path:
     raise UsageError(f"no configuration in {' or '.join(map(str, places))}: set KERV_CONF_DIR to a folder like conf/")
 
 
+PART_GROUPS = (*METHOD_KINDS, "datastore")
+"""Config groups whose choices are the registry's parts; YAML files in them are further choices."""
+
+
 def groups() -> dict[str, list[str]]:
     """Config groups and the names in them: {"method": ["ar", "spec_vla", …], …}."""
     root = conf_dir()
-    return {d.name: sorted(p.stem for p in d.glob("*.yaml")) for d in sorted(root.iterdir()) if d.is_dir()}
+    known = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
+    for group in PART_GROUPS:
+        known.setdefault(group, set()).update(_parts_of(group))
+    return {group: sorted(names) for group, names in sorted(known.items())}
+
+
+def _parts_of(group: str) -> dict[str, registry.Part]:
+    """The parts that a group may choose, by name; before the prefill only what needs no states of the target."""
+    if group != "prefill_draft":
+        return dict(registry.parts(group))
+    return {name: part for name, part in registry.parts("proposer").items() if part.traits.get("when") == PREFILL}
 
 
 def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
-    """The command's settings: `conf/<command>.yaml`, its groups, the overrides, checked against the dataclass.
+    """The command's settings: the dataclass `schema`, `conf/<command>.yaml`, its groups and the overrides.
 
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of the wrong type.
     """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -50,16 +64,32 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     _check(command, overrides)
     overrides = [_task_list(word) for word in overrides]
     try:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            composed = hydra_compose(command, overrides=list(overrides))
-        merged = OmegaConf.merge(OmegaConf.structured(schema), composed)
-        settings = OmegaConf.to_object(merged)
+        settings = OmegaConf.to_object(_composed(command, overrides, schema))
     except HydraException as error:
-        raise _explained(command, error, overrides) from error
+        raise _explained(command, error, overrides, schema) from error
     except OmegaConfBaseException as error:
         raise UsageError(_one_line(error)) from error
     assert isinstance(settings, schema)
     return settings
+
+
+def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
+    """Hydra's composition, as typed nodes."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import MISSING, OmegaConf
+
+    store = ConfigStore.instance()
+    base = OmegaConf.structured(schema)
+    for group in set(PART_GROUPS) & set(base):
+        base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
+    store.store(name=f"base_{command}", node=base)
+    for group in PART_GROUPS:
+        for name, part in _parts_of(group).items():
+            store.store(group=group, name=name, node=part.settings(kind=name))
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra_compose(command, overrides=list(overrides))
 
 
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
@@ -121,8 +151,14 @@ def _task_list(word: str) -> str:
     return f"task=[{value}]" if key == "task" and not value.startswith("[") else word
 
 
-def _explained(command: str, error: Exception, overrides: Sequence[str]) -> UsageError:
-    keys = _keys(command)
+def _explained(command: str, error: Exception, overrides: Sequence[str], schema: type) -> UsageError:
+    from hydra.errors import HydraException
+
+    choices = [word for word in overrides if word.split("=", 1)[0] in groups()]
+    try:
+        keys = _keys(command, choices, schema)
+    except HydraException:  # the choices alone do not compose
+        return UsageError(_one_line(error))
     for word in overrides:
         key = word.split("=", 1)[0].lstrip("+~")
         if key not in keys and key not in groups():
@@ -133,14 +169,9 @@ def _explained(command: str, error: Exception, overrides: Sequence[str]) -> Usag
     return UsageError(_one_line(error))
 
 
-def _keys(command: str) -> list[str]:
-    """Every key of the command's default configuration, dotted."""
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
+def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:
+    """Every key of the command's configuration with these group choices, dotted."""
     from omegaconf import DictConfig, OmegaConf
-
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        plain = hydra_compose(command)
 
     def walk(node: DictConfig, prefix: str) -> Iterator[str]:
         for name in map(str, node):
@@ -148,7 +179,7 @@ def _keys(command: str) -> list[str]:
             if isinstance(OmegaConf.select(node, name), DictConfig):
                 yield from walk(node[name], f"{prefix}{name}.")
 
-    return list(walk(plain, ""))
+    return list(walk(_composed(command, choices, schema), ""))
 
 
 def _one_line(error: Exception) -> str:

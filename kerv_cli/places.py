@@ -51,28 +51,9 @@ def find_target(results: str, name: str) -> Path:
     )
 
 
-def drafter_folder(results: str, name: str | None, target: Path) -> Path:
-    """The drafter that is named, else the one beside the target."""
-    return artifact(results, "drafter", name) if name else drafter_beside(target)
-
-
-def drafter_beside(target: Path) -> Path:
-    """Shipped: pretrained/<name>/{target,drafter}; trained: artifacts/target/<name> and artifacts/drafter/<name>."""
-    return beside(target, "drafter")
-
-
-def early_folder(results: str, name: str | None, target: Path) -> Path:
-    """The early drafter that is named, else the one beside the target."""
-    return artifact(results, "early", name) if name else early_beside(target)
-
-
-def early_beside(target: Path) -> Path:
-    """As `drafter_beside`, in folders named early."""
-    return beside(target, "early")
-
-
 def beside(target: Path, kind: str) -> Path:
-    """The folder of this kind that belongs to the target: among the shipped, among the artifacts, or inside it."""
+    """The folder of this kind that belongs to the target. Shipped: pretrained/<name>/{target,<kind>}; trained:
+    artifacts/target/<name> and artifacts/<kind>/<name>; else a folder inside the target's."""
     if target.name == "target":
         return target.parent / kind
     return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind

@@ -5,20 +5,14 @@ Nothing heavy is imported here: a wrong override must be answered before torch o
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from kerv_cli import manifests, parts, registry
+
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
-
-SPARE = "?"
-"""Behind a source of an opening: it drafts only where the others are not sure of their chunk."""
-
-
-def opening_sources(sources: Iterable[str]) -> list[str]:
-    """Names of an opening's sources, spare ones included, in their order."""
-    return [name.removesuffix(SPARE) for name in sources]
 
 
 @dataclass
@@ -40,138 +34,49 @@ class RuntimeSettings:
     device: str = "cpu"  # cpu | cuda | auto
     dtype: str = "float32"
     threads: int = 1  # torch threads of each process
-    workers: int = 1  # processes
+    executor: str = "local"  # sweeps: who runs the blocks: local (processes here) | slurm | ray
+    workers: int = 1  # sweeps: blocks that run at the same time
+    executor_options: dict[str, Any] = field(default_factory=dict)  # see SlurmOptions, RayOptions in parts.py
 
 
-@dataclass
-class ProposerSettings:
-    """Who drafts (METHODS §2.2, §4, §5)."""
-
-    kind: str = "none"  # none | drafter | retrieval | hybrid | early | jacobi | hold | linear | kalman | … | expert
-    depth: int = 5  # draft depth, tokens
-    top_k: int = 8  # drafter: children expanded per level
-    nodes: int = 50  # tree nodes kept after reranking
-    neighbours: int = 5  # retrieval, hybrid: stored chunks
-
-
-@dataclass
-class AcceptanceSettings:
-    """Which drafts are good enough (METHODS §2.1)."""
-
-    kind: str = "strict"  # strict | relaxed | sequence | hybrid (sequence for retrieved drafts, relaxed for others)
-    strict_gripper: bool = False  # the gripper's tokens must equal the verdict
-    group_limit: int = 30  # sequence: summed bias of a kinematic group, bins
-    token_limit: int = 15  # sequence: bias of one token, bins
-
-
-@dataclass
-class ThresholdSettings:
-    """How far a draft may be from the verdict (METHODS §3.2)."""
-
-    kind: str = "fixed"  # fixed | kinematic | change | schedule
-    r: int = 0  # fixed: bins
-    r_min: int = 5  # others: bins, as r_max
-    r_max: int = 15
-    phi: float = 2.0  # exponent of the level (kinematic), the move (change) or the time (schedule)
-    k_s: float | None = None  # reference level K_S of K; None: the task's, from the calibration
-    tau: float = 20.0  # schedule: decodes
-
-
-@dataclass
-class RectifierSettings:
-    """What happens after a rejection (METHODS §3.1)."""
-
-    kind: str = "reinfer"  # reinfer | compensate
-    predictor: str = "hold"  # compensate: hold | linear | kalman | … | draft (the rejected draft's own values, ours)
-    steps: int = 1  # PL: control steps that a prediction may fill
-    use_verdict: bool = True  # the verdict at the rejected position is kept (ours); false: predicted too (KERV)
-    min_verified: int = 1  # DoFs of a step that must be known for it to be filled
-    rest: int = 0  # decodes without compensation after one (KERV: 4)
-    max_dropped: int = -1  # control steps of the chunk that a compensation may drop; -1: any number (KERV)
-
-
-@dataclass
-class BoundarySettings:
-    """Which proposer drafts now (METHODS §4.4)."""
-
-    kind: str = "always"  # always (the method's only proposer) | always_retrieval | always_drafter | fused | random
-    alpha: float = 0.5  # weight of the radius of curvature against the path length
-    window: int = 15  # newest measured positions that are looked at
-    f_star: float = 0.5  # fused metric from which retrieval drafts
-    p: float = 0.5  # random: probability of retrieval
-    seed: int = 0  # random
-
-
-@dataclass
-class SkipSettings:
-    """When a retrieved chunk is executed without a verification (METHODS §4.3)."""
-
-    kind: str = "none"  # none | similarity
-    s_min: float | None = None  # least similarity; None: the task's, from the calibration
-    max_skips: int = 2  # decodes in a row without a verification
-    up: float = 0.25  # share of the calibrated range that s_min rises after a failed episode
-    down: float = 0.05  # and falls after a successful one
-
-
-@dataclass
-class OpeningSettings:
-    """What is drafted before the prefill and verified inside it (METHODS §5, ours)."""
-
-    sources: list[str] = field(default_factory=list)  # early | retrieval | a predictor; with "?": a spare
-    nodes: int = 64  # tree nodes at most; what is named last is dropped first
-    neighbours: int = 3  # retrieval: stored chunks
-
-
-@dataclass
-class MethodSettings:
-    """A method is a composition of parts, never a class of its own."""
-
-    name: str = "ar"
-    proposer: ProposerSettings = field(default_factory=ProposerSettings)
-    acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
-    threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
-    rectifier: RectifierSettings = field(default_factory=RectifierSettings)
-    boundary: BoundarySettings = field(default_factory=BoundarySettings)
-    opening: OpeningSettings = field(default_factory=OpeningSettings)
-    skip: SkipSettings = field(default_factory=SkipSettings)
-    chunk: int = 0  # H, control steps decoded at once; 0: as many as the target was trained for
+MODEL, EXPERT = "model", "expert"
 
 
 @dataclass
 class PolicySettings:
-    """Which weights: a name under results/pretrained or results/artifacts/target, or a folder."""
+    """Who acts. Weights are named by what lies under results/pretrained or results/artifacts, or by a folder."""
 
+    kind: str = MODEL  # model | expert (the environment's scripted policy: privileged, the reference of success)
     target: str = "mt10-vision"
-    drafter: str | None = None  # default: the drafter beside the target
-    early: str | None = None  # default: the early drafter beside the target
+    drafter: str | None = None  # these: default the one beside the target
+    early: str | None = None
+    datastore: str | None = None
+    calibration: str | None = None
+    others: dict[str, str] = field(default_factory=dict)  # artifacts of parts that are not kerv's: kind -> name
 
-
-@dataclass
-class DatastoreSettings:
-    """Who searches the datastore (METHODS §4.1): every backend gives the same neighbours."""
-
-    backend: str = "exact"  # exact (in process, numpy) | qdrant (optional)
-    url: str | None = None  # qdrant: a server; None: the engine in this process
+    def named(self, kind: str) -> str | None:
+        """The artifact of this kind that is asked for by name."""
+        return self.others.get(kind) or getattr(self, kind, None)
 
 
 @dataclass
 class RolloutSettings:
-    """`kerv rollout`: episodes of one method."""
+    """`kerv rollout`: episodes of one method. Its parts are settings of the classes in kerv_cli/parts.py."""
 
     task: list[str] = field(default_factory=lambda: ["MT10"])  # task names and suites
     episodes: int = 3  # per task
     seed: int = EVALUATION_SEED  # first seed; episode i uses seed + i in every setting: that is the pairing
     policy: PolicySettings = field(default_factory=PolicySettings)
     method: str = "ar"  # name of the composition; its parts follow
-    opening: OpeningSettings = field(default_factory=OpeningSettings)
-    proposer: ProposerSettings = field(default_factory=ProposerSettings)
-    acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
-    threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
-    rectifier: RectifierSettings = field(default_factory=RectifierSettings)
-    boundary: BoundarySettings = field(default_factory=BoundarySettings)
-    skip: SkipSettings = field(default_factory=SkipSettings)
+    prefill_draft: Any = field(default_factory=parts.Nothing)  # a proposer, before the prefill
+    proposer: Any = field(default_factory=parts.Nothing)
+    acceptance: Any = field(default_factory=parts.StrictAcceptanceSettings)
+    threshold: Any = field(default_factory=parts.FixedThresholdSettings)
+    rectifier: Any = field(default_factory=parts.ReinferSettings)
+    boundary: Any = field(default_factory=parts.ConstantBoundarySettings)
+    skip: Any = field(default_factory=parts.Nothing)
     chunk: int = 0  # H, control steps decoded at once; 0: as many as the target was trained for
-    datastore: DatastoreSettings = field(default_factory=DatastoreSettings)
+    datastore: Any = field(default_factory=parts.ExactSearchSettings)
     world: WorldSettings = field(default_factory=WorldSettings)
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     deviation_every: int = 0  # decodes between two deviation samples; 0: never
@@ -179,19 +84,13 @@ class RolloutSettings:
     record_size: int = 240  # pixels of the logged camera
     results: str = "results"
 
-    def parts(self) -> MethodSettings:
-        """The method's parts alone: what a decoder is built from."""
-        return MethodSettings(
-            name=self.method,
-            proposer=self.proposer,
-            acceptance=self.acceptance,
-            threshold=self.threshold,
-            rectifier=self.rectifier,
-            boundary=self.boundary,
-            opening=self.opening,
-            skip=self.skip,
-            chunk=self.chunk,
-        )
+    def __post_init__(self) -> None:
+        if self.policy.kind == EXPERT:
+            self.method = EXPERT  # it decodes nothing: no method is a name for what it does
+
+    def parts(self) -> dict[str, Any]:
+        """Kind -> settings of the method's parts: what a decoder is composed of."""
+        return {kind: getattr(self, kind) for kind in parts.METHOD_KINDS}
 
 
 @dataclass
@@ -204,6 +103,8 @@ class StudySettings:
     common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
+    block: int = 5  # seeds for which the settings take turns in one process, episode by episode
+    repeats: int = 1  # how often every episode is measured
 
 
 @dataclass
@@ -350,6 +251,7 @@ class BuildDatastoreSettings:
     episodes: int = 0  # per task, the first ones by seed; 0: all
     stride: int = 1  # of an episode's observations every so many become entries
     half: bool = False  # keys on disk in float16: half the size, for shipping
+    components: int = 0  # directions that keys are projected onto; 0: keys stay as they are
     key: list[str] = field(default_factory=lambda: ["scene"])  # pooled parts of the prompt; also vision, proprioception
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     results: str = "results"
@@ -372,9 +274,9 @@ class CalibrateSettings:
     confidence: float = 0.9  # verify-skip: share of skipped chunks whose error stays below epsilon
     boundary_windows: list[int] = field(default_factory=lambda: [5, 15, 30])  # positions; each has ranges of its own
     decodes: int = 60  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
-    proposer: ProposerSettings = field(default_factory=ProposerSettings)
-    acceptance: AcceptanceSettings = field(default_factory=AcceptanceSettings)
-    threshold: ThresholdSettings = field(default_factory=ThresholdSettings)
+    proposer: Any = field(default_factory=parts.DrafterProposerSettings)  # pre-sampling decodes with these parts
+    acceptance: Any = field(default_factory=parts.RelaxedAcceptanceSettings)
+    threshold: Any = field(default_factory=parts.FixedThresholdSettings)
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     results: str = "results"
 
@@ -382,3 +284,18 @@ class CalibrateSettings:
 def as_plain(settings: Any) -> dict[str, Any]:
     """A settings dataclass as nested dicts and lists."""
     return asdict(settings)
+
+
+def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
+    """The inverse of `as_plain` for a rollout; the parts get the classes of their kinds.
+
+    Raises:
+        CheckpointError: not such settings. UnknownName: a part that is not registered here.
+    """
+    settings = manifests.read(RolloutSettings, dict(plain), "a stored setting")
+    for group in (*parts.METHOD_KINDS, "datastore"):
+        value = dict(getattr(settings, group))
+        kind = "proposer" if group == "prefill_draft" else group
+        schema = registry.find(kind, value["kind"], f"{group}.kind").settings
+        setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}"))
+    return settings

@@ -6,7 +6,7 @@ import hashlib
 import os
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import RolloutSettings, StudySettings
+from kerv_cli.studies.block import Prepare, RunEpisode
 from kerv_cli.studies.plan import Cell, plan
 
 TOKENS = 16
@@ -66,7 +67,7 @@ def generator(*parts: object) -> np.random.Generator:
 
 
 def run_cell(cell: Cell) -> list[EpisodeRecord]:
-    """A stand-in for the lead's: higher r, longer acceptance, a little less success."""
+    """The cell's episodes: higher r, longer acceptance, a little less success."""
     return [episode(cell, seed) for seed in cell.seeds]
 
 
@@ -130,15 +131,20 @@ def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
     return replace(decode_of(rounds, phases, "drafter"), variability=float(rng.uniform()))
 
 
-def count_calls() -> tuple[Callable[[Cell], list[EpisodeRecord]], list[str]]:
-    """run_cell, and the list of the labels that it was called for."""
+def prepare(cell: Cell) -> RunEpisode:
+    """What a sweep calls for every cell of a block."""
+    return lambda seed: episode(cell, seed)
+
+
+def count_calls() -> tuple[Prepare, list[str]]:
+    """prepare, and the list of the labels that it was called for."""
     calls: list[str] = []
 
-    def run(cell: Cell) -> list[EpisodeRecord]:
+    def counted(cell: Cell) -> RunEpisode:
         calls.append(cell.label)
-        return run_cell(cell)
+        return prepare(cell)
 
-    return run, calls
+    return counted, calls
 
 
 class Odd(Exception):
@@ -148,19 +154,27 @@ class Odd(Exception):
         super().__init__(f"{a} and {b}")
 
 
-def misbehave(cell: Cell) -> list[EpisodeRecord]:
-    """Kills its process, raises, or reports its process's thread number as wall seconds, depending on r."""
-    r = cell.settings["threshold"]["r"]
-    if r == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    if r == 5:
-        raise Odd(1, 2)
-    time.sleep(0.1)
-    threads = float(os.environ["OMP_NUM_THREADS"])
-    return [replace(record, wall_seconds=threads) for record in run_cell(cell)]
+def misbehave(cell: Cell) -> RunEpisode:
+    """Kills its process in its second episode, raises, or reports its process's thread number as wall seconds,
+    depending on r."""
+
+    def run(seed: int) -> EpisodeRecord:
+        r = cell.settings["threshold"]["r"]
+        if r == 1 and seed > cell.seeds[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if r == 5:
+            raise Odd(1, 2)
+        time.sleep(0.02)
+        return replace(episode(cell, seed), wall_seconds=float(os.environ["OMP_NUM_THREADS"]))
+
+    return run
 
 
-def slow_cell(cell: Cell) -> list[EpisodeRecord]:
-    """The baseline at once, everything else in a minute."""
-    time.sleep(0.0 if cell.label == "ar" else 60.0)
-    return run_cell(cell)
+def slow_elsewhere(cell: Cell) -> RunEpisode:
+    """The first task at once, every other in a minute."""
+
+    def run(seed: int) -> EpisodeRecord:
+        time.sleep(0.0 if cell.task == "reach-v3" else 60.0)
+        return episode(cell, seed)
+
+    return run

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,20 +13,36 @@ from hypothesis import strategies as st
 
 from kerv_cli.decoding.boundary import (
     STILL,
+    Boundary,
     BoundaryRanges,
     Choice,
-    build_boundary,
-    episode_generator,
     path_length,
     radius_of_curvature,
 )
+from kerv_cli.decoding.build import Context
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.registry import find
 from kerv_cli.reporting.curvature import pseudo_radius
-from kerv_cli.settings import BoundarySettings
 
 WINDOW = 15
 RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)
 seeds = st.integers(0, 2**32 - 1)
+
+
+def boundary_of(kind: str, **values: Any) -> Boundary:
+    """As a method's part: its numbers are checked, then it is built; the calibration has `RANGES` for 10 and 15."""
+    part = find("boundary", kind)
+    chosen = part.settings(kind=kind, **values)
+    if part.check is not None:
+        part.check(chosen)
+    calibration = SimpleNamespace(ranges={10: RANGES, WINDOW: RANGES}.__getitem__)
+
+    def artifact(kind: str) -> Any:
+        assert kind in part.needs(chosen)
+        return calibration
+
+    built: Boundary = part.built(chosen, Context(None, artifact))  # type: ignore[arg-type]
+    return built
 
 
 def rotation(rng: np.random.Generator) -> np.ndarray:
@@ -188,30 +206,26 @@ def test_normalisation_is_linear_and_clipped() -> None:
 def test_an_infinite_radius_is_a_straight_reach_unless_the_hand_stands_still() -> None:
     assert RANGES.normalise(math.inf, 0.15) == (1.0, 1.0)
     assert RANGES.normalise(math.inf, 0.0) == (0.0, 0.0)
-    boundary = build_boundary(BoundarySettings("fused"), RANGES)
-    assert boundary is not None
+    boundary = boundary_of("fused")
     still = boundary.choose(np.full((WINDOW, 3), 0.6), np.random.default_rng(0))
     assert still == Choice("drafter", 0.0)
 
 
 def test_fused_sends_straight_reaches_to_retrieval_and_bends_to_the_drafter() -> None:
     rng = np.random.default_rng(3)
-    boundary = build_boundary(BoundarySettings("fused"), RANGES)
-    assert boundary is not None
+    boundary = boundary_of("fused")
     reach, bend = boundary.choose(line(rng, 0.14), rng), boundary.choose(arc(rng, 0.02, 0.05), rng)
     assert (reach.mode, bend.mode) == ("retrieval", "drafter")
     assert reach.metric is not None
     assert bend.metric is not None
     assert reach.metric > 0.9 > 0.3 > bend.metric
-    exact = build_boundary(BoundarySettings("fused", f_star=reach.metric), RANGES)
-    assert exact is not None
+    exact = boundary_of("fused", f_star=reach.metric)
     assert exact.choose(line(np.random.default_rng(3), 0.14), rng).mode == "retrieval"  # F ≥ F*
 
 
 def test_only_the_newest_positions_count() -> None:
     rng = np.random.default_rng(4)
-    boundary = build_boundary(BoundarySettings("fused", window=10), RANGES)
-    assert boundary is not None
+    boundary = boundary_of("fused", window=10)
     newest = arc(rng, 0.05, 0.1, 10)
     path = np.concatenate([line(rng, 0.4, 30), newest])
     assert boundary.choose(path, rng) == boundary.choose(newest, rng)
@@ -220,51 +234,56 @@ def test_only_the_newest_positions_count() -> None:
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_fewer_than_three_positions_go_to_the_drafter(n: int) -> None:
-    boundary = build_boundary(BoundarySettings("fused", f_star=0.0), RANGES)
-    assert boundary is not None
+    boundary = boundary_of("fused", f_star=0.0)
     path = np.arange(3.0 * n).reshape(n, 3)
     assert boundary.choose(path, np.random.default_rng(0)) == Choice("drafter", None)
 
 
 @pytest.mark.parametrize("mode", ["retrieval", "drafter"])
 def test_the_fixed_kinds_never_change_their_mind(mode: str) -> None:
-    boundary = build_boundary(BoundarySettings(f"always_{mode}"))
-    assert boundary is not None
+    boundary = boundary_of(f"always_{mode}")
     for n in (0, 2, 20):
         assert boundary.choose(np.zeros((n, 3)), np.random.default_rng(n)).mode == mode
 
 
 def test_random_keeps_its_share_and_repeats_itself() -> None:
-    thirty = BoundarySettings("random", p=0.3, seed=5)
-    boundary = build_boundary(thirty)
-    assert boundary is not None
+    boundary, other = (boundary_of("random", p=0.3, seed=seed) for seed in (5, 6))
 
-    def modes(task: str, seed: int) -> list[str]:
-        rng = episode_generator(thirty, task, seed)
+    def modes(task: str, seed: int, boundary: Boundary = boundary) -> list[str]:
+        rng = boundary.numbers(task, seed)
         return [boundary.choose(np.zeros((0, 3)), rng).mode for _ in range(2000)]
 
     assert modes("reach-v3", 100_000) == modes("reach-v3", 100_000)
     assert modes("reach-v3", 100_000) != modes("reach-v3", 100_001)
     assert modes("reach-v3", 100_000) != modes("push-v3", 100_000)
+    assert modes("reach-v3", 100_000) != modes("reach-v3", 100_000, other)
     assert np.mean([m == "retrieval" for m in modes("reach-v3", 100_000)]) == pytest.approx(0.3, abs=0.05)
 
 
 def test_always_chooses_nothing() -> None:
-    assert build_boundary(BoundarySettings()) is None
+    assert boundary_of("always") is None
 
 
 @pytest.mark.parametrize(
-    ("wrong", "error", "says"),
+    ("kind", "values", "error", "says"),
     [
-        (BoundarySettings("fusd"), UnknownName, "unknown boundary.kind 'fusd': did you mean fused"),
-        (BoundarySettings("fused"), CheckpointError, "needs the demonstrations' ranges"),
-        (BoundarySettings("fused", window=2), UsageError, "boundary.window=2: at least 3"),
-        (BoundarySettings("fused", alpha=1.5), UsageError, "boundary.alpha=1.5: from 0 to 1"),
-        (BoundarySettings("random", p=-0.1), UsageError, "boundary.p=-0.1: from 0 to 1"),
+        ("fusd", {}, UnknownName, "unknown boundary 'fusd': did you mean fused"),
+        ("fused", {"window": 2}, UsageError, "boundary.window=2: at least 3"),
+        ("fused", {"alpha": 1.5}, UsageError, "boundary.alpha=1.5: from 0 to 1"),
+        ("fused", {"alpha": math.nan}, UsageError, "boundary.alpha=nan: from 0 to 1"),
+        ("fused", {"f_star": math.nan}, UsageError, "boundary.f_star=nan"),
+        ("random", {"p": -0.1}, UsageError, "boundary.p=-0.1: from 0 to 1"),
     ],
 )
-def test_what_cannot_be_built_gets_one_line(wrong: BoundarySettings, error: type[Exception], says: str) -> None:
+def test_what_cannot_be_built_gets_one_line(
+    kind: str, values: dict[str, Any], error: type[Exception], says: str
+) -> None:
     with pytest.raises(error) as caught:
-        build_boundary(wrong)
+        boundary_of(kind, **values)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_fused_reads_the_calibrations_ranges_over_its_own_window() -> None:
+    with pytest.raises(KeyError, match="9"):  # what the calibration says then: test_calibration_skip
+        boundary_of("fused", window=9)

@@ -26,8 +26,8 @@ from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.places import find_target
 from kerv_cli.settings import CalibrateSettings, ThresholdSettings
-from kerv_cli.spaces import CENTRES, ActionTokenizer, Observation
-from kerv_cli.targets.checkpoint import read_target
+from kerv_cli.spaces import CENTRES, ActionTokenizer
+from kerv_cli.targets.checkpoint import read_description
 from kerv_cli.training.calibration import CalibrationRun, kinematic_variability, reference_level
 from kerv_cli.training.predictor_fit import (
     Windows,
@@ -204,8 +204,8 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     made = run.finish(variability, run.boundary(lambda done, total: None), run.skip(lambda done, total: None))
     folder = find_target(str(results), target)
     assert run.path == calibration_beside(folder) == results / f"artifacts/calibration/{target}/calibration.json"
-    described = read_target(folder)
-    loaded = load_calibration(run.path, described.sha256, 4)
+    described = read_description(folder, "target")
+    loaded = load_calibration(run.path, described["sha256"], 4)
     assert loaded == made
     assert loaded.demos["sha256"] == run.dataset.sha256
     assert loaded.provenance["versions"]["numpy"] == np.__version__
@@ -224,7 +224,7 @@ def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
     decoder, _ = run.decoder()
     episode = run.dataset.load(0)
     decoder.reset(episode.task, "reach")
-    record = decoder.decode(Observation(episode.states[0][:4], episode.states[0], "reach"))
+    record = decoder.decode(None, episode.states[0])
     pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.target_tokens, strict=False)]
     drafted, target_tokens = np.array(pairs).T
     assert record.variability == pytest.approx(float(kinematic_variability(drafted, target_tokens)))

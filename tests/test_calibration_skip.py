@@ -195,7 +195,7 @@ def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
     assert row == task_levels(match(store, "reach-v3"), 1.9, 0.5)
     assert row["share"] > 0
     assert made.skip_levels("reach-v3", sha256) == (row["low"], row["s_min"], row["high"])
-    assert load_calibration(run.path, run.described.sha256, 4) == made
+    assert load_calibration(run.path, run.described["sha256"], 4) == made
     with pytest.raises(
         CheckpointError, match=r"those of datastore .*, not of eeeeeeeeeeee: run 'kerv calibrate' again"
     ):

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
-from test_decoding_lossless import plain_greedy, random_prompt, random_target
+from examples.own_target import MockTarget
+from test_decoding_lossless import plain_greedy
 
 from kerv_cli.decoding.chunk import Chunk, Situation
 from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import Stateless
 from kerv_cli.decoding.rectify import Compensation, assemble
 from kerv_cli.drafting.kinematics import ActionHistory, Hold, Linear
 from kerv_cli.drafting.tree import TokenTree
-from kerv_cli.errors import UsageError
-from kerv_cli.settings import AcceptanceSettings, MethodSettings, OpeningSettings, RectifierSettings
-from kerv_cli.spaces import values_of
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.parts import CompensateSettings, check_compensate
 
 D, N = 4, 16
+SPACE = SPEC.actions
+TARGET = MockTarget(SPACE, chunk=N // D)
+HOLD = Hold(SPACE.is_strict, minimum=1)
+
+
+def prompt_of(seed: int) -> torch.Tensor:
+    return torch.randn(1, 5, TARGET.width, generator=torch.Generator().manual_seed(seed)).double()
+
+
+def compensation(**values: Any) -> Compensation:
+    return Compensation(CompensateSettings(**values), HOLD)
 
 
 def history_of(*actions: list[float]) -> ActionHistory:
@@ -30,8 +45,7 @@ PAST = history_of([0.1, 0.2, 0.3, 1.0], [0.2, 0.1, 0.3, 1.0])
 
 
 def chunk_with(history: ActionHistory) -> Chunk:
-    target = random_target(0, 1, 1, N // D)
-    return Chunk(torch.zeros(1, 1, 16), N, D, target.trunk.new_cache(1, 4), Situation("t", history))
+    return Chunk(torch.zeros(1, 1, 8), N // D, SPACE, TARGET.new_cache(1, 4), Situation("t", history))
 
 
 @pytest.mark.parametrize("known", range(N + 1))
@@ -39,8 +53,8 @@ def chunk_with(history: ActionHistory) -> Chunk:
 def test_assembly_for_every_position(known: int, min_verified: int) -> None:
     """Transcribed from the definition: step by step, DoF by DoF, with `hold` as the prediction."""
     tokens = [10 * i for i in range(known)]
-    settings = RectifierSettings("compensate", min_verified=min_verified)
-    actions = assemble(tokens, chunk_with(PAST), Hold(D, minimum=1), settings)
+    settings = CompensateSettings(min_verified=min_verified)
+    actions = assemble(tokens, chunk_with(PAST), HOLD, settings)
     assert actions is not None
     expected: list[list[float]] = []
     last = [0.2, 0.1, 0.3, 1.0]
@@ -48,7 +62,7 @@ def test_assembly_for_every_position(known: int, min_verified: int) -> None:
         have = tokens[step * D : step * D + D]
         if step > 0 and (not have or len(have) < min_verified):
             break
-        row = [float(values_of(np.array(t))) for t in have]
+        row = [float(SPACE.values_of(np.array(t))) for t in have]
         last = row + last[len(row) :]
         expected.append(last)
     assert actions == pytest.approx(np.array(expected))
@@ -56,22 +70,22 @@ def test_assembly_for_every_position(known: int, min_verified: int) -> None:
 
 
 def test_further_steps_are_predicted_from_the_accepted_prefix() -> None:
-    settings = RectifierSettings("compensate", steps=3)
+    settings = CompensateSettings(steps=3)
     tokens = [127, 127, 127, 254, 150]
-    actions = assemble(tokens, chunk_with(PAST), Linear(D, minimum=2), settings)
+    actions = assemble(tokens, chunk_with(PAST), Linear(SPACE.is_strict, minimum=2), settings)
     assert actions is not None
     assert actions.shape == (4, 4)
-    first = values_of(np.array(tokens[:4]))
+    first = SPACE.values_of(np.array(tokens[:4]))
     slope = first - np.array([0.2, 0.1, 0.3, 1.0])
     assert actions[2, :3] == pytest.approx(np.clip(first + 2 * slope, -1, 1)[:3])
-    assert actions[1, 0] == pytest.approx(values_of(np.array(150)))
+    assert actions[1, 0] == pytest.approx(SPACE.values_of(np.array(150)))
     assert actions[1:, 3] == pytest.approx(first[3])
 
 
 def test_without_enough_history_the_target_decodes_on() -> None:
     chunk = chunk_with(history_of())
     chunk.tokens = [1, 2]
-    assert not Compensation(RectifierSettings("compensate"), Hold(D, minimum=1)).close(chunk)
+    assert not compensation().close(chunk)
     assert chunk.closed is None
 
 
@@ -81,58 +95,56 @@ def test_a_chunk_is_not_closed_where_too_much_would_be_dropped(known: int, close
     for most in (0, 1, 2):
         chunk = chunk_with(PAST)
         chunk.tokens = [100] * known
-        found.append(Compensation(RectifierSettings("compensate", max_dropped=most), Hold(D, minimum=1)).close(chunk))
+        found.append(compensation(max_dropped=most).close(chunk))
     assert found == closed
 
 
 def test_the_filter_rests_after_a_compensation() -> None:
-    compensation = Compensation(RectifierSettings("compensate", rest=2), Hold(D, minimum=1))
+    resting = compensation(rest=2)
     closed = []
     for _ in range(7):
         chunk = chunk_with(PAST)
         chunk.tokens = [1, 2]
-        closed.append(compensation.close(chunk))
-        compensation.next_decode()
+        closed.append(resting.close(chunk))
+        resting.next_decode()
     assert closed == [True, False, False, True, False, False, True]
-    compensation.reset()
-    assert compensation.resting == 0
+    resting.reset()
+    assert resting.resting == 0
 
 
-@pytest.mark.parametrize("use_verdict", [True, False])
+class Known(Stateless):
+    """An in-prefill draft of these tokens; nothing may follow the prefill."""
+
+    name = "known"
+
+    def __init__(self, drafted: list[int]) -> None:
+        self.drafted = drafted
+
+    def begin(self, chunk: Chunk) -> None:
+        raise AssertionError("nothing follows the prefill")
+
+    committed = begin  # type: ignore[assignment]
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        return TokenTree.chain(self.drafted)
+
+
+@pytest.mark.parametrize("use_target_token", [True, False])
 @pytest.mark.parametrize("wrong", range(N))
-def test_one_forward_whatever_is_rejected(wrong: int, use_verdict: bool) -> None:
-    """An opening whose token `wrong` is off: one forward, target's tokens up to it, the step's rest predicted."""
-    target = random_target(3, 2, 2, N // D)
-    prompt = random_prompt(target, 3)
-    truth = plain_greedy(target, prompt)
-
-    class Opening:
-        name = "opening"
-        needs_states = False
-
-        def begin(self, chunk: Chunk) -> None:
-            raise AssertionError("nothing follows the prefill")
-
-        committed = begin
-
-        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-            drafted = list(truth)
-            drafted[wrong] = (drafted[wrong] + 100) % 255
-            return TokenTree.chain(drafted)
-
-    rectifier = RectifierSettings("compensate", use_verdict=use_verdict)
-    opening = OpeningSettings(["opening"], N)
-    method = MethodSettings("test", acceptance=AcceptanceSettings("strict"), rectifier=rectifier, opening=opening)
-    decoder = Decoder(
-        target, method, Parts(opening=Opening(), compensation=Compensation(rectifier, Hold(D, minimum=1)))
-    )
+def test_one_forward_whatever_is_rejected(wrong: int, use_target_token: bool) -> None:
+    """An in-prefill draft whose token `wrong` is off: one forward, the target's tokens up to it, the rest predicted."""
+    prompt = prompt_of(3)
+    truth = plain_greedy(TARGET, prompt)
+    drafted = [(t + 100) % 255 if i == wrong else t for i, t in enumerate(truth)]
+    rectifier = compensation(use_target_token=use_target_token)
+    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted), rectifier=rectifier))
     decoder.situation = Situation("t", PAST)
     chunk = decoder.decode_prompt(prompt)
     assert chunk.forwards == 1
-    known = wrong + use_verdict
+    known = wrong + use_target_token
     assert chunk.tokens == truth[:known]
     assert sum(r.committed for r in chunk.rounds) == known
-    if wrong == N - 1 and use_verdict:
+    if wrong == N - 1 and use_target_token:
         assert chunk.closed is None
         return
     steps = max(1, -(-known // D))
@@ -140,52 +152,49 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_verdict: bool) -> None
     assert chunk.closed.shape == (steps, D)
     actions, predicted = decoder.actions_of(chunk)
     assert predicted == steps * D - known
-    assert actions.reshape(-1)[:known] == pytest.approx(values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
+    assert actions.reshape(-1)[:known] == pytest.approx(SPACE.values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
 
 
 @pytest.mark.parametrize("wrong", range(N - 1))
 def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> None:
-    """predictor=draft: behind the verdict the step is filled with the draft's own values, at the first decode too."""
-    target = random_target(3, 2, 2, N // D)
-    prompt = random_prompt(target, 3)
-    truth = plain_greedy(target, prompt)
+    """predictor=draft: behind the target's token the step is filled with the draft's own values, at the first decode
+    too."""
+    prompt = prompt_of(3)
+    truth = plain_greedy(TARGET, prompt)
     drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
-
-    class Opening:
-        name = "opening"
-        needs_states = False
-
-        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-            return TokenTree.chain(drafted[:depth])
-
-    rectifier = RectifierSettings("compensate", predictor="draft")
-    opening = OpeningSettings(["opening"], N)
-    method = MethodSettings("test", acceptance=AcceptanceSettings("strict"), rectifier=rectifier, opening=opening)
-    parts = Parts(opening=Opening(), compensation=Compensation(rectifier, Hold(D, minimum=1)))  # type: ignore[arg-type]
-    decoder = Decoder(target, method, parts)
+    decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted[:-1]), rectifier=compensation(predictor="draft")))
     chunk = decoder.decode_prompt(prompt)
     assert chunk.forwards == 1
-    end = min(-(-(wrong + 1) // D) * D, N)
-    if (
-        end == N
-    ):  # the last token of all was not drafted, the bonus would have filled it: without a history it is decoded
-        assert chunk.closed is None or len(chunk.closed) == N // D
-        return
-    expected = [*truth[: wrong + 1], *drafted[wrong + 1 : end]]
+    end = -(-(wrong + 1) // D) * D
+    expected = [*truth[: wrong + 1], *drafted[wrong + 1 : min(end, N - 1)]]
+    if end == N:  # the last token of all was not drafted, the bonus would have filled it: it is predicted
+        expected.append(truth[N - D - 1])
     assert chunk.closed is not None
-    assert chunk.closed.reshape(-1) == pytest.approx(values_of(np.array(expected)))
+    assert chunk.closed.reshape(-1) == pytest.approx(SPACE.values_of(np.array(expected)))
     assert decoder.actions_of(chunk)[1] == end - wrong - 1
 
 
-def test_a_draft_that_goes_on_needs_the_verdict() -> None:
-    with pytest.raises(UsageError, match="use_verdict"):
-        Compensation(RectifierSettings("compensate", predictor="draft", use_verdict=False), Hold(D, minimum=1))
+@pytest.mark.parametrize(
+    ("values", "error", "says"),
+    [
+        ({"predictor": "draft", "use_target_token": False}, UsageError, "leave rectifier.use_target_token=true"),
+        ({"predictor": "kalmann"}, UnknownName, "unknown rectifier.predictor 'kalmann': did you mean kalman"),
+        ({"steps": 0}, UsageError, "rectifier.steps=0: at least 1"),
+        ({"rest": -1}, UsageError, "rectifier.rest=-1: at least 0"),
+        ({"min_verified": -1}, UsageError, "rectifier.min_verified=-1: at least 0"),
+    ],
+)
+def test_what_cannot_compensate_is_refused(values: dict[str, Any], error: type[Exception], says: str) -> None:
+    with pytest.raises(error) as caught:
+        check_compensate(CompensateSettings(**values))
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_an_opening_that_needs_states_is_refused() -> None:
-    class Late:
+def test_an_in_prefill_draft_that_needs_states_is_refused() -> None:
+    class Late(Stateless):
         name = "late"
         needs_states = True
 
-    with pytest.raises(UsageError, match="needs the target's states"):
-        Decoder(random_target(0, 1, 1, 1), MethodSettings(), Parts(opening=Late()))  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="'late' reads the target's states"):
+        Decoder(TARGET, Parts(prefill_draft=Late()))  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
 from typer.testing import CliRunner
 
 from kerv_cli.commands import build as command
@@ -27,15 +28,14 @@ from kerv_cli.drafting.datastore import (
     neighbour_tree,
     open_datastore,
     prompt_key,
+    segments_of,
 )
-from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge
 from kerv_cli.environments.demos.dataset import dataset_hash, episode_path
 from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, save_episode
 from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, DatastoreSettings, PolicySettings
-from kerv_cli.spaces import Observation
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
@@ -230,9 +230,11 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
     shown = episode("reach-v3", 1, LENGTHS[1])
     with torch.inference_mode():
         for step in (0, 4):
-            state, images = shown.states[step], {"corner4": shown.frames[step // 2]}
-            prompt = target.encode(Observation(state[:4], state, task_of("reach").instruction, images))
-            found = store.query(store.key(prompt, target.segments), "reach-v3", 3)
+            inputs = target.inputs(
+                shown.frames[step // 2], shown.states[step], target.words_of(task_of("reach").instruction)
+            )
+            prompt, _ = target.encode(inputs)
+            found = store.query(store.key(prompt, target.settings), "reach-v3", 3)
             assert (found.seeds[0], found.steps[0], found.left[0]) == (1, step, LENGTHS[1] - step)
             assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
             assert (np.diff(found.similarity) <= 0).all()
@@ -241,15 +243,16 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
 
 def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
     _, target, _ = opened(results, "nano-vision")
-    prompt, parts = torch.randn(2, target.max_prompt, target.width), target.segments
+    shape = target.settings
+    prompt = torch.randn(2, target.prompt_length, shape.width)
     vision, scene, hand = prompt[:, :4].mean(1), prompt[:, 14:16].mean(1), prompt[:, 16]
     unit = [x / x.norm(dim=-1, keepdim=True) for x in (vision, scene, hand)]
-    assert np.allclose(prompt_key(prompt, parts, ["scene"]), unit[1], atol=1e-6)
-    whole = prompt_key(prompt, parts, ["vision", "scene", "proprioception"])
+    assert np.allclose(prompt_key(prompt, shape, ["scene"]), unit[1], atol=1e-6)
+    whole = prompt_key(prompt, shape, ["vision", "scene", "proprioception"])
     assert np.allclose(whole, torch.cat(unit, -1) / 3**0.5, atol=1e-6)
     assert whole.dtype == np.float32
-    assert list(parts) == ["vision", "instruction", "scene", "proprioception"]
-    assert parts["proprioception"].stop == target.max_prompt
+    assert list(segments_of(replace(shape, observation="state"))) == ["scene", "proprioception"]
+    assert segments_of(shape)["proprioception"].stop == target.prompt_length
 
 
 def test_fewer_entries_than_asked_for_are_all_given(results: Path) -> None:
@@ -285,7 +288,7 @@ def test_the_manifest_says_where_everything_comes_from(results: Path) -> None:
     store, _, description = opened(results)
     demos = read_json(results / "artifacts/demos/few/manifest.json")
     manifest = store.manifest
-    assert (manifest["target"], manifest["demos"]) == (description.sha256, demos["sha256"])
+    assert (manifest["target"], manifest["demos"]) == (description["sha256"], demos["sha256"])
     assert (manifest["chunk"], manifest["dofs"], manifest["rows"]) == (4, 4, 52)
     assert {tuple(shard["seeds"]) for shard in manifest["tasks"].values()} == {tuple(LENGTHS)}
     assert manifest["first_evaluation_seed"] == EVALUATION_SEED

@@ -20,15 +20,7 @@ from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.files import sha256_of
-from kerv_cli.settings import (
-    AcceptanceSettings,
-    DrafterSettings,
-    MethodSettings,
-    OpeningSettings,
-    ProposerSettings,
-    TargetSettings,
-    ThresholdSettings,
-)
+from kerv_cli.settings import DrafterSettings, TargetSettings
 from kerv_cli.spaces import ActionSpace, Group, Observation
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.target import CompactTarget
@@ -36,8 +28,6 @@ from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.protocol import Target
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
-
-STRICT = AcceptanceSettings(kind="strict")
 
 
 def random_target(seed: int, layers: int, heads: int, chunk: int, fixed: bool = False) -> CompactTarget:
@@ -112,9 +102,8 @@ class RandomTrees:
         return TokenTree.build(tokens, parents)
 
 
-def decode(target: Target, proposer: object, prompt: torch.Tensor, nodes: int) -> Chunk:
-    method = MethodSettings("test", ProposerSettings(nodes=nodes), STRICT, ThresholdSettings(r=0))
-    return Decoder(target, method, Parts(proposer=proposer)).decode_prompt(prompt)  # type: ignore[arg-type]
+def decode(target: Target, proposer: object, prompt: torch.Tensor) -> Chunk:
+    return Decoder(target, Parts(proposer=proposer)).decode_prompt(prompt)  # type: ignore[arg-type]
 
 
 def assert_adds_up(chunk: Chunk) -> None:
@@ -143,7 +132,7 @@ def test_strict_decoding_of_random_trees_equals_ar(
     target = random_target(seed, layers, heads, chunk, fixed)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
-    result = decode(target, RandomTrees(truth, seed, nodes), prompt, nodes)
+    result = decode(target, RandomTrees(truth, seed, nodes), prompt)
     assert result.tokens == truth
     assert_adds_up(result)
 
@@ -165,9 +154,9 @@ def test_strict_decoding_with_a_drafter_equals_ar(
     drafter = Drafter.beside(DrafterSettings(layers=layers), target).eval().requires_grad_(False)
     if fixed:
         drafter.new_cache = functools.partial(drafter.new_cache, fixed=True)  # type: ignore[method-assign]
-    proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", depth, top_k, nodes))
+    proposer = DrafterProposer(drafter, target, depth, top_k, nodes)
     prompt = random_prompt(target, seed)
-    result = decode(target, proposer, prompt, nodes)
+    result = decode(target, proposer, prompt)
     assert result.tokens == plain_greedy(target, prompt)
     assert_adds_up(result)
 
@@ -177,7 +166,7 @@ def test_strict_decoding_with_a_drafter_equals_ar(
 def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None:
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
-    result = decode(target, JacobiProposer(), prompt, 0)
+    result = decode(target, JacobiProposer(), prompt)
     assert result.tokens == plain_greedy(target, prompt)
     assert result.forwards <= size_of(target)
     assert_adds_up(result)
@@ -187,7 +176,7 @@ def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None
 def test_ar_takes_exactly_n_forwards(chunk: int) -> None:
     target = random_target(3, 2, 2, chunk)
     prompt = random_prompt(target, 5)
-    result = Decoder(target, MethodSettings()).decode_prompt(prompt)
+    result = Decoder(target).decode_prompt(prompt)
     assert result.tokens == plain_greedy(target, prompt)
     assert result.forwards == size_of(target)
     assert {r.mode for r in result.rounds} == {"prefill", "decode"} if chunk else True
@@ -202,7 +191,7 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None
         def propose(self, chunk: Chunk, depth: int) -> TokenTree:
             return TokenTree.chain(self.truth[len(chunk.tokens) :][: min(5, depth)])
 
-    result = decode(target, Perfect(truth, 0, 5), prompt, 5)
+    result = decode(target, Perfect(truth, 0, 5), prompt)
     assert result.tokens == truth
     assert [r.committed for r in result.rounds] == [1, 6, 6, 3]
 
@@ -219,24 +208,21 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None
 def test_drafts_verified_inside_the_prefill_are_lossless(
     seed: int, heads: int, chunk: int, nodes: int, drafting: bool, fixed: bool
 ) -> None:
-    """docs/methods.md §5: an opening of random trees, then plain decoding or the drafter, still yields AR's tokens."""
+    """docs/methods.md §5: random trees in the prefill, then plain decoding or the drafter, still yield AR's tokens."""
     target = random_target(seed, 2, heads, chunk, fixed)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
     proposer = None
     if drafting:
         drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
-        proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
-    method = MethodSettings(
-        "test", ProposerSettings(nodes=6), STRICT, ThresholdSettings(), opening=OpeningSettings(["random"], nodes)
-    )
-    parts = Parts(opening=RandomTrees(truth, seed, nodes), proposer=proposer)
-    result = Decoder(target, method, parts).decode_prompt(prompt)
+        proposer = DrafterProposer(drafter, target, 4, 2, 6)
+    parts = Parts(prefill_draft=RandomTrees(truth, seed, nodes), proposer=proposer)
+    result = Decoder(target, parts).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
 
 
-def test_a_perfect_opening_takes_one_forward() -> None:
+def test_a_perfect_draft_in_the_prefill_takes_one_forward() -> None:
     target = random_target(5, 2, 2, 4)
     prompt = random_prompt(target, 5)
     truth = plain_greedy(target, prompt)
@@ -245,8 +231,7 @@ def test_a_perfect_opening_takes_one_forward() -> None:
         def propose(self, chunk: Chunk, depth: int) -> TokenTree:
             return TokenTree.chain(self.truth[:depth])
 
-    method = MethodSettings("test", acceptance=STRICT, opening=OpeningSettings(["whole"], 16))
-    result = Decoder(target, method, Parts(opening=Whole(truth, 0, 16))).decode_prompt(prompt)
+    result = Decoder(target, Parts(prefill_draft=Whole(truth, 0, 16))).decode_prompt(prompt)
     assert result.tokens == truth
     assert result.forwards == 1
     assert [r.committed for r in result.rounds] == [16]
@@ -259,8 +244,8 @@ def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
     drafted = []
     for fixed in (False, True):
         drafter.new_cache = functools.partial(Drafter.new_cache, drafter, fixed=fixed)  # type: ignore[method-assign]
-        proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", 5, 4, 20))
-        drafted.append([r.drafted for r in decode(target, proposer, prompt, 20).rounds])
+        proposer = DrafterProposer(drafter, target, 5, 4, 20)
+        drafted.append([r.drafted for r in decode(target, proposer, prompt).rounds])
     assert drafted[0] == drafted[1]
 
 
@@ -297,12 +282,18 @@ def test_any_target_is_decoded_losslessly(
     assert prompt.shape[1] == words + 1
     truth = plain_greedy(target, prompt)
     trees = RandomTrees(truth, seed, nodes, actions.tokens)
-    opening = RandomTrees(truth, seed + 1, nodes, actions.tokens) if inside else None
-    sources = OpeningSettings(["random"] if inside else [], nodes)
-    method = MethodSettings("test", ProposerSettings(nodes=nodes), STRICT, ThresholdSettings(r=0), opening=sources)
-    result = Decoder(target, method, Parts(opening=opening, proposer=trees)).decode_prompt(prompt)
+    first = RandomTrees(truth, seed + 1, nodes, actions.tokens) if inside else None
+    result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), actions=spaces(), chunk=st.integers(1, 4))
+def test_jacobi_decoding_of_any_target_ends_at_ar(seed: int, actions: ActionSpace, chunk: int) -> None:
+    target = MockTarget(actions, chunk, seed=seed)
+    prompt = target.encode(Observation(np.array([0.1 * seed]), np.zeros(0), "go"))
+    assert decode(target, JacobiProposer(), prompt).tokens == plain_greedy(target, prompt)
 
 
 def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file
 
+from kerv_cli.artifacts import artifact_folder
 from kerv_cli.config import compose
 from kerv_cli.drafting.early import (
     EarlyDrafter,
@@ -31,7 +32,6 @@ from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.demos.recording import DemoConfig, record
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.places import early_folder
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.target import CompactTarget
@@ -273,7 +273,6 @@ def test_a_share_of_the_observations_is_spread_evenly(nano: CompactTarget, share
 def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
     """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
     from kerv_cli.decoding.decoder import Decoder
-    from kerv_cli.settings import MethodSettings
 
     target = load_target(results / "artifacts/target" / name)[0]
     dataset = DemoDataset.open(results / "artifacts/demos/few")
@@ -281,7 +280,7 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
     samples = load_samples(dataset, target.settings, target.words, ("drawer-close-v3",))
     assert torch.equal(taught.episodes, samples.episodes)
     assert [bool(x) for x in taught.perturbed] == [dataset.episodes[e].perturbed for e in taught.episodes]
-    decoder = Decoder(target, MethodSettings())
+    decoder = Decoder(target)
     for i in range(0, len(samples), 7):
         prompt, _ = target.encode_batch(samples.inputs(torch.tensor([i]), target.device))
         assert taught.tokens[i].tolist() == decoder.decode_prompt(prompt).tokens
@@ -370,9 +369,10 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
 
 
 def test_the_folder_is_beside_the_target(policies: Path) -> None:
-    assert early_folder("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
-    assert early_folder("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
-    assert early_folder("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")
+    place = artifact_folder("early")
+    assert place("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
+    assert place("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
+    assert place("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")
 
 
 def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line() -> None:

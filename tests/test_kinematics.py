@@ -1,4 +1,4 @@
-"""Kinematic prediction: precomputed weights against filterpy step by step, closed forms, the gripper, the history."""
+"""Kinematic prediction: precomputed weights against weighted least squares, closed forms, held DoFs, the history."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from filterpy.common import Q_discrete_white_noise
-from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -32,33 +30,38 @@ from kerv_cli.drafting.kinematics import (
 from kerv_cli.errors import UnknownName, UsageError
 
 DOFS = 4
+HELD = (False, False, False, True)
 NOISE = {name: Noise.uniform(DOFS, 5.0, 0.5, 0.8 if name == "damped" else 1.0) for name in FILTERS}
 
 
 @functools.cache
-def predictor(kind: str, **shape: int) -> Predictor:
-    return build_predictor(kind, DOFS, NOISE, **shape)
+def predictor(kind: str, held: tuple[bool, ...] = HELD, **shape: int) -> Predictor:
+    return build_predictor(kind, np.array(held), NOISE, **shape)
 
 
-def filterpy_prediction(
+def most_probable_path(
     window: np.ndarray, q: float, r: float, steps: int, order: int, damping: float = 1.0
 ) -> np.ndarray:
-    """(steps,): the reference, one predict and one update per action."""
-    run = KalmanFilter(dim_x=order, dim_z=1)
-    run.x = np.zeros((order, 1))
-    run.x[0, 0] = window[0]
-    run.P = r * np.eye(order)
-    run.R = np.array([[r]])
-    run.Q = Q_discrete_white_noise(order, dt=1, var=q)
-    run.H = np.eye(1, order)
-    run.F = {2: np.array([[1, damping], [0, damping]]), 3: np.array([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]])}[order]
-    for value in window[1:]:
-        run.predict()
-        run.update(value)
+    """(steps,): the reference, without a recursion. The first state and every random push are unknowns; the most
+    probable ones are a weighted least-squares solution, and what is ahead goes on from them without a push."""
+    transition = {2: np.array([[1, damping], [0, damping]]), 3: np.array([[1, 1, 0.5], [0, 1, 1], [0, 0, 1]])}[order]
+    push = np.array([0.5, 1.0, 1.0])[:order]
+    pushes = len(window) - 1
+    state = np.hstack([np.eye(order), np.zeros((order, pushes))])  # of time 0, in the unknowns
+    first, rows = state.copy(), []
+    for i in range(pushes):
+        state = transition @ state
+        state[:, order + i] += push
+        rows.append(state[0].copy())
+    pushed = np.eye(order + pushes)[order:]
+    known = [window[0], *[0.0] * (order - 1)]
+    weighted = np.vstack([first / np.sqrt(r), np.reshape(rows, (pushes, -1)) / np.sqrt(r), pushed / np.sqrt(q)])
+    wanted = np.concatenate([np.array(known) / np.sqrt(r), window[1:] / np.sqrt(r), np.zeros(pushes)])
+    unknowns, *_ = np.linalg.lstsq(weighted, wanted, rcond=None)
     ahead = []
     for _ in range(steps):
-        run.predict()
-        ahead.append(run.x[0, 0])
+        state = transition @ state
+        ahead.append(state[0] @ unknowns)
     return np.array(ahead)
 
 
@@ -68,25 +71,25 @@ log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
 
 @settings(deadline=None)  # the machine is shared
 @given(windows, log_scale, log_scale, st.integers(1, HORIZON), st.sampled_from([(2, 1.0), (2, 0.7), (3, 1.0)]))
-def test_the_weights_are_filterpys_filter(
+def test_the_weights_are_those_of_the_most_probable_path(
     window: np.ndarray, q: float, r: float, steps: int, model: tuple[int, float]
 ) -> None:
     weights = kalman_weights(q, r, len(window), steps, *model)
     assert weights.shape == (steps, len(window))
-    expected = filterpy_prediction(window, q, r, steps, *model)
+    expected = most_probable_path(window, q, r, steps, *model)
     np.testing.assert_allclose(weights @ window, expected, rtol=1e-6, atol=1e-6)
 
 
 @settings(deadline=None)  # the machine is shared
 @given(arrays(np.float64, st.tuples(st.integers(3, 14), st.just(DOFS)), elements=st.floats(-1, 1)))
-def test_predict_is_filterpys_filter_on_the_newest_actions_clipped(history: np.ndarray) -> None:
+def test_predict_goes_on_along_the_newest_actions_most_probable_path_clipped(history: np.ndarray) -> None:
     for kind, order in (("kalman", 2), ("damped", 2), ("acceleration", 3)):
         noise = NOISE[kind]
         ahead = predictor(kind, minimum=3).predict(history, 4)
         assert ahead is not None
         for dof in range(DOFS - 1):
             window = history[-WINDOW:, dof]
-            expected = filterpy_prediction(window, noise.q[dof], noise.r[dof], 4, order, noise.damping[dof])
+            expected = most_probable_path(window, noise.q[dof], noise.r[dof], 4, order, noise.damping[dof])
             np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), atol=1e-9)
 
 
@@ -142,9 +145,9 @@ def test_only_the_ratio_of_the_noises_counts() -> None:
 
 def test_hold_and_linear() -> None:
     history = np.array([[0.9, 0.0, 0.1, 1.0], [0.2, 0.0, 0.2, 1.0], [0.3, 0.5, 0.1, -1.0]])
-    held = Hold(DOFS, minimum=1).predict(history, 2)
+    held = Hold(np.array(HELD), minimum=1).predict(history, 2)
     np.testing.assert_allclose(held, [history[-1]] * 2)
-    line = Linear(DOFS, minimum=2).predict(history, 3)
+    line = Linear(np.array(HELD), minimum=2).predict(history, 3)
     np.testing.assert_allclose(
         line, [[0.4, 1.0, 0.0, -1.0], [0.5, 1.0, -0.1, -1.0], [0.6, 1.0, -0.2, -1.0]], atol=1e-12
     )
@@ -154,17 +157,21 @@ def test_hold_and_linear() -> None:
 @given(
     st.sampled_from(PREDICTORS),
     arrays(np.float64, (7, DOFS), elements=st.floats(-1, 1)),
-    st.integers(0, DOFS - 1),
+    st.tuples(*[st.booleans()] * DOFS),
     st.integers(0, HORIZON),
 )
-def test_predictions_are_bounded_and_the_gripper_is_held(
-    kind: str, history: np.ndarray, gripper: int, steps: int
+def test_predictions_are_bounded_and_held_dofs_keep_their_last_value(
+    kind: str, history: np.ndarray, held: tuple[bool, ...], steps: int
 ) -> None:
-    ahead = predictor(kind, gripper=gripper).predict(history, steps)
+    ahead = predictor(kind, held).predict(history, steps)
     assert ahead is not None
     assert ahead.shape == (steps, DOFS)
     assert (np.abs(ahead) <= 1).all()
-    assert (ahead[:, gripper] == history[-1, gripper]).all()
+    assert (ahead[:, held] == history[-1, held]).all()
+    moving = np.logical_not(held)
+    free = predictor(kind, (False,) * DOFS).predict(history, steps)
+    assert free is not None
+    assert (ahead[:, moving] == free[:, moving]).all()
 
 
 @pytest.mark.parametrize("kind", PREDICTORS)
@@ -218,10 +225,10 @@ def test_wrong_requests() -> None:
     with pytest.raises(UnknownName, match="did you mean kalman"):
         predictor("kalmann")
     with pytest.raises(UsageError, match="kerv calibrate"):
-        build_predictor("kalman", DOFS, {})
+        build_predictor("kalman", np.array(HELD), {})
     with pytest.raises(UsageError, match="minimum history"):
-        Acceleration(NOISE["acceleration"], minimum=2)
+        Acceleration(np.array(HELD), NOISE["acceleration"], minimum=2)
     with pytest.raises(UsageError, match="minimum history"):
-        Hold(DOFS, minimum=WINDOW + 1)
+        Hold(np.array(HELD), minimum=WINDOW + 1)
     with pytest.raises(ValueError, match="9 steps of 4"):
-        Kalman(NOISE["kalman"]).predict(np.zeros((5, DOFS)), HORIZON + 1)
+        Kalman(np.array(HELD), NOISE["kalman"]).predict(np.zeros((5, DOFS)), HORIZON + 1)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.tree import ROOT, TokenTree
+from kerv_cli.drafting.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import DrafterSettings, TargetSettings
 from kerv_cli.spaces import Observation, ObservationSpace, Place
@@ -99,7 +99,7 @@ def test_the_packed_trunk_is_the_trunk(
             seen = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
             drafted = x[:, prompt : prompt + 1 + nodes]
             positions = torch.tensor([prompt, *(prompt + 1 + d for d in tree.depths)])
-            seen.append(trunk(drafted, positions, cache, tree.seen(1)))
+            seen.append(trunk(drafted, positions, cache, visible_in_verification(tree)))
             path = tree.path_to(nodes - 1) if nodes else []
             cache.compact(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
             for i in range(2):
@@ -107,7 +107,7 @@ def test_the_packed_trunk_is_the_trunk(
                 seen.append(trunk(x[:, -1 - i][:, None], torch.tensor([at]), cache))
             whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
             cache.length = 0
-            seen.append(trunk(x[:, : prompt + nodes], whole, cache, tree.seen(prompt)))
+            seen.append(trunk(x[:, : prompt + nodes], whole, cache, visible_in_prefill(tree, prompt)))
             seen.append(trunk(x[:, :prompt], torch.arange(prompt)))
             outputs.append(seen)
     assert all(close(a, b) for a, b in zip(*outputs, strict=True))

@@ -37,7 +37,7 @@ from kerv_cli.settings import (
     SkipSettings,
 )
 from kerv_cli.spaces import bins_of
-from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import Target
 
 D = 4
 STRICT = AcceptanceSettings("strict")
@@ -50,14 +50,14 @@ class KnownDraft:
         self.odds = random.random()
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def drafted(self, features: torch.Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
+    def drafted(self, prompt: torch.Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
         return self.tokens, self.odds
 
 
-def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
+def stored(target: Target, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
     """A datastore whose entries lie around this prompt's key; entry i is of episode i."""
     random = np.random.default_rng(0)
-    key = prompt_key(prompt, target.segments, ["scene"])[0]
+    key = prompt_key(prompt, target.settings, ["scene"])[0]
     vectors = key + 0.05 * random.standard_normal((len(chunks), len(key)))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     return Datastore(
@@ -80,16 +80,16 @@ def situation(random: np.random.Generator, executed: int) -> Situation:
     return Situation("t", history, path, random)
 
 
-def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:
+def proposers(target: Target, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:
     random = np.random.default_rng(seed)
-    horizon = target.chunk
+    horizon = target.settings.chunk
     wrong = np.array([truth] * 4)
     wrong[random.random(wrong.shape) < 0.2] = random.integers(255)
     retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 40)
     drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
     drafting = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
     hold = PredictionProposer(Hold(D, minimum=1, horizon=horizon))
-    early = EarlyProposer(KnownDraft(truth, random), target)  # type: ignore[arg-type]
+    early = EarlyProposer(KnownDraft(truth, random))  # type: ignore[arg-type]
     return {
         "hold": hold,
         "linear": PredictionProposer(Linear(D, minimum=2, horizon=horizon)),

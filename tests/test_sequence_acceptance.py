@@ -7,24 +7,33 @@ from itertools import groupby
 import numpy as np
 import pytest
 import torch
+from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.decoding.acceptance import accept_by_distance, accept_by_group, acceptance_rule, limits_of
+from kerv_cli.decoding.acceptance import Acceptance, accept_by_distance, accept_by_group
+from kerv_cli.decoding.build import Context
 from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups, segments
+from kerv_cli.decoding.proposers import Stateless
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.settings import AcceptanceSettings, MethodSettings, ProposerSettings, TargetSettings
-from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.registry import find
+from kerv_cli.spaces import ActionSpace, Group
 
-ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
+POSITION_GRIPPER = SPEC.actions
 
-POSITION_GRIPPER = kinematic_groups(4)
+
+def space_of(*sizes: int) -> ActionSpace:
+    """Groups of these sizes, the last one strict."""
+    names = tuple(f"dof{i}" for i in range(sum(sizes)))
+    groups = tuple(Group(f"group{i}", size) for i, size in enumerate(sizes))
+    limits = (1.0,) * len(names)
+    return ActionSpace(names, groups, names[-sizes[-1] :], 10.0, tuple(-x for x in limits), limits)
+
+
 LIMITS = (15, 15, 15, 0)
-layouts = st.sampled_from([POSITION_GRIPPER, kinematic_groups(7), ((0,), (1, 2)), ((0, 1, 2, 3, 4),)])
+layouts = st.sampled_from([POSITION_GRIPPER, SEVEN, space_of(1, 2), space_of(5)])
 
 
 @st.composite
@@ -35,13 +44,18 @@ def bushes(draw: st.DrawFn, most: int = 16, vocabulary: int = 6) -> TokenTree:
     return TokenTree.build([draw(st.integers(0, vocabulary - 1)) for _ in range(n)], parents)
 
 
+def group_of_dof(space: ActionSpace) -> list[int]:
+    """DoF -> number of its group."""
+    return [g for g, group in enumerate(space.groups) for _ in range(group.size)]
+
+
 def slow_acceptance(
-    tree: TokenTree, target_tokens: list[int], start: int, limits: list[int], group_limit: int, groups: Groups
+    tree: TokenTree, target_tokens: list[int], start: int, limits: list[int], group_limit: int, space: ActionSpace
 ) -> tuple[int, int, int]:
     """(−length, distance, node) of the best path, by the definition: every root path of whole groups, judged group by
     group."""
-    dofs = len(limits)
-    name = [g for g, group in enumerate(groups) for _ in group]  # DoF -> its group
+    dofs, groups = len(limits), space.groups
+    name = group_of_dof(space)
     best = (0, 0, ROOT)
     for node in range(len(tree)):
         path = tree.path_to(node)
@@ -61,13 +75,12 @@ def slow_acceptance(
 @settings(max_examples=400, deadline=None)
 @given(bushes(), st.data(), layouts, st.integers(0, 15), st.integers(0, 6))
 def test_the_sequence_rule_is_its_definition(
-    tree: TokenTree, data: st.DataObject, groups: Groups, start: int, group_limit: int
+    tree: TokenTree, data: st.DataObject, space: ActionSpace, start: int, group_limit: int
 ) -> None:
-    dofs = sum(map(len, groups))
-    limits = data.draw(st.lists(st.integers(0, 4), min_size=dofs, max_size=dofs))
+    limits = data.draw(st.lists(st.integers(0, 4), min_size=space.dofs, max_size=space.dofs))
     target_tokens = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
-    found = accept_by_group(tree, target_tokens, start, limits, group_limit=group_limit, groups=groups)
-    _, _, node = slow_acceptance(tree, target_tokens, start, limits, group_limit, groups)
+    found = accept_by_group(tree, target_tokens, start, limits, group_limit=group_limit, bounds=space.bounds)
+    _, _, node = slow_acceptance(tree, target_tokens, start, limits, group_limit, space)
     assert list(found.path) == (tree.path_to(node) if node != ROOT else [])
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     assert (found.rejected is None) == (not children)
@@ -81,14 +94,17 @@ def test_no_limits_on_single_dofs_is_acceptance_by_distance(tree: TokenTree, dat
     """Groups of one DoF and a loose sum leave only the token limits: Spec-VLA's rule."""
     limits = data.draw(st.lists(st.integers(0, 4), min_size=4, max_size=4))
     target_tokens = [data.draw(st.integers(0, 5)) for _ in range(len(tree) + 1)]
-    single = accept_by_group(tree, target_tokens, start, limits, group_limit=99, groups=((0,), (1,), (2,), (3,)))
+    single = accept_by_group(tree, target_tokens, start, limits, group_limit=99, bounds=space_of(1, 1, 1, 1).bounds)
     assert single == accept_by_distance(tree, target_tokens, start, limits)
 
 
-def judge(tokens: list[int], start: int = 0, verdict: int = 100) -> int:
-    """Accepted length of a chain whose target_tokens are all `verdict`."""
+def judge(tokens: list[int], start: int = 0, wanted: int = 100) -> int:
+    """Accepted length of a chain whose target tokens are all `wanted`."""
     tree = TokenTree.chain(tokens)
-    return len(accept_by_group(tree, [verdict] * (len(tokens) + 1), start, LIMITS, group_limit=30).path)
+    found = accept_by_group(
+        tree, [wanted] * (len(tokens) + 1), start, LIMITS, group_limit=30, bounds=POSITION_GRIPPER.bounds
+    )
+    return len(found.path)
 
 
 @pytest.mark.parametrize(
@@ -119,58 +135,75 @@ def test_groups_are_accepted_or_rejected_whole(tokens: list[int], start: int, ac
 
 def test_a_rejected_group_is_shown_by_its_first_token() -> None:
     tree = TokenTree.build([100, 100, 100, 100, 104, 100, 90, 103], [-1, 0, 1, 2, 3, 4, 5, 3])
-    verdict = accept_by_group(tree, [100] * 9, 0, LIMITS, group_limit=10)
-    assert verdict.path == (0, 1, 2, 3)
-    assert verdict.rejected == 7  # nearer to the verdict than node 4, which began a group that failed
+    found = accept_by_group(tree, [100] * 9, 0, LIMITS, group_limit=10, bounds=POSITION_GRIPPER.bounds)
+    assert found.path == (0, 1, 2, 3)
+    assert found.rejected == 7  # nearer to the target's token than node 4, which began a group that failed
+
+
+def rule(kind: str, space: ActionSpace = POSITION_GRIPPER, **values: object) -> Acceptance:
+    """As a method's part."""
+    part = find("acceptance", kind)
+    target = MockTarget(space)
+    built: Acceptance = part.built(part.settings(kind=kind, **values), Context(target, lambda kind: None))
+    return built
 
 
 def test_the_settings_become_the_rule() -> None:
-    chosen = AcceptanceSettings("sequence", group_limit=20, token_limit=9)
-    assert limits_of(chosen, r=3, dofs=4, gripper=3) == (9, 9, 9, 0)
-    assert limits_of(chosen, r=3, dofs=7, gripper=6) == (9, 9, 9, 9, 9, 9, 0)
-    rule = acceptance_rule(chosen)
-    tree = TokenTree.chain([107, 107, 106, 100])
-    assert rule(tree, [100] * 5, 0, (9, 9, 9, 0)).path == (0, 1, 2, 3)
-    assert rule(TokenTree.chain([107, 107, 107, 100]), [100] * 5, 0, (9, 9, 9, 0)).path == ()
-    assert limits_of(AcceptanceSettings("relaxed"), r=3, dofs=4, gripper=3) == (3, 3, 3, 3)
-    assert limits_of(AcceptanceSettings("relaxed", strict_gripper=True), r=3, dofs=4, gripper=3) == (3, 3, 3, 0)
+    chosen = rule("sequence", group_limit=20, token_limit=9)
+    assert chosen.limits(3) == (9, 9, 9, 0)
+    assert rule("sequence", SEVEN, token_limit=9).limits(3) == (9, 9, 9, 9, 9, 9, 0)
+    assert chosen.judge(TokenTree.chain([107, 107, 106, 100]), [100] * 5, 0, 3).path == (0, 1, 2, 3)
+    assert chosen.judge(TokenTree.chain([107, 107, 107, 100]), [100] * 5, 0, 3).path == ()
+    assert rule("relaxed", strict_dofs=False).limits(3) == (3, 3, 3, 3)
+    assert rule("relaxed").limits(3) == (3, 3, 3, 0)
+    assert rule("relaxed", SEVEN).limits(3) == (3, 3, 3, 3, 3, 3, 0)
+    assert rule("strict").limits(9) == (0, 0, 0, 0)
+    assert (rule("sequence").group_limit, rule("sequence").token_limit) == (30, 15)  # HeiSD's
+
+
+def test_every_strict_dof_must_match_wherever_it_stands() -> None:
+    wrist = ActionSpace(("grip", "x", "lock"), (Group("all", 3),), ("grip", "lock"), 10.0, (-1.0,) * 3, (1.0,) * 3)
+    assert rule("relaxed", wrist).limits(4) == (0, 4, 0)
+    assert rule("sequence", wrist, token_limit=7).limits(4) == (0, 7, 0)
+
+
+def test_hybrid_judges_retrieved_drafts_by_group_and_all_others_by_distance() -> None:
+    chosen = rule("hybrid", group_limit=20, token_limit=9, strict_dofs=False)
+    retrieved, drafted = chosen.of_drafts_from("retrieval"), chosen.of_drafts_from("drafter")
+    tree = TokenTree.chain([107, 107, 107, 100])
+    assert (retrieved.limits(8), retrieved.judge(tree, [100] * 5, 0, 8).path) == ((9, 9, 9, 0), ())
+    assert (drafted.limits(8), drafted.judge(tree, [100] * 5, 0, 8).path) == ((8, 8, 8, 8), (0, 1, 2, 3))
+    for kind in ("strict", "relaxed", "sequence"):
+        assert rule(kind).of_drafts_from("retrieval") == rule(kind)
 
 
 def test_groups_cover_the_action_in_order() -> None:
-    assert bounds(kinematic_groups(4)) == [(0, 3), (0, 3), (0, 3), (3, 4)]
-    assert bounds(kinematic_groups(7)) == [(0, 3)] * 3 + [(3, 6)] * 3 + [(6, 7)]
-    for wrong in (((0, 2), (1,)), ((0,), (2,)), ((1, 2),), ((0,), ())):
-        with pytest.raises(ValueError, match="do not cover the DoFs in order"):
-            bounds(wrong)
-    with pytest.raises(ValueError, match="no kinematic groups for 5 DoFs"):
-        kinematic_groups(5)
+    assert POSITION_GRIPPER.bounds == ((0, 3), (0, 3), (0, 3), (3, 4))
+    assert SEVEN.bounds == ((0, 3),) * 3 + ((3, 6),) * 3 + ((6, 7),)
+    for sizes in ((3,), (3, 2), (4, 0), ()):
+        groups = tuple(Group("group", size) for size in sizes)
+        with pytest.raises(ValueError, match="do not cover the 4 DoFs in order"):
+            ActionSpace(("a", "b", "c", "d"), groups, (), 10.0, (-1.0,) * 4, (1.0,) * 4)
 
 
 @given(layouts, st.integers(0, 30), st.integers(0, 30))
-def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(groups: Groups, start: int, stop: int) -> None:
-    cut = list(segments(start, stop, groups))
-    dofs = sum(map(len, groups))
-    name = [g for g, group in enumerate(groups) for _ in group]
-    indices = range(start, stop)
-    expected = [list(g) for _, g in groupby(indices, lambda j: j // dofs * len(groups) + name[j % dofs])]
+def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(space: ActionSpace, start: int, stop: int) -> None:
+    cut = list(space.segments(start, stop))
+    dofs, name = space.dofs, group_of_dof(space)
+    expected = [
+        list(g) for _, g in groupby(range(start, stop), lambda j: j // dofs * len(space.groups) + name[j % dofs])
+    ]
     assert [list(range(first, last)) for first, last, _ in cut] == expected
-    assert [gripper for _, _, gripper in cut] == [name[g[0] % dofs] == len(groups) - 1 for g in expected]
+    assert [strict for _, _, strict in cut] == [name[g[0] % dofs] == len(space.groups) - 1 for g in expected]
 
 
-class Shifted:
+class Shifted(Stateless):
     """Drafts AR's own chunk, shifted by a few bins, so that whole groups are accepted and rejected."""
 
     name = "shifted"
-    needs_states = False
 
     def __init__(self, truth: list[int], seed: int) -> None:
         self.truth, self.rng = truth, np.random.default_rng(seed)
-
-    def begin(self, chunk: Chunk) -> None:
-        pass
-
-    def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, target_tokens: list[int]) -> None:
-        pass
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         ahead = np.array(self.truth[len(chunk.tokens) :][:depth])
@@ -178,15 +211,12 @@ class Shifted:
 
 
 def test_in_the_loop_paths_end_with_groups_and_a_begun_group_has_one_verdict() -> None:
-    torch.manual_seed(0)
-    shape = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
-    target = CompactTarget(shape, ACTIONS, OBSERVATION, WordTokenizer.build(["open"])).eval()
+    target = MockTarget(POSITION_GRIPPER, chunk=4)
     accepted = 0
     for seed in range(20):
-        prompt = torch.randn(1, target.max_prompt, 32, generator=torch.Generator().manual_seed(seed))
-        truth = Decoder(target, MethodSettings()).decode_prompt(prompt).tokens
-        loose = MethodSettings("x", ProposerSettings("shifted", nodes=16), AcceptanceSettings("sequence"))
-        chunk = Decoder(target, loose, Parts(proposer=Shifted(truth, seed))).decode_prompt(prompt)
+        prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(seed)).double()
+        truth = Decoder(target).decode_prompt(prompt).tokens
+        chunk = Decoder(target, Parts(rule("sequence"), proposer=Shifted(truth, seed))).decode_prompt(prompt)
         assert len(chunk.tokens) == 16
         for r in chunk.rounds:
             if r.mode == "verify":

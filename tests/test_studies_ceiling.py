@@ -180,7 +180,7 @@ def test_cells_of_before_are_readable(tmp_path: Path) -> None:
         plain = {k: v for k, v in cell.settings.items() if k not in ("skip", "datastore", "chunk")}
         plain["opening"] = {"kind": "none", "nodes": 0}
         plain["policy"] = {"target": "mt10-vision", "drafter": None}
-        old.append(make_cell(cell.label, "", plain, IDENTITY, "reach-v3"))
+        old.append(make_cell(cell.label, "", plain, IDENTITY, "reach-v3", cell.seeds))
     assert [cell.label for cell in old] == ["ar", "kerv"]
     table = write(tmp_path, [*old, cells[2]])
     assert ceilings(table)["kerv"] == pytest.approx(EXPECTED["kerv"])

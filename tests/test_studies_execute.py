@@ -3,23 +3,39 @@
 from __future__ import annotations
 
 import io
+import itertools
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from rich.console import Console
-from studies_synthetic import count_calls, misbehave, run_cell, slow_cell, threshold_study
+from studies_synthetic import (
+    count_calls,
+    episode,
+    misbehave,
+    prepare,
+    run_cell,
+    slow_elsewhere,
+    threshold_study,
+)
 
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import StorageError, UsageError
-from kerv_cli.studies.events import CellDone, CellFailed, CellReused, CellStarted, Event, SweepFinished, SweepStarted
-from kerv_cli.studies.execute import estimate, execute
-from kerv_cli.studies.plan import Cell
+from kerv_cli.settings import RuntimeSettings
+from kerv_cli.studies.block import RunEpisode
+from kerv_cli.studies.claims import is_claimed
+from kerv_cli.studies.estimate import estimate
+from kerv_cli.studies.events import BlockStarted, CellDone, CellFailed, CellReused, Event, SweepFinished, SweepStarted
+from kerv_cli.studies.execute import execute
+from kerv_cli.studies.plan import Cell, blocks_of
 from kerv_cli.studies.progress import ProgressDisplay
 from kerv_cli.studies.store import StudyStore
 
@@ -52,17 +68,52 @@ def test_two_labels_of_one_result_run_once(store: StudyStore) -> None:
     assert len(outcome.done) == 1
 
 
-def test_a_cell_that_raises_does_not_end_the_others(store: StudyStore) -> None:
-    cells = threshold_study(["reach-v3"])
-    bad = cells[1]
+def test_the_settings_of_a_block_take_turns_in_a_recorded_order(store: StudyStore) -> None:
+    """Seed by seed, every setting once per seed, not always in the same order; the gauge runs before each episode."""
+    cells = threshold_study(["reach-v3"], episodes=7)  # two blocks: five seeds and two
+    ran: list[tuple[str, int]] = []
 
-    def run(cell: Cell) -> list[EpisodeRecord]:
-        if cell is bad:
-            raise RuntimeError("the gripper\nfell off")
-        return run_cell(cell)
+    def noting(cell: Cell) -> RunEpisode:
+        def run(seed: int) -> EpisodeRecord:
+            ran.append((cell.label, seed))
+            return episode(cell, seed)
+
+        return run
+
+    gauged = itertools.count()
+    execute(cells, noting, store, gauge=lambda device: float(next(gauged)))
+    assert [seed for _, seed in ran] == sorted(4 * list(range(100_000, 100_007)))
+    orders = [tuple(label for label, seed in ran if seed == wanted) for wanted in range(100_000, 100_007)]
+    assert {frozenset(order) for order in orders} == {frozenset(labels(cells))}
+    assert len(set(orders)) > 2
+    table = pd.concat([store.read_cell(cell.id).episodes.assign(label=cell.label) for cell in cells])
+    table = table.sort_values("gauge_seconds")
+    assert list(zip(table["label"], table["seed"], strict=True)) == ran
+    assert list(table["order"]) == [*range(20), *range(8)]
+    assert table["block"].nunique() == 2
+    assert table["started"].is_monotonic_increasing
+    (again,) = blocks_of([cell for cell in threshold_study(["reach-v3"], episodes=7) if len(cell.seeds) == 5])
+    assert [tuple(again.cells[i].label for i in again.order(seed)) for seed in again.seeds] == orders[:5]
+
+
+def test_a_setting_that_raises_is_dropped_from_its_block_alone(store: StudyStore) -> None:
+    cells = threshold_study(["reach-v3"])
+    bad, third = cells[1], cells[1].seeds[2]
+    tried = []
+
+    def breaking(cell: Cell) -> RunEpisode:
+        def run(seed: int) -> EpisodeRecord:
+            if cell is bad:
+                tried.append(seed)
+                if seed == third:
+                    raise RuntimeError("the gripper\nfell off")
+            return episode(cell, seed)
+
+        return run
 
     events: list[Event] = []
-    outcome = execute(cells, run, store, on_event=events.append)
+    outcome = execute(cells, breaking, store, on_event=events.append)
+    assert tried == list(bad.seeds[:3])
     assert len(outcome.done) == 3
     (failure,) = outcome.failed
     assert failure.cell is bad
@@ -71,58 +122,58 @@ def test_a_cell_that_raises_does_not_end_the_others(store: StudyStore) -> None:
     assert "fell off" in trace.read_text()
     assert not store.has_cell(bad.id)
     kinds = [type(event) for event in events]
-    assert kinds[0] is SweepStarted
+    assert kinds[:2] == [SweepStarted, BlockStarted]
     assert kinds[-1] is SweepFinished
-    assert kinds.count(CellStarted) == 4
     assert kinds.count(CellDone) == 3
     assert kinds.count(CellFailed) == 1
-    assert execute(cells, run_cell, store).failed == []
+    assert execute(cells, prepare, store).failed == []
     assert not trace.exists()
 
 
 def test_an_error_of_kerv_is_told_in_its_own_words(store: StudyStore) -> None:
-    def run(cell: Cell) -> list[EpisodeRecord]:
+    def unprepared(cell: Cell) -> RunEpisode:
         raise UsageError("no drafter fits this target: run `kerv train drafter`")
 
-    outcome = execute(threshold_study(["reach-v3"])[:1], run, store)
+    outcome = execute(threshold_study(["reach-v3"])[:1], unprepared, store)
     assert outcome.failed[0].reason == "no drafter fits this target: run `kerv train drafter`"
 
 
 def test_a_full_disk_ends_the_sweep(store: StudyStore) -> None:
-    def run(cell: Cell) -> list[EpisodeRecord]:
+    def full(cell: Cell) -> RunEpisode:
         raise StorageError("cannot write rollouts/x.rrd: the disk is full")
 
     with pytest.raises(StorageError, match="disk is full"):
-        execute(threshold_study(["reach-v3"]), run, store)
+        execute(threshold_study(["reach-v3"]), full, store)
 
 
 def test_an_interrupt_keeps_what_is_complete(store: StudyStore) -> None:
-    cells = threshold_study(["reach-v3"])
+    cells = threshold_study(["reach-v3", "push-v3"])
 
-    def run(cell: Cell) -> list[EpisodeRecord]:
-        if cell is cells[2]:
+    def interrupted(cell: Cell) -> RunEpisode:
+        if cell is cells[6]:
             raise KeyboardInterrupt
-        return run_cell(cell)
+        return prepare(cell)
 
     with pytest.raises(KeyboardInterrupt):
-        execute(cells, run, store)
-    assert [store.has_cell(cell.id) for cell in cells] == [True, True, False, False]
+        execute(cells, interrupted, store)
+    assert [store.has_cell(cell.id) for cell in cells] == [True] * 4 + [False] * 4
+    assert list(store.claims.iterdir()) == []
 
 
 def test_a_damaged_cell_is_a_failure_not_a_crash(store: StudyStore) -> None:
     cells = threshold_study(["reach-v3"])
-    execute(cells[:1], run_cell, store)
+    execute(cells[:1], prepare, store)
     (store.cells / cells[0].id / "episodes.parquet").unlink()
-    outcome = execute(cells, run_cell, store)
+    outcome = execute(cells, prepare, store)
     assert labels(outcome.done) == labels(cells[1:])
     assert "delete that folder" in outcome.failed[0].reason
 
 
-def test_a_cell_that_another_sweep_completes_meanwhile_is_not_run_again(store: StudyStore) -> None:
+def test_a_cell_that_is_completed_meanwhile_is_not_run_again(store: StudyStore) -> None:
     cells = threshold_study(["reach-v3"])[:2]
     run, calls = count_calls()
 
-    def with_company(cell: Cell) -> list[EpisodeRecord]:
+    def with_company(cell: Cell) -> RunEpisode:
         store.write_cell(cells[1], run_cell(cells[1]), {})
         return run(cell)
 
@@ -133,56 +184,79 @@ def test_a_cell_that_another_sweep_completes_meanwhile_is_not_run_again(store: S
     assert any(isinstance(event, CellReused) for event in events)
 
 
+def test_two_sweeps_share_the_work(store: StudyStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Started together, they run every cell once, and both end with all of them."""
+    monkeypatch.setattr("kerv_cli.studies.execute._POLL_SECONDS", 0.02)
+    cells = threshold_study(["reach-v3", "push-v3", "door-open-v3"])
+    ran: list[tuple[str, str]] = []
+
+    def noting(cell: Cell) -> RunEpisode:
+        ran.append((cell.label, cell.task))
+        time.sleep(0.02)
+        return prepare(cell)
+
+    with ThreadPoolExecutor(2) as pool:
+        outcomes = [future.result() for future in [pool.submit(execute, cells, noting, store) for _ in range(2)]]
+    assert sorted(ran) == sorted((cell.label, cell.task) for cell in cells)
+    assert all(len(outcome.done) + len(outcome.reused) == len(cells) for outcome in outcomes)
+    assert all(outcome.failed == [] for outcome in outcomes)
+
+
 def test_over_processes_only_the_guilty_cells_fail(store: StudyStore) -> None:
-    """One cell kills its process, one raises what cannot be pickled; the workers serve more than one cell each."""
-    cells = threshold_study(["reach-v3"], radii=(1, 3, 5, 9, 15, 20))
+    """One cell kills its process, one raises what cannot be pickled; the rest of their blocks still runs in turns."""
+    cells = threshold_study(["reach-v3", "push-v3"], radii=(1, 3, 5, 9))
     for cell in cells:
         cell.settings["runtime"]["threads"] = 3
-    outcome = execute(cells, misbehave, store, workers=2)
+    outcome = execute(cells, misbehave, store, RuntimeSettings(workers=2))
     reasons = {failure.cell.label: failure.reason for failure in outcome.failed}
-    assert set(reasons) == {"spec_vla r=1", "spec_vla r=5"}
+    assert sorted(labels([failure.cell for failure in outcome.failed])) == 2 * ["spec_vla r=1"] + 2 * ["spec_vla r=5"]
     assert reasons["spec_vla r=1"] == "its worker process was killed by SIGKILL"
     assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
-    assert len(outcome.done) == 6
+    assert len(outcome.done) == 8
     stored = [store.read_cell(cell.id) for cell in outcome.done]
-    pids = {cell.status["pid"] for cell in stored}
-    assert os.getpid() not in pids
-    assert 2 <= len(pids) <= 3
+    assert os.getpid() not in {cell.status["pid"] for cell in stored}
     assert {cell.status["workers"] for cell in stored} == {2}
     assert len({cell.status["run"] for cell in stored}) == 1
+    assert len({block for cell in stored for block in cell.episodes["block"]}) == 2  # one attempt per task
     assert {seconds for cell in stored for seconds in cell.episodes["wall_seconds"]} == {3.0}  # OMP_NUM_THREADS
-    again = execute(cells, run_cell, store)
-    assert sorted(labels(again.done)) == ["spec_vla r=1", "spec_vla r=5"]
+    assert list(store.claims.iterdir()) == []
+    again = execute(cells, prepare, store)
+    assert sorted(labels(again.done)) == sorted(labels([failure.cell for failure in outcome.failed]))
 
 
 KILLED_PARENT = """
 import sys
-from studies_synthetic import slow_cell, threshold_study
+from studies_synthetic import slow_elsewhere, threshold_study
+from kerv_cli.settings import RuntimeSettings
 from kerv_cli.studies.execute import execute
 from kerv_cli.studies.store import StudyStore
 
-execute(threshold_study(["reach-v3"]), slow_cell, StudyStore(sys.argv[1], "threshold"), workers=2)
+cells = threshold_study(["reach-v3", "push-v3"])
+execute(cells, slow_elsewhere, StudyStore(sys.argv[1], "threshold"), RuntimeSettings(workers=2))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_workers_of_a_killed_sweep_end_and_complete_cells_stay(store: StudyStore, tmp_path: Path) -> None:
-    assert slow_cell  # what the script runs: the first cell quickly, the others for a minute
+    assert slow_elsewhere  # what the script runs: the first task quickly, the other for minutes
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, "-c", KILLED_PARENT, str(tmp_path)], env=environment)
-    first = threshold_study(["reach-v3"])[0]
+    cells = threshold_study(["reach-v3", "push-v3"])
     deadline = time.monotonic() + 30
-    while not (store.cells / first.id).exists() and time.monotonic() < deadline:
+    while not all(store.has_cell(cell.id) for cell in cells[:4]) and time.monotonic() < deadline:
         time.sleep(0.05)
-    worker = store.read_cell(first.id).status["pid"]
+    while not is_claimed(store.claims, cells[4]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    worker = json.loads((store.claims / f"{cells[4].id}.json").read_text())["pid"]
     assert Path(f"/proc/{worker}").exists()
     process.send_signal(signal.SIGKILL)
     process.wait()
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not Path(f"/proc/{worker}").exists()
-    assert store.has_cell(first.id)
-    assert [path.name for path in store.cells.iterdir()] == [first.id]
+    assert not is_claimed(store.claims, cells[4])
+    assert [store.has_cell(cell.id) for cell in cells] == [True] * 4 + [False] * 4
+    assert len(execute(cells, prepare, store).done) == 4
 
 
 def test_estimates_say_what_they_rest_on(store: StudyStore) -> None:
@@ -190,7 +264,7 @@ def test_estimates_say_what_they_rest_on(store: StudyStore) -> None:
     guess = estimate(cells, store, 1, 10.0)
     assert (guess.seconds, guess.to_run, guess.reused, guess.measured) == (8 * 4 * 10.0, 8, 0, False)
     assert "guess" in guess.source
-    execute(cells[:2], run_cell, store)
+    execute(cells[:2], prepare, store)
     wall = {c.label: store.read_cell(c.id).episodes["wall_seconds"].mean() for c in cells[:2]}
     found = estimate(cells, store, 2, 10.0)
     mean = (wall["ar"] + wall["naive_sd"]) / 2
@@ -200,13 +274,13 @@ def test_estimates_say_what_they_rest_on(store: StudyStore) -> None:
 
 def test_progress_without_a_terminal_is_plain_lines(store: StudyStore) -> None:
     cells = threshold_study(["reach-v3"])
-    execute(cells[:1], run_cell, store)
+    execute(cells[:1], prepare, store)
     written = io.StringIO()
 
-    def run(cell: Cell) -> list[EpisodeRecord]:
+    def run(cell: Cell) -> RunEpisode:
         if cell.label == "naive_sd":
             raise ValueError("[bold] is not markup")
-        return run_cell(cell)
+        return prepare(cell)
 
     with ProgressDisplay(Console(file=written, width=60)) as display:
         execute(cells, run, store, on_event=display)
@@ -226,5 +300,5 @@ def test_progress_on_a_terminal_is_a_bar_that_goes_away(store: StudyStore) -> No
 
 
 def test_no_workers_is_refused(store: StudyStore) -> None:
-    with pytest.raises(ValueError, match="at least 1"):
-        execute([], run_cell, store, workers=0)
+    with pytest.raises(UsageError, match=r"runtime\.workers=0: at least 1"):
+        execute([], prepare, store, RuntimeSettings(workers=0))

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 from studies_synthetic import IDENTITY, settings_of, threshold_settings, threshold_study
 
+import kerv_cli
+from kerv_cli.errors import UsageError
 from kerv_cli.settings import RolloutSettings
-from kerv_cli.studies.plan import cell_id, parse_seeds, plan, seeds_text, unique_cells
+from kerv_cli.studies.code import code_hash
+from kerv_cli.studies.plan import blocks_of, cell_id, parse_seeds, plan, seeds_text, unique_cells
 from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
 
 
@@ -58,6 +63,8 @@ def test_what_determines_the_result_changes_the_id(path: str, value: Any) -> Non
     ("path", "value"),
     [
         ("runtime.workers", 2),
+        ("runtime.executor", "slurm"),
+        ("runtime.executor_options", {"partition": "p"}),
         ("results", "elsewhere"),
         ("record", -1),
         ("record_size", 480),
@@ -70,12 +77,12 @@ def test_what_does_not_determine_the_result_leaves_the_id(path: str, value: Any)
     assert only_id(changed(path, value)) == only_id(settings_of("spec_vla", 9))
 
 
-def test_task_weights_and_version_change_the_id(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_task_weights_and_code_change_the_id(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = settings_of("ar")
     before = only_id(settings)
     assert only_id(settings, task="push-v3") != before
     assert only_id(settings, identity={**IDENTITY, "drafter": "c" * 64}) != before
-    monkeypatch.setattr("kerv_cli.studies.plan.kerv_version", lambda: "9.9.9")
+    monkeypatch.setattr("kerv_cli.studies.plan.code_hash", lambda: "f" * 64)
     assert only_id(settings) != before
 
 
@@ -99,6 +106,42 @@ def test_tasks_in_turn_and_the_baseline_first() -> None:
     ]
     assert cells[0].seeds == (100_000, 100_001, 100_002, 100_003)
     assert cells[3].settings["task"] == ["push-v3"]
+
+
+def test_seeds_come_in_blocks_and_repeats_are_cells_of_their_own() -> None:
+    settings = {"ar": settings_of("ar", episodes=7), "b": settings_of("spec_vla", 9, episodes=7)}
+    cells = plan(settings, ["reach-v3", "push-v3"], IDENTITY, block=3, repeats=2)
+    assert len({cell.id for cell in cells}) == len(cells) == 2 * 2 * 2 * 3
+    blocks = blocks_of(cells)
+    assert [(b.task, len(b.seeds), b.repeat) for b in blocks[:3]] == [("reach-v3", n, 0) for n in (3, 3, 1)]
+    assert [b.seeds[0] for b in blocks[:3]] == [100_000, 100_003, 100_006]
+    assert [b.task for b in blocks[::3]] == ["reach-v3", "push-v3"] * 2
+    assert all([cell.label for cell in block.cells] == ["ar", "b"] for block in blocks)
+    assert blocks[0].name == "reach-v3 100000-100002"
+    assert blocks[-1].name == "push-v3 100006 repeat 1"
+    with pytest.raises(UsageError, match=r"study\.block=0"):
+        plan(settings, ["reach-v3"], IDENTITY, block=0)
+
+
+def test_what_differs_in_threads_cannot_take_turns_in_one_process() -> None:
+    cells = plan({"a": settings_of("ar"), "b": changed("runtime.threads", 2)}, ["reach-v3"], IDENTITY)
+    assert [len(block.cells) for block in blocks_of(cells)] == [1, 1]
+
+
+def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(Path(kerv_cli.__file__).parent, tmp_path / "kerv_cli")
+    monkeypatch.setattr(kerv_cli, "__file__", str(tmp_path / "kerv_cli" / "__init__.py"))
+
+    def hash_after(file: str) -> str:
+        path = tmp_path / "kerv_cli" / file
+        path.write_text(path.read_text() + "\n")
+        return code_hash.__wrapped__()
+
+    before = code_hash.__wrapped__()
+    assert hash_after("reporting/tables.py") == hash_after("commands/sweep.py") == before
+    assert (
+        len({before, hash_after("decoding/decoder.py"), hash_after("settings.py"), hash_after("rollouts/run.py")}) == 4
+    )
 
 
 def test_settings_may_have_weights_of_their_own() -> None:

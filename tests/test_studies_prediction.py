@@ -145,7 +145,7 @@ def test_whose_methods_predict() -> None:
 def test_the_page_shows_what_its_methods_use(tmp_path: Path) -> None:
     calibrate(tmp_path)
     write_study(tmp_path, "used")
-    written = names(tmp_path, report(tmp_path, "used"))
+    written = names(tmp_path, report(tmp_path, "used").files)
     assert {"tables/prediction_made-here.csv", "plots/prediction_made-here.png"} <= set(written)
     assert {"tables/boundary_radius.csv", "plots/boundary_radius.png"} <= set(written)
     assert len(written) == len(set(written))
@@ -161,10 +161,11 @@ def test_the_page_shows_what_its_methods_use(tmp_path: Path) -> None:
 
 def test_without_a_study_every_calibration_is_reported(tmp_path: Path) -> None:
     calibrate(tmp_path)
-    assert names(tmp_path, report(tmp_path)) == [
+    assert names(tmp_path, report(tmp_path).files) == [
         f"{folder}/{name}.{kind}"
         for name in ("prediction_made-here", "boundary_radius")
         for folder, kind in (("tables", "csv"), ("plots", "png"), ("plots", "svg"))
+        if (name, kind) != ("boundary_radius", "svg")  # too large
     ]
 
 

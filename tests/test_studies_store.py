@@ -12,13 +12,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from studies_synthetic import episode, run_cell, threshold_settings, threshold_study
 
 from kerv_cli.decoding.record import PHASES
 from kerv_cli.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.studies import rows
+from kerv_cli.studies import claims, rows
 from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.store import StudyStore, list_studies
 
@@ -52,20 +52,21 @@ def test_records_come_back_as_they_were(store: StudyStore, cell: Cell) -> None:
     records = run_cell(cell)
     first = dataclasses.replace(records[0].decodes[0], deviation=0.125, similarity=0.5, compensated=3, skipped=True)
     records[0] = dataclasses.replace(records[0], decodes=(first, *records[0].decodes[1:]))
-    assert store.write_cell(cell, records, STATUS, "2026-01-01T00:00:00+00:00")
-    decodes = store.read_decodes(cell.id)
-    assert list(decodes) == list(cell.seeds)
-    for record in records:
-        assert len(decodes[record.seed]) == len(record.decodes)
-        for read, written in zip(decodes[record.seed], record.decodes, strict=True):
-            a, b = dataclasses.asdict(read), dataclasses.asdict(written)
-            np.testing.assert_array_equal(a.pop("actions"), b.pop("actions"))
-            assert a == b
-    assert decodes[cell.seeds[0]][0].verifications == first.verifications
+    assert store.write_cell(cell, records, STATUS)
+    stored = pq.read_table(store.cells / cell.id / "decodes.parquet").to_pylist()
+    assert stored == [row for record in records for row in rows.decode_rows(record)]
+    for row, decode in zip(stored, (d for record in records for d in record.decodes), strict=True):
+        assert tuple(row["tokens"]) == decode.tokens
+        assert row["actions"] == decode.actions.tolist()
+        assert [r["accepted"] for r in row["rounds"]] == [r.accepted for r in decode.rounds]
+        assert row["seconds"] == decode.seconds
+    assert (stored[0]["deviation"], stored[0]["similarity"], stored[0]["skipped"]) == (0.125, 0.5, True)
+    seconds = store.read_cell(cell.id).episodes["decode_seconds"]
+    assert [list(s) for s in seconds] == [[d.seconds for d in record.decodes] for record in records]
 
 
 def test_a_cell_tells_what_it_is(store: StudyStore, cell: Cell) -> None:
-    store.write_cell(cell, run_cell(cell), STATUS, "2026-01-01T00:00:00+00:00")
+    store.write_cell(cell, run_cell(cell), STATUS)
     stored = store.read_cell(cell.id)
     assert stored.config["settings"] == cell.settings
     assert stored.config["identity"] == cell.identity
@@ -82,7 +83,7 @@ def test_a_cell_tells_what_it_is(store: StudyStore, cell: Cell) -> None:
 
 def test_episode_rows_sum_their_decodes(cell: Cell) -> None:
     record = episode(cell, 100_000)
-    row = rows.episode_row(record, 1, "")
+    row = rows.episode_row(record, rows.Circumstances())
     assert sum(row[f"seconds.{phase}"] for phase in PHASES) == pytest.approx(row["seconds"])
     assert row["seconds.verify"] == pytest.approx(sum(d.phases["verify"] for d in record.decodes))
     assert row["committed"] + row["decodes"] == row["tokens"]  # the prefill gives one token of each chunk
@@ -93,7 +94,7 @@ def test_an_unknown_phase_is_refused(cell: Cell) -> None:
     record = episode(cell, 100_000)
     odd = dataclasses.replace(record.decodes[0], phases={"thinking": 1.0})
     with pytest.raises(ValueError, match="thinking"):
-        rows.episode_row(dataclasses.replace(record, decodes=(odd,)), 1, "")
+        rows.episode_row(dataclasses.replace(record, decodes=(odd,)), rows.Circumstances())
 
 
 def test_records_of_other_seeds_are_refused(store: StudyStore, cell: Cell) -> None:
@@ -144,6 +145,59 @@ def test_a_writer_killed_at_any_point_leaves_no_half_cell(store: StudyStore, cel
     assert sorted(store.clean_stale()) == sorted(left)
     assert store.write_cell(cell, run_cell(cell), STATUS)
     assert store.has_cell(cell.id)
+
+
+def test_a_lock_that_is_a_link_is_refused_and_a_file_behind_it_stays(store: StudyStore, tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("kept")
+    store.root.mkdir(parents=True)
+    lock = store.root / ".plan.yaml.lock"
+    lock.symlink_to(precious)
+    with pytest.raises(StorageError, match=r"plan\.yaml\.lock is a link"):
+        store.write_plan(threshold_settings(), threshold_study(["reach-v3"]))
+    assert precious.read_text() == "kept"
+    lock.unlink()
+    lock.write_text("not truncated")
+    store.write_plan(threshold_settings(), threshold_study(["reach-v3"]))
+    assert lock.read_text() == "not truncated"
+
+
+def test_claims_exclude_others_until_their_process_is_gone(store: StudyStore) -> None:
+    cells, folder = threshold_study(["reach-v3"]), store.claims
+    assert claims.claim(folder, cells[:2], "run", "block1")
+    assert not claims.claim(folder, cells[1:], "other", "block2")  # one of them is taken: none is
+    assert not claims.is_claimed(folder, cells[2])
+    claims.note_running(folder, cells[1], "block1")
+    assert claims.running_cell(folder, cells, "block1") is cells[1]
+    assert claims.running_cell(folder, cells, "block2") is None
+    claims.release(folder, cells, "block2")
+    assert claims.is_claimed(folder, cells[0])
+    claims.release(folder, cells, "block1")
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(("host", "pid", "hours", "held"), [
+    ("here", "dead", 0, False), ("here", "alive", 0, True), ("here", "alive", 7, False),
+    ("elsewhere", "dead", 0, True), ("elsewhere", "dead", 7, False),
+])  # fmt: skip
+def test_claims_expire(store: StudyStore, cell: Cell, host: str, pid: str, hours: float, held: bool) -> None:
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert claims.claim(store.claims, [cell], "run", "block")
+    path = store.claims / f"{cell.id}.json"
+    value = json.loads(path.read_text())
+    value |= {"host": value["host"] if host == "here" else host, "pid": child if pid == "dead" else os.getpid()}
+    path.write_text(json.dumps(value))
+    os.utime(path, (0, time.time() - 3600 * hours))
+    assert claims.is_claimed(store.claims, cell) is held
+    assert claims.claim(store.claims, [cell], "other", "block2") is not held
+    if hours and host == "elsewhere":  # a block whose episodes still begin is alive, however old its claim
+        path.write_text(json.dumps({**value, "block": "block3"}))
+        os.utime(path, (0, time.time() - 3600 * hours))
+        claims.note_running(store.claims, cell, "block3")
+        assert claims.is_claimed(store.claims, cell)
 
 
 def test_folders_of_living_processes_and_young_ones_of_other_machines_stay(store: StudyStore, cell: Cell) -> None:
@@ -206,7 +260,7 @@ def test_a_damaged_cell_is_named_with_its_remedy(store: StudyStore, cell: Cell, 
         path.write_bytes(content[: len(content) // 2])
     else:
         path.write_bytes(content.replace(b"s", b"z", 40))
-    for look in (store.has_cell, store.read_cell, store.read_decodes):
+    for look in (store.has_cell, store.read_cell):
         with pytest.raises(CheckpointError) as caught:
             look(cell.id)
         message = str(caught.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,21 +12,42 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.config import compose
-from kerv_cli.decoding.thresholds import Threshold, build_threshold
+from kerv_cli.decoding.build import Context
+from kerv_cli.decoding.thresholds import Threshold
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.settings import RolloutSettings, ThresholdSettings
+from kerv_cli.registry import find
+from kerv_cli.settings import RolloutSettings
 
 levels = st.floats(0, 50)
+CLOSED_LOOP = ("kinematic", "change")
+TASKS = {"reach-v3": 0.7}
+
+
+def artifact(kind: str) -> Any:
+    """A calibration, and nothing else."""
+    assert kind == "calibration"
+    return SimpleNamespace(k_s=TASKS.__getitem__)
+
+
+def built(chosen: Any, task: str = "reach-v3") -> Threshold:
+    """As a method's part: its numbers are checked, then it is built."""
+    part = find("threshold", chosen.kind)
+    assert part.check is not None
+    part.check(chosen)
+    found: Threshold = part.built(chosen, Context(SimpleNamespace(actions=SPEC.actions), artifact, task))  # type: ignore[arg-type]
+    return found
 
 
 def threshold(kind: str, **values: Any) -> Threshold:
-    return build_threshold(ThresholdSettings(kind, **{"k_s": 0.4, **values}))
+    given_level = {"k_s": 0.4} if kind in CLOSED_LOOP else {}
+    return built(find("threshold", kind).settings(kind=kind, **{**given_level, **values}))
 
 
-def radius_after(built: Threshold, *variability: float | None) -> int:
+def radius_after(chosen: Threshold, *variability: float | None) -> int:
     for value in variability:
-        built.update(value)
-    return built.radius()
+        chosen.update(value)
+    return chosen.radius()
 
 
 def rounded(r: float) -> int:
@@ -41,14 +63,14 @@ def test_kinematic_is_the_level_form(k: float, k_s: float, phi: float) -> None:
 
 
 def test_kinematic_at_its_landmarks() -> None:
-    built = threshold("kinematic")
-    assert built.radius() == rounded(5 + 10 / math.e) == 9  # an episode begins at the reference level
-    assert radius_after(built, 0.0) == 15
-    assert radius_after(built, 0.4) == 9
-    assert radius_after(built, 1e300) == 5
-    assert radius_after(built, None) == 5  # nothing was compared: r stays
-    built.reset()
-    assert built.radius() == 9
+    chosen = threshold("kinematic")
+    assert chosen.radius() == rounded(5 + 10 / math.e) == 9  # an episode begins at the reference level
+    assert radius_after(chosen, 0.0) == 15
+    assert radius_after(chosen, 0.4) == 9
+    assert radius_after(chosen, 1e300) == 5
+    assert radius_after(chosen, None) == 5  # nothing was compared: r stays
+    chosen.reset()
+    assert chosen.radius() == 9
 
 
 @settings(deadline=None)  # the machine is shared
@@ -60,25 +82,25 @@ def test_more_variability_never_widens(k: float, more: float, start: float) -> N
 
 
 def test_change_is_its_closed_form() -> None:
-    built = threshold("change")
+    chosen = threshold("change")
     r, last = 5 + 10 * math.exp(-1), 0.4
-    assert built.radius() == rounded(r)
+    assert chosen.radius() == rounded(r)
     for k in (0.5, 0.45, None, 0.2, 0.1, 0.9, 0.0):
         if k is not None:
             move = 10 * (1 - math.exp(-((abs(k - last) / 0.4) ** 2)))
             r = min(15.0, max(5.0, r - move if k > last else r + move))
             last = k
-        assert radius_after(built, k) == rounded(r)
-    built.reset()
-    assert built.radius() == 9
+        assert radius_after(chosen, k) == rounded(r)
+    chosen.reset()
+    assert chosen.radius() == 9
 
 
 @settings(deadline=None)  # the machine is shared
 @given(st.lists(levels, max_size=20), levels)
 def test_change_moves_against_the_change_and_stays_in_range(history: list[float], k: float) -> None:
-    built = threshold("change")
-    before, last = radius_after(built, *history), history[-1] if history else 0.4
-    after = radius_after(built, k)
+    chosen = threshold("change")
+    before, last = radius_after(chosen, *history), history[-1] if history else 0.4
+    after = radius_after(chosen, k)
     assert 5 <= after <= 15
     if k > last:
         assert after <= before
@@ -89,14 +111,14 @@ def test_change_moves_against_the_change_and_stays_in_range(history: list[float]
 
 
 def test_schedule_is_the_public_codes_and_open_loop() -> None:
-    settings = compose("rollout", ["threshold=schedule", "threshold.tau=8"], RolloutSettings).threshold
-    built, other = build_threshold(settings), build_threshold(settings)
+    asked = compose("rollout", ["threshold=schedule", "threshold.tau=8"], RolloutSettings).threshold
+    chosen, other = built(asked), built(asked)
     for t in range(40):
-        assert built.radius() == other.radius() == rounded(3 + 12 * math.exp(-((t / 8) ** 3)))
-        built.update(0.7)
+        assert chosen.radius() == other.radius() == rounded(3 + 12 * math.exp(-((t / 8) ** 3)))
+        chosen.update(0.7)
         other.update(None)
-    built.reset()
-    assert built.radius() == 15
+    chosen.reset()
+    assert chosen.radius() == 15
 
 
 def test_fixed_ignores_what_happens() -> None:
@@ -105,22 +127,36 @@ def test_fixed_ignores_what_happens() -> None:
 
 @pytest.mark.parametrize("kind", ["fixed", "kinematic", "change", "schedule"])
 def test_the_config_is_the_paper(kind: str) -> None:
-    settings = compose("rollout", [f"threshold={kind}"], RolloutSettings).threshold
-    assert settings.kind == kind
-    if kind in ("kinematic", "change"):
-        assert (settings.r_min, settings.r_max, settings.phi, settings.k_s) == (5, 15, 2.0, None)
-        build_threshold(replace(settings, k_s=0.3))
+    asked = compose("rollout", [f"threshold={kind}"], RolloutSettings).threshold
+    assert asked.kind == kind
+    if kind in CLOSED_LOOP:
+        assert (asked.r_min, asked.r_max, asked.phi, asked.k_s) == (5, 15, 2.0, None)
+        built(replace(asked, k_s=0.3))
+    elif kind == "schedule":
+        assert (asked.r_min, asked.r_max, asked.phi) == (3, 15, 3.0)
+        built(asked)
     else:
-        build_threshold(settings)
+        assert asked.r == 9
+        built(asked)
+
+
+@pytest.mark.parametrize("kind", CLOSED_LOOP)
+def test_the_reference_level_is_the_tasks_where_none_is_given(kind: str) -> None:
+    asked = find("threshold", kind).settings(kind=kind)
+    assert find("threshold", kind).needs(asked) == ("calibration",)
+    assert find("threshold", kind).needs(replace(asked, k_s=0.4)) == ()
+    for k in (0.0, 0.3, 2.0):
+        assert radius_after(built(asked), k) == radius_after(threshold(kind, k_s=0.7), k)
+    assert radius_after(built(asked), 0.5) != radius_after(threshold(kind, k_s=0.3), 0.5)
+    with pytest.raises(KeyError, match="push-v3"):
+        built(asked, "push-v3")
 
 
 @pytest.mark.parametrize(
     ("kind", "values", "says"),
     [
         ("fixed", {"r": -1}, r"threshold\.r=-1"),
-        ("fixed", {"r": 255}, r"threshold\.r=255"),
-        ("kinematic", {"k_s": None}, "run 'kerv calibrate'"),
-        ("change", {"k_s": None}, "run 'kerv calibrate'"),
+        ("fixed", {"r": 255}, r"threshold\.r=255: bins from 0 to 254"),
         ("kinematic", {"k_s": 0.0}, r"threshold\.k_s=0\.0"),
         ("kinematic", {"k_s": math.nan}, r"threshold\.k_s=nan"),
         ("kinematic", {"k_s": math.inf}, r"threshold\.k_s=inf"),

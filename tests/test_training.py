@@ -180,7 +180,6 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
 
 def test_batched_greedy_decoding_is_the_decoders() -> None:
     from kerv_cli.decoding.decoder import Decoder
-    from kerv_cli.settings import MethodSettings
 
     torch.manual_seed(0)
     settings = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
@@ -188,7 +187,7 @@ def test_batched_greedy_decoding_is_the_decoders() -> None:
     prompts = torch.randn(3, target.max_prompt, 32)
     tokens, hidden = greedy(target, prompts)
     assert hidden.shape == (3, target.max_prompt + target.chunk * 4 - 1, 32)
-    decoder = Decoder(target, MethodSettings())
+    decoder = Decoder(target)
     for prompt, expected in zip(prompts.split(1), tokens, strict=True):
         assert decoder.decode_prompt(prompt).tokens == expected.tolist()
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.decoding.acceptance import accept_by_distance
-from kerv_cli.drafting.tree import ROOT, TokenTree, merge
+from kerv_cli.drafting.tree import ROOT, TokenTree, merge, visible_in_prefill, visible_in_verification
 from kerv_cli.targets.compact.trunk import Cache, Trunk, attention_mask
 
 
@@ -39,6 +39,21 @@ def test_ancestors_are_the_transitive_closure_of_parents(tree: TokenTree) -> Non
     assert tree.depths == tuple(int(row.sum()) - 1 for row in tree.ancestors())
 
 
+@given(trees(), st.integers(0, 6))
+def test_a_node_sees_what_stands_before_its_ancestors_and_itself(tree: TokenTree, prompt: int) -> None:
+    seen, n = visible_in_prefill(tree, prompt), len(tree)
+    assert (seen.dtype, seen.shape) == (np.dtype(bool), (prompt + n, prompt + n))
+    assert (seen[:prompt, :prompt] == np.tri(prompt, dtype=bool)).all()
+    assert not seen[:prompt, prompt:].any()
+    assert seen[prompt:, :prompt].all()
+    assert (seen[prompt:, prompt:] == reachable(tree)).all()
+    verified = visible_in_verification(tree)
+    assert verified.shape == (1 + n, 1 + n)
+    assert verified[:, 0].all()
+    assert not verified[0, 1:].any()
+    assert (verified[1:, 1:] == reachable(tree)).all()
+
+
 @given(trees(), st.integers(0, 9), st.integers(1, 6), st.booleans())
 def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
     tree: TokenTree, cached: int, before: int, fixed: bool
@@ -47,7 +62,7 @@ def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
     cache = Cache(1, 1, 1, 40, 1, like, fixed)
     cache.length = cached
     n = len(tree)
-    mask = attention_mask(tree.seen(before), before + n, cache, like)
+    mask = attention_mask(visible_in_prefill(tree, before), before + n, cache, like)
     if mask is None:
         assert before + n == 1
         assert not fixed
@@ -137,7 +152,7 @@ def test_tree_forward_equals_forwarding_every_path_alone() -> None:
         cache = trunk.new_cache(1, 16)
         trunk(prefix, torch.arange(5), cache)
         positions = torch.tensor([5, *(6 + d for d in tree.depths)])
-        together = trunk(torch.cat([root, nodes], 1), positions, cache, tree.seen(1))
+        together = trunk(torch.cat([root, nodes], 1), positions, cache, visible_in_verification(tree))
         for node in range(4):
             alone = torch.cat([prefix, root, nodes[:, tree.path_to(node)]], 1)
             expected = trunk(alone, torch.arange(alone.shape[1]))[0, -1]

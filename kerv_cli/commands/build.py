@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, composed, console, edge, print_plan, progress_bar
 
 app = typer.Typer(
     help="Build what is not trained.", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
@@ -20,19 +20,14 @@ def build() -> None:
 @edge
 def datastore(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Store the demonstrations' action chunks under the target's own features, for retrieval."""
-    from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import BuildDatastoreSettings
 
-    settings = compose("build_datastore", overrides or [], BuildDatastoreSettings)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        return
+    settings = composed("build_datastore", overrides, BuildDatastoreSettings, cfg)
     from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
 
     run = DatastoreBuild(settings)
     if plan:
-        typer.echo(run.plan())
-        return
+        print_plan(run.plan())
     with progress_bar("encoding demonstrations", 1000) as advance:
         store = run.build(lambda done, total: advance(1000 * done // total, ""))
     _summary({"entries": len(store.vectors), "tasks": len(store.shards), **leave_one_out(store)}, run.folder)

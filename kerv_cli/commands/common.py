@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def complete_overrides(incomplete: str) -> list[str]:
@@ -44,13 +45,37 @@ ShowConfig = Annotated[bool, typer.Option("--cfg", help="Print the resolved sett
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
 
+def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bool) -> T:
+    """The command's settings. With --cfg they are printed and the command ends.
+
+    Raises:
+        UsageError: as `config.compose`.
+    """
+    from kerv_cli.config import compose, to_yaml
+
+    settings = compose(command, overrides or [], schema)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        raise typer.Exit(0)
+    return settings
+
+
+def print_plan(text: str) -> None:
+    """What would be done, for --plan; the command ends."""
+    typer.echo(text)
+    raise typer.Exit(0)
+
+
 def edge(command: Callable[P, None]) -> Callable[P, None]:
-    """A KervError becomes one line and its exit code; anything else too, and KERV_TRACEBACK=1 shows where it arose."""
+    """Decorates a command: every exception is printed as one line and becomes an exit code (a KervError's own; 1 for
+    others; 130 for Ctrl-C). KERV_TRACEBACK=1 raises it instead."""
 
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
             command(*args, **kwargs)
+        except typer.Exit:
+            raise
         except KervError as error:
             _refuse(str(error), error.exit_code, error)
         except KeyboardInterrupt:

@@ -22,13 +22,9 @@ def report(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     from kerv_cli.places import results_dir
     from kerv_cli.reporting.report import report as write_report
     from kerv_cli.reporting.summary import summary_table
-    from kerv_cli.reporting.tables import load_study, study_table
-    from kerv_cli.studies.store import StudyStore, list_studies
 
-    results = results_dir(settings.results)
-    written = write_report(results, settings.only)
-    names = [settings.only] if settings.only else [s.name for s in list_studies(results) if s.complete]
-    for name in names:
-        console().print(summary_table(study_table(load_study(StudyStore(results, name)))))
-    for path in written:
+    written = write_report(results_dir(settings.results), settings.only)
+    for table in written.tables.values():
+        console().print(summary_table(table))
+    for path in written.files:
         typer.echo(str(path))

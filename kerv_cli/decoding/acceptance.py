@@ -1,32 +1,30 @@
-"""Which drafts are good enough (METHODS §2.1). Pure functions of tokens; the longest accepted path wins, ties go to the
-smaller summed distance, then to the node proposed first."""
+"""Which drafts are good enough (docs/methods.md §2.1). Pure functions of tokens; the longest accepted path wins, ties
+go to the smaller summed distance, then to the node proposed first."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
-from kerv_cli.drafting.groups import Groups, bounds, kinematic_groups
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.errors import UnknownName
-from kerv_cli.settings import AcceptanceSettings
+from kerv_cli.spaces import ActionSpace
 
-Rule = Callable[[TokenTree, Sequence[int], int, Sequence[int]], "Verdict"]
+Bounds = Sequence[tuple[int, int]]
+"""Per DoF: the first DoF of its kinematic group, and one past the last (`ActionSpace.bounds`)."""
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Accepted:
     """The best accepted path (node indices, root to leaf) and the best rejected candidate behind it, or None."""
 
     path: tuple[int, ...]
     rejected: int | None
 
 
-def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Verdict:
-    """Accept a node when abs(token − verdict at its parent) ≤ the limit of its DoF and its parent was accepted.
+def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Accepted:
+    """Accept a node when abs(token − target token at its parent) ≤ the limit of its DoF and its parent was accepted.
 
-    target_tokens: 1 + n target tokens, the first for the position after the last committed token, then after each node.
+    target_tokens: 1 + n, the first for the position after the last committed token, then after each node.
     start: index in the chunk of the nodes of depth 0. limits: r per DoF, in bins; all zero is strict.
     """
     dofs = len(limits)
@@ -43,7 +41,7 @@ def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int
         distances[i] = distance + (distances[parent] if parent != ROOT else 0)
         if lengths[i] > best_length or (lengths[i] == best_length and distances[i] < best_distance):
             best, best_length, best_distance = i, lengths[i], distances[i]
-    return Verdict(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
+    return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
 
 
 def accept_by_group(
@@ -53,21 +51,20 @@ def accept_by_group(
     limits: Sequence[int],
     *,
     group_limit: int,
-    groups: Groups | None = None,
-) -> Verdict:
+    bounds: Bounds,
+) -> Accepted:
     """HeiSD's `sequence` rule: a kinematic group of one control step is accepted or not as a whole.
 
-    A group is accepted when its abs biases (token − verdict at its parent) are each ≤ the limit of their DoF and sum to
-    at most `group_limit`. A rejected group ends the path at its first token. So does an incomplete one: where a path
-    leaves the tree inside a group, that group's tokens are not accepted. `start` may lie inside a group: its remaining
-    tokens are then judged as a group of their own, the committed ones' biases being unknown. In the decode loop nothing
-    is lost by that: accepted paths end with a group, so what is committed of a begun group are target_tokens, with bias 0.
+    A group is accepted when its abs biases (token − target token at its parent) are each ≤ the limit of their DoF and
+    sum to at most `group_limit`. A rejected group ends the path at its first token. So does an incomplete one: where a
+    path leaves the tree inside a group, that group's tokens are not accepted. `start` may lie inside a group: its
+    remaining tokens are then judged as a group of their own. In the decode loop nothing is lost by that: accepted paths
+    end with a group, so what is committed of a begun group are target tokens, with bias 0.
 
-    target_tokens, start, limits: as in `accept_by_distance`. groups: default `kinematic_groups(D)`. `rejected` is the first
-    token of the group that ended the path.
+    target_tokens, start, limits: as in `accept_by_distance`. `rejected` is the first token of the group that ended the
+    path.
     """
     dofs = len(limits)
-    group_of = bounds(groups or kinematic_groups(dofs))
     alive = [False] * len(tree)  # no limit is broken down to this node
     biases = [0] * len(tree)  # summed within the node's group
     distances = [0] * len(tree)  # summed along the path
@@ -76,7 +73,7 @@ def accept_by_group(
         if parent != ROOT and not alive[parent]:
             continue
         dof = (start + depth) % dofs
-        first, end = group_of[dof]
+        first, end = bounds[dof]
         bias = abs(token - target_tokens[parent + 1])
         biases[i] = bias if parent == ROOT or dof == first else bias + biases[parent]
         alive[i] = bias <= limits[dof] and biases[i] <= group_limit
@@ -85,39 +82,47 @@ def accept_by_group(
             continue
         if depth + 1 > best_length or (depth + 1 == best_length and distances[i] < best_distance):
             best, best_length, best_distance = i, depth + 1, distances[i]
-    return Verdict(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
+    return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """The child of `node` that is closest to the verdict there."""
+    """The child of `node` that is closest to the target's token there."""
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
 
-def limits_of(settings: AcceptanceSettings, r: int, dofs: int, gripper: int) -> tuple[int, ...]:
-    """Bins per DoF under this rule: `r`, or the rule's own. The gripper of `sequence` is exact."""
-    if settings.kind == "strict":
-        return (0,) * dofs
-    limits = [settings.token_limit if settings.kind == "sequence" else r] * dofs
-    if settings.strict_gripper or settings.kind == "sequence":
-        limits[gripper] = 0
-    return tuple(limits)
+@dataclass(frozen=True)
+class Acceptance:
+    """An acceptance rule for one action space.
 
+    kind: strict, relaxed, sequence or hybrid. strict_dofs: the space's strict DoFs must match. group_limit,
+    token_limit: of `sequence`, bins.
+    """
 
-def judging(settings: AcceptanceSettings, proposer: str) -> AcceptanceSettings:
-    """The rule for drafts of `proposer`: `hybrid` judges retrieved ones by `sequence` and all others by `relaxed`."""
-    if settings.kind != "hybrid":
-        return settings
-    return replace(settings, kind="sequence" if proposer == "retrieval" else "relaxed")
+    space: ActionSpace
+    kind: str = "strict"
+    strict_dofs: bool = True
+    group_limit: int = 0
+    token_limit: int = 0
 
+    def of_drafts_from(self, proposer: str) -> Acceptance:
+        """The rule for drafts of `proposer`: `hybrid` judges retrieved ones by `sequence`, all others by `relaxed`."""
+        if self.kind != "hybrid":
+            return self
+        return replace(self, kind="sequence" if proposer == "retrieval" else "relaxed")
 
-def acceptance_rule(settings: AcceptanceSettings) -> Rule:
-    rules: dict[str, Rule] = {
-        "strict": accept_by_distance,
-        "relaxed": accept_by_distance,
-        "hybrid": accept_by_distance,
-        "sequence": partial(accept_by_group, group_limit=settings.group_limit),
-    }
-    if settings.kind not in rules:
-        raise UnknownName("acceptance.kind", settings.kind, rules)
-    return rules[settings.kind]
+    def limits(self, r: int) -> tuple[int, ...]:
+        """Bins per DoF that a draft may be off: `r`, or the rule's own."""
+        if self.kind == "strict":
+            return (0,) * self.space.dofs
+        limit = self.token_limit if self.kind == "sequence" else r
+        exact = self.strict_dofs or self.kind == "sequence"
+        return tuple(0 if exact and strict else limit for strict in self.space.is_strict)
+
+    def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
+        """The longest accepted path; arguments as `accept_by_distance`, r in bins."""
+        limits = self.limits(r)
+        if self.kind == "sequence":
+            groups = {"group_limit": self.group_limit, "bounds": self.space.bounds}
+            return accept_by_group(tree, target_tokens, start, limits, **groups)  # type: ignore[arg-type]
+        return accept_by_distance(tree, target_tokens, start, limits)

@@ -14,8 +14,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.settings import BoundarySettings
+from kerv_cli.errors import CheckpointError
 
 Mode = Literal["retrieval", "drafter"]
 
@@ -23,7 +22,6 @@ LEAST = 3  # positions; fewer have no curvature
 STILL = 1e-3  # metres; a hand whose path is shorter stands still (one control step at full speed is 10 mm)
 COINCIDENT = 1e-7  # metres of spread; below it float32 positions are the same point
 STRAIGHT = 1e-6  # spread across the path by the spread along it; below it the points lie on a line
-KINDS = ("always", "always_retrieval", "always_drafter", "fused", "random")
 
 
 def radius_of_curvature(points: np.ndarray) -> float:
@@ -123,25 +121,45 @@ class Boundary(Protocol):
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """path (n, 3): the episode's measured positions up to now, metres, oldest first; the newest `window` count."""
 
+    def numbers(self, task: str, seed: int) -> np.random.Generator:
+        """The episode's own random numbers: the same whatever ran before it and in whichever process."""
+
+
+class Seeded:
+    """A boundary whose random numbers follow from its own seed, the task and the episode's seed."""
+
+    seed = 0
+
+    def numbers(self, task: str, seed: int) -> np.random.Generator:
+        """As `Boundary.numbers`."""
+        return np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
+
 
 @dataclass(frozen=True)
-class Always:
+class Always(Seeded):
+    """One side, always."""
+
     mode: Mode
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        """As `Boundary.choose`."""
         return Choice(self.mode)
 
 
 @dataclass(frozen=True)
-class Random:
-    p: float  # probability of retrieval
+class Random(Seeded):
+    """Retrieval with probability p."""
+
+    p: float
+    seed: int = 0
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        """As `Boundary.choose`."""
         return Choice("retrieval" if rng.random() < self.p else "drafter")
 
 
 @dataclass(frozen=True)
-class Fused:
+class Fused(Seeded):
     """F ≥ F* → retrieval; fewer than three positions → drafter."""
 
     ranges: BoundaryRanges
@@ -150,41 +168,9 @@ class Fused:
     f_star: float
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
+        """As `Boundary.choose`."""
         points = np.asarray(path)[-self.window :]
         if len(points) < LEAST:
             return Choice("drafter")
         metric = self.ranges.fused(radius_of_curvature(points), path_length(points), self.alpha)
         return Choice("retrieval" if metric >= self.f_star else "drafter", metric)
-
-
-def check_boundary(settings: BoundarySettings) -> None:
-    """Raises UnknownName for a kind that does not exist, UsageError for a number out of range."""
-    if settings.kind not in KINDS:
-        raise UnknownName("boundary.kind", settings.kind, KINDS)
-    for name in ("alpha", "p"):
-        if not 0 <= getattr(settings, name) <= 1:
-            raise UsageError(f"boundary.{name}={getattr(settings, name)}: from 0 to 1")
-    if settings.window < LEAST:
-        raise UsageError(f"boundary.window={settings.window}: at least {LEAST} positions")
-
-
-def build_boundary(settings: BoundarySettings, ranges: BoundaryRanges | None = None) -> Boundary | None:
-    """The boundary of these settings; None for `always`, where the method has one proposer and nothing is chosen.
-
-    Raises:
-        UnknownName: no such kind. UsageError: a number out of range. CheckpointError: `fused` without ranges.
-    """
-    check_boundary(settings)
-    if settings.kind == "random":
-        return Random(settings.p)
-    if settings.kind == "fused":
-        if ranges is None:
-            raise CheckpointError("boundary=fused needs the demonstrations' ranges: calibrate the target first")
-        return Fused(ranges, settings.alpha, settings.window, settings.f_star)
-    modes: dict[str, Mode] = {"always_retrieval": "retrieval", "always_drafter": "drafter"}
-    return Always(modes[settings.kind]) if settings.kind in modes else None
-
-
-def episode_generator(settings: BoundarySettings, task: str, seed: int) -> np.random.Generator:
-    """The random boundary's numbers in one episode: the same whatever ran before it and in whichever process."""
-    return np.random.default_rng([settings.seed, zlib.crc32(task.encode()), seed])

@@ -1,4 +1,4 @@
-"""The one decode loop: propose, verify, accept, commit, rectify (METHODS §2). Methods are compositions of its parts."""
+"""The one decode loop: propose, verify, accept, commit, rectify (docs/methods.md §2)."""
 
 from __future__ import annotations
 
@@ -9,34 +9,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.decoding.acceptance import acceptance_rule, judging, limits_of
-from kerv_cli.decoding.boundary import Boundary, episode_generator
-from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Situation, steps_of
+from kerv_cli.decoding.acceptance import Acceptance
+from kerv_cli.decoding.boundary import Boundary
+from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Rejection, Situation, steps_of
 from kerv_cli.decoding.proposers import EMPTY
 from kerv_cli.decoding.record import DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
-from kerv_cli.decoding.thresholds import Threshold, build_threshold
+from kerv_cli.decoding.thresholds import Fixed, Threshold
 from kerv_cli.decoding.verify_skip import VerifySkip
 from kerv_cli.drafting.kinematics import ActionHistory
-from kerv_cli.drafting.tree import TokenTree
+from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import MethodSettings
-from kerv_cli.spaces import GRIPPER, Observation
+from kerv_cli.spaces import Observation
 from kerv_cli.targets.protocol import Target
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What a method is made of besides its rules.
+    """What a method is made of; the defaults are autoregressive decoding.
 
-    opening: drafts before the prefill, which then verifies them (METHODS §5). proposer: drafts behind committed
-    tokens. compensation: ends a chunk after a rejection; without it the target decodes on. boundary: chooses between
-    the sides of a hybrid proposer. skip: executes a retrieved chunk unverified.
+    prefill_draft: drafts before the prefill, which then verifies it (§5). proposer: drafts behind committed tokens.
+    rectifier: ends a chunk after a rejection; without one the target decodes on. boundary: chooses between the sides of
+    a hybrid proposer. skip: executes a draft unverified.
     """
 
-    opening: Proposer | None = None
+    acceptance: Acceptance | None = None  # None: strict
+    threshold: Threshold | None = None  # None: r = 0
+    prefill_draft: Proposer | None = None
     proposer: Proposer | None = None
-    compensation: Compensation | None = None
+    rectifier: Compensation | None = None
     boundary: Boundary | None = None
     skip: VerifySkip | None = None
 
@@ -47,28 +48,32 @@ class Decoder:
     decode() times itself: from the observation handed in to the actions handed back, synchronised at both ends.
     """
 
-    def __init__(self, target: Target, method: MethodSettings, parts: Parts | None = None) -> None:
-        self.target, self.method, self.parts = target, method, parts or Parts()
-        if self.parts.opening is not None and self.parts.opening.needs_states:
-            raise UsageError(f"opening '{self.parts.opening.name}' needs the target's states, which come after it")
-        self.size = steps_of(method.chunk, target.chunk) * target.actions.dofs
-        acceptance_rule(method.acceptance)
-        self.threshold: Threshold = build_threshold(method.threshold)
-        nodes = max(method.proposer.nodes, method.opening.nodes, self.size)
-        self.cache = target.new_cache(1, target.max_prompt + self.size + nodes + 1)
+    def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
+        """chunk: H, control steps decoded at once; 0: as many as the target was trained for."""
+        self.target, self.parts = target, parts or Parts()
+        draft = self.parts.prefill_draft
+        if draft is not None and draft.needs_states:
+            raise UsageError(f"prefill_draft '{draft.name}' reads the target's states, which come after it")
+        self.steps = steps_of(chunk, target.chunk)
+        self.acceptance = self.parts.acceptance or Acceptance(target.actions)
+        self.threshold: Threshold = self.parts.threshold or Fixed(0)
+        size = self.steps * target.actions.dofs
+        nodes = max((p.nodes for p in (draft, self.parts.proposer) if p is not None), default=0)
+        self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
         self.situation = Situation("", ActionHistory(target.actions.dofs))
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the images that the target reads."""
+        """Names of the images that an observation must hold."""
         return self.target.cameras
 
-    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
+    def reset(self, task: str, instruction: str = "", seed: int = 0) -> None:
         """A new episode begins."""
-        random = episode_generator(self.method.boundary, task, seed)
+        boundary = self.parts.boundary
+        random = boundary.numbers(task, seed) if boundary is not None else np.random.default_rng(seed)
         self.situation = Situation(task, ActionHistory(self.target.actions.dofs), random=random)
         self.threshold.reset()
-        for part in (self.parts.compensation, self.parts.skip):
+        for part in (self.parts.rectifier, self.parts.skip):
             if part is not None:
                 part.reset()
 
@@ -84,17 +89,16 @@ class Decoder:
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:
-        """What is known now -> the chunk's actions and the record of its decode."""
+        """The chunk's actions and the record of its decode."""
         clock = Clock(self.target.device)
         prompt = self.target.encode(observation)
         clock.lap("vision")
         chunk = self.decode_prompt(prompt, clock)
-        actions, compensated = self.actions_of(chunk)
-        compared = any(r.drafted and r.mode != "skip" for r in chunk.rounds)
-        variability = chunk.variability if compared else None
+        actions, predicted = self.actions_of(chunk)
+        variability = chunk.difference if chunk.compared else None
         self.threshold.update(variability)
-        if self.parts.compensation is not None:
-            self.parts.compensation.next_decode()
+        if self.parts.rectifier is not None:
+            self.parts.rectifier.next_decode()
         seconds = clock.stop()
         return DecodeRecord(
             tokens=tuple(chunk.tokens),
@@ -105,7 +109,7 @@ class Decoder:
             mode=next((r.mode if r.mode == "skip" else r.proposer for r in chunk.rounds if r.drafted), "ar"),
             seconds=seconds,
             phases=clock.phases,
-            compensated=compensated,
+            compensated=predicted,
             variability=variability,
             skipped=any(r.mode == "skip" for r in chunk.rounds),
             similarity=chunk.similarity,
@@ -114,60 +118,60 @@ class Decoder:
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
         """(steps, D) float32 in environment units, and how many of its numbers were predicted."""
-        tokenizer = self.target.actions
+        space = self.target.actions
         if chunk.closed is None:
-            return tokenizer.decode(np.array(chunk.tokens).reshape(-1, chunk.dofs)).astype(np.float32), 0
+            return space.decode(np.array(chunk.tokens).reshape(-1, space.dofs)).astype(np.float32), 0
         predicted = max(0, chunk.closed.size - len(chunk.tokens))
-        return tokenizer.unnormalise(chunk.closed).astype(np.float32), predicted
+        return space.unnormalise(chunk.closed).astype(np.float32), predicted
 
     @torch.inference_mode()
     def decode_prompt(self, prompt: Tensor, clock: Clock | None = None) -> Chunk:
         """prompt (1, P, E) -> a complete chunk, or one that the rectifier closed."""
-        clock = clock or Clock(prompt.device)
-        chunk = Chunk(prompt, self.size, self.target.actions.dofs, self.cache, self.situation)
-        chunk.limits = limits_of(self.method.acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
-        if self.parts.boundary is not None:
-            chunk.choice = self.parts.boundary.choose(np.array(self.situation.path), self.situation.random)
-        skipped = self.parts.skip is not None and self.parts.skip.take(chunk)
+        clock, parts = clock or Clock(prompt.device), self.parts
+        choice = None
+        if parts.boundary is not None:
+            choice = parts.boundary.choose(np.array(self.situation.path), self.situation.random)
+        limits = self.acceptance.limits(self.threshold.radius())
+        chunk = Chunk(prompt, self.steps, self.target.actions, self.cache, self.situation, limits, choice)
+        skipped = parts.skip is not None and parts.skip.take(chunk)
         clock.lap("propose")
         if skipped:
             return chunk
-        self.open(chunk, clock)
-        if self.parts.proposer is not None and chunk.left > 1:
-            self.parts.proposer.begin(chunk)
+        self.prefill(chunk, clock)
+        if parts.proposer is not None and chunk.left > 1:
+            parts.proposer.begin(chunk)
             clock.lap("propose")
         while chunk.left:
             self.round(chunk, clock)
         return chunk
 
-    def open(self, chunk: Chunk, clock: Clock) -> None:
-        """The first forward: encodes the prompt and, with an opening draft, verifies that too."""
-        tree, prompt, target = EMPTY, chunk.prompt, self.target
-        if self.parts.opening is not None and chunk.size > 1:
+    def prefill(self, chunk: Chunk, clock: Clock) -> None:
+        """The first forward: encodes the prompt and, with an in-prefill draft, verifies that too."""
+        tree, prompt, target, draft = EMPTY, chunk.prompt, self.target, self.parts.prefill_draft
+        if draft is not None and chunk.size > 1:
             # as in a round: the bonus fills the last place
-            tree = self.parts.opening.propose(chunk, chunk.size - 1)
+            tree = draft.propose(chunk, chunk.size - 1)
             clock.lap("propose")
-        chunk.forwards = 1
-        length = prompt.shape[1]
+        length = chunk.prompt_length
+        chunk.cache.length = 0
         if not len(tree):
-            chunk.cache.length = 0
-            chunk.hidden = target.forward(prompt, torch.arange(length, device=prompt.device), chunk.cache)
-            token = int(target.head(chunk.hidden[:, -1]).argmax())
-            chunk.tokens.append(token)
-            chunk.rounds.append(Round("prefill", "none", 0, (), (token,), 0, 1, 0, ()))
+            hidden = target.forward(prompt, torch.arange(length, device=prompt.device), chunk.cache)
+            chunk.encoded(hidden)
+            token = int(target.head(hidden[:, -1]).argmax())
+            chunk.commit(Round("prefill", "none", 0, (), (token,), 0, 1, 0, ()), [token])
             clock.lap("prefill")
             return
         x = torch.cat([prompt, target.embed(torch.tensor([tree.tokens], device=prompt.device))], 1)
         positions = torch.tensor([*range(length), *(length + d for d in tree.depths)], device=prompt.device)
-        chunk.cache.length = 0
-        hidden = target.forward(x, positions, chunk.cache, None if tree.is_chain else tree.seen(length))
+        seen = None if tree.is_chain else visible_in_prefill(tree, length)
+        hidden = target.forward(x, positions, chunk.cache, seen)
         target_tokens = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
         clock.lap("prefill")
-        path = self.accept(chunk, tree, target_tokens, self.parts.opening)
+        path = self.accept(chunk, tree, target_tokens, draft)
         clock.lap("accept")
-        rows = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
-        chunk.cache.compact(length, rows)
-        chunk.hidden = torch.cat([hidden[:, :length], hidden[:, rows]], 1)
+        slots = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
+        chunk.cache.compact(length, slots)
+        chunk.encoded(torch.cat([hidden[:, :length], hidden[:, slots]], 1))
         clock.lap("prefill")
         self.rectify(chunk)
         clock.lap("rectify")
@@ -177,7 +181,7 @@ class Decoder:
         tree, proposer = EMPTY, self.parts.proposer
         if proposer is not None and chunk.left > 1:
             # one token less than is left: the bonus fills the last place whether or not everything is accepted
-            tree = proposer.propose(chunk, min(self.method.proposer.depth, chunk.left - 1))
+            tree = proposer.propose(chunk, chunk.left - 1)
             clock.lap("propose")
         hidden, target_tokens = self.verify(chunk, tree)
         clock.lap("verify")
@@ -186,8 +190,8 @@ class Decoder:
         clock.lap("accept")
         rows = torch.tensor([0, *(i + 1 for i in path)], device=hidden.device)
         if len(tree):
-            at = chunk.prompt.shape[1] + first
-            chunk.cache.compact(at, at + rows)
+            start = chunk.prompt_length + first
+            chunk.cache.compact(start, start + rows)
             clock.lap("accept")
             self.rectify(chunk)
             clock.lap("rectify")
@@ -198,11 +202,11 @@ class Decoder:
     def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:
         """Forward [last committed token, tree] -> hidden (1, 1 + n, E) and the argmax behind each of them."""
         device = self.target.device
-        at = chunk.prompt.shape[1] + len(chunk.tokens) - 1
+        at = chunk.prompt_length + len(chunk.tokens) - 1
         tokens = torch.tensor([[chunk.tokens[-1], *tree.tokens]], device=device)
         positions = torch.tensor([at, *(at + 1 + d for d in tree.depths)], device=device)
-        hidden = self.target.forward(self.target.embed(tokens), positions, chunk.cache, tree.seen(1))
-        chunk.forwards += 1
+        seen = visible_in_verification(tree) if len(tree) else None
+        hidden = self.target.forward(self.target.embed(tokens), positions, chunk.cache, seen)
         return hidden, self.target.head(hidden)[0].argmax(-1).tolist()
 
     def accept(
@@ -211,45 +215,36 @@ class Decoder:
         """Commit the best accepted path and, where a place is left, the bonus; record the round -> the path's nodes."""
         start = len(chunk.tokens)
         if not len(tree) or proposer is None:
-            chunk.tokens.append(target_tokens[0])
-            chunk.rounds.append(Round("decode", "none", start, (), (target_tokens[0],), 0, 1, 0, ()))
+            token = target_tokens[0]
+            chunk.commit(Round("decode", "none", start, (), (token,), 0, 1, 0, ()), [token])
             return ()
-        acceptance = judging(self.method.acceptance, proposer.name)
-        limits = limits_of(acceptance, self.threshold.radius(), chunk.dofs, GRIPPER)
-        verdict = acceptance_rule(acceptance)(tree, target_tokens, start, limits)
-        path = verdict.path
-        behind = [] if verdict.rejected is None else tree.down_from(verdict.rejected)
-        chunk.unverified = [tree.tokens[i] for i in behind[1:]]
-        chunk.guesses = [target_tokens[i + 1] for i in behind]
-        judged = path if verdict.rejected is None else (*path, verdict.rejected)
+        acceptance, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
+        accepted = acceptance.judge(tree, target_tokens, start, r)
+        path, rejected = accepted.path, accepted.rejected
+        behind = [] if rejected is None else tree.down_from(rejected)
+        judged = path if rejected is None else (*path, rejected)
         seen = [target_tokens[tree.parents[i] + 1] for i in judged]
-        drafted = [tree.tokens[i] for i in judged]
         bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
-        chunk.tokens += [tree.tokens[i] for i in path] + bonus
-        values = self.target.actions.values_of
-        chunk.variability += float(np.abs(values(np.array(drafted)) - values(np.array(seen))).sum())
-        chunk.rounds.append(
-            Round(
-                mode="verify",
-                proposer=proposer.name,
-                start=start,
-                drafted=tuple(drafted),
-                target_tokens=tuple(seen) if verdict.rejected is not None else (*seen, *bonus),
-                accepted=len(path),
-                committed=len(path) + len(bonus),
-                tree_size=len(tree),
-                threshold=limits,
-            )
+        played = Round(
+            mode="verify",
+            proposer=proposer.name,
+            start=start,
+            drafted=tuple(tree.tokens[i] for i in judged),
+            target_tokens=tuple(seen) if rejected is not None else (*seen, *bonus),
+            accepted=len(path),
+            committed=len(path) + len(bonus),
+            tree_size=len(tree),
+            threshold=acceptance.limits(r),
         )
+        rejection = Rejection(tuple(tree.tokens[i] for i in behind[1:]), tuple(target_tokens[i + 1] for i in behind))
+        chunk.commit(played, [tree.tokens[i] for i in path] + bonus, rejection)
         return path
 
     def rectify(self, chunk: Chunk) -> None:
-        """After a rejection: let the compensation end the chunk, if there is one and it can."""
-        last, compensation = chunk.rounds[-1], self.parts.compensation
-        if compensation is None or last.accepted == len(last.drafted):
+        """After a rejection: let the rectifier end the chunk, if there is one and it can."""
+        last, rectifier = chunk.rounds[-1], self.parts.rectifier
+        if rectifier is None or last.accepted == len(last.drafted):
             return
-        complete = not chunk.left  # the verdict filled the last place: nothing is missing, if it may be used
-        if complete and self.method.rectifier.use_verdict:
-            return
-        if compensation.close(chunk) and not self.method.rectifier.use_verdict:
-            chunk.rounds[-1] = last.without_bonus()
+        # where the target's token filled the last place nothing is missing, if it may be used
+        if chunk.left or not rectifier.settings.use_target_token:
+            rectifier.close(chunk)

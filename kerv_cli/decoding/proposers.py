@@ -12,15 +12,14 @@ from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
 from kerv_cli.drafting.eagle import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.early import EarlyDrafter
-from kerv_cli.drafting.groups import kinematic_groups
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
-from kerv_cli.settings import ProposerSettings
-from kerv_cli.spaces import VOCABULARY, bins_of, values_of
 from kerv_cli.targets.protocol import ReadableTarget, Target
 
 EMPTY = TokenTree((), (), ())
-SURE = 0.05  # odds from which no spare draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
+SURE = (
+    0.05  # odds from which no fallback draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
+)
 
 
 class Stateless:
@@ -28,6 +27,7 @@ class Stateless:
 
     name = ""
     needs_states = False
+    nodes = 0
 
     def begin(self, chunk: Chunk) -> None:
         pass
@@ -59,12 +59,14 @@ class PredictionProposer(ChainProposer):
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         whole = len(chunk.tokens) // chunk.dofs
-        pending = values_of(np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64)).reshape(whole, chunk.dofs)
+        pending = chunk.space.values_of(np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64)).reshape(
+            whole, chunk.dofs
+        )
         history = chunk.situation.history.values(pending)
-        predicted = self.predictor.predict(history, chunk.size // chunk.dofs - whole)
+        predicted = self.predictor.predict(history, chunk.steps - whole)
         if predicted is None:
             return []
-        tokens: list[int] = bins_of(predicted).flatten().tolist()
+        tokens: list[int] = chunk.space.bins_of(predicted).flatten().tolist()
         return [tokens[len(chunk.tokens) - whole * chunk.dofs :][:depth]]
 
 
@@ -98,20 +100,19 @@ class RetrievalProposer(Stateless):
 
     def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
-        self.groups = kinematic_groups(target.actions.dofs)
         self._found: tuple[Chunk, Neighbours] | None = None
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
         """Looked up once per chunk."""
         if self._found is None or self._found[0] is not chunk:
-            key = self.datastore.key(chunk.prompt, self.target.segments)
+            key = self.datastore.key(chunk.prompt, self.target)
             self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
-            chunk.similarity = float(self._found[1].similarity[0])
+            chunk.looked_up(float(self._found[1].similarity[0]))
         return self._found[1]
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
-        return neighbour_tree(chunks, len(chunk.tokens), self.groups, self.nodes, depth)
+        return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         start = len(chunk.tokens)
@@ -122,18 +123,18 @@ class RetrievalProposer(Stateless):
 class MergedProposer(Stateless):
     """Whole drafts of several sources in one prefix tree, a branch each (METHODS §5).
 
-    spare: sources that draft only where none of the others is sure of its chunk: every node costs time.
+    fallback: sources that draft only where none of the others is sure of its chunk: every node costs time.
     """
 
-    def __init__(self, sources: Sequence[DraftsChunks], nodes: int, spare: Sequence[DraftsChunks] = ()) -> None:
-        every = [*sources, *spare]
+    def __init__(self, sources: Sequence[DraftsChunks], nodes: int, fallback: Sequence[DraftsChunks] = ()) -> None:
+        every = [*sources, *fallback]
         self.name = every[0].name if len(every) == 1 else "merged"
-        self.sources, self.spare, self.nodes = sources, spare, nodes
+        self.sources, self.fallback, self.nodes = sources, fallback, nodes
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
-            sources += self.spare
+            sources += self.fallback
         chains = [chain for source in sources for chain in source.chains(chunk, depth)]
         tree = merge(chains)
         while len(tree) > self.nodes:
@@ -151,6 +152,7 @@ class HybridProposer:
 
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
         self.sides: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
+        self.nodes = max(drafter.nodes, retrieval.nodes)
         self.chosen = drafter
 
     @property
@@ -172,22 +174,24 @@ class HybridProposer:
 class JacobiProposer:
     """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
 
-    With strict acceptance the fixed point is AR's chunk. The first guess is what an opening's verification left behind
-    its first rejection, else the zero action.
+    With strict acceptance the fixed point is AR's chunk. The first guess is what the verification of an in-prefill
+    draft left behind its first rejection, else the zero action. `depth`: tokens guessed at once; 0: all.
     """
 
     name = "jacobi"
     needs_states = False
+    nodes = 0
 
-    def __init__(self) -> None:
+    def __init__(self, depth: int = 0) -> None:
+        self.depth = depth
         self.guess: list[int] = []
 
     def begin(self, chunk: Chunk) -> None:
-        known = chunk.guesses[: chunk.left]
-        self.guess = [*known, *[VOCABULARY // 2] * (chunk.left - len(known))]
+        known = chunk.rejection.target[: chunk.left]
+        self.guess = [*known, *[chunk.space.tokens // 2] * (chunk.left - len(known))]
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        return TokenTree.chain(self.guess[:depth])
+        return TokenTree.chain(self.guess[: min(depth, self.depth or depth)])
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         accepted = len(chunk.tokens) - first - 2
@@ -200,10 +204,11 @@ class DrafterProposer:
     name = "drafter"
     needs_states = True
 
-    def __init__(self, drafter: Drafter, target: Target, settings: ProposerSettings) -> None:
-        self.drafter, self.target, self.settings = drafter, target, settings
-        drafted = settings.top_k * max(1, settings.depth)
-        capacity = target.max_prompt + target.chunk * target.actions.dofs + drafted
+    def __init__(self, drafter: Drafter, target: Target, depth: int, top_k: int, nodes: int) -> None:
+        """depth: tokens; top_k: children expanded per level; nodes: kept after reranking."""
+        self.drafter, self.target = drafter, target
+        self.depth, self.top_k, self.nodes = depth, top_k, nodes
+        capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
         self.state = DraftState(drafter.new_cache(1, capacity), torch.empty(0))
 
     def begin(self, chunk: Chunk) -> None:
@@ -211,12 +216,11 @@ class DrafterProposer:
         observe(self.drafter, self.state, following, chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        s = self.settings
-        return grow_tree(self.drafter, self.target, self.state, min(s.depth, depth), s.top_k, s.nodes)
+        return grow_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         following = self.embed(chunk.tokens[first + 1 :])
-        observe(self.drafter, self.state, following, hidden, chunk.prompt.shape[1] + first)
+        observe(self.drafter, self.state, following, hidden, chunk.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
         """(1, T, E)."""

@@ -8,9 +8,7 @@ import numpy as np
 
 from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.drafting.kinematics import Predictor
-from kerv_cli.errors import UsageError
-from kerv_cli.settings import RectifierSettings
-from kerv_cli.spaces import values_of
+from kerv_cli.parts import CompensateSettings
 
 DRAFT = "draft"
 """The one filling that no predictor of `drafting/kinematics.py` gives."""
@@ -19,19 +17,14 @@ DRAFT = "draft"
 class Compensation:
     """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
 
-    With `use_verdict` (ours) the verdict at the rejected position is kept too: it is there and free. `steps` (PL) lets
-    the prediction fill further control steps. With `predictor: draft` (ours) what the rejected draft had behind the
-    rejected token goes before the prediction: it was drafted with the observation in view, which a filter has not.
+    With `use_target_token` (ours) the target's token at the rejected position is kept too: it is there and free.
+    `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) what the rejected draft
+    had behind the rejected token goes before the prediction: it was drafted with the observation in view.
     After a compensation the filter rests for `rest` decodes.
     """
 
-    def __init__(self, settings: RectifierSettings, predictor: Predictor) -> None:
-        if settings.steps < 1 or settings.rest < 0 or settings.min_verified < 0:
-            raise UsageError("rectifier: steps must be at least 1, rest and min_verified at least 0")
+    def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
         self.settings, self.predictor = settings, predictor
-        self.from_draft = settings.predictor == DRAFT
-        if self.from_draft and not settings.use_verdict:
-            raise UsageError("rectifier.predictor=draft goes on behind the verdict: leave rectifier.use_verdict=true")
         self.resting = 0
 
     def reset(self) -> None:
@@ -43,19 +36,15 @@ class Compensation:
         self.resting = max(0, self.resting - 1)
 
     def close(self, chunk: Chunk) -> bool:
-        """A draft was rejected; end the chunk if a prediction can.
-
-        Sets `chunk.closed`; with `use_verdict` off the bonus token is taken back. False: decode on.
-        """
+        """A draft was rejected; end the chunk if a prediction can. False: decode on."""
         if self.resting:
             return False
-        tokens = chunk.tokens if self.settings.use_verdict else chunk.tokens[:-1]
-        drafted = chunk.unverified if self.from_draft else []
+        tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
+        drafted = chunk.rejection.draft if self.settings.predictor == DRAFT else ()
         values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
-        if values is None or 0 <= self.settings.max_dropped < chunk.size // chunk.dofs - len(values):
+        if values is None or 0 <= self.settings.max_dropped < chunk.steps - len(values):
             return False
-        chunk.tokens = tokens[: values.size]
-        chunk.closed = values
+        chunk.close(values, self.settings.use_target_token)
         # one more than the rest, because the decode that compensated ends too
         self.resting = self.settings.rest + 1
         return True
@@ -65,7 +54,7 @@ def assemble(
     tokens: list[int],
     chunk: Chunk,
     predictor: Predictor,
-    settings: RectifierSettings,
+    settings: CompensateSettings,
     drafted: Sequence[int] = (),
 ) -> np.ndarray | None:
     """Known tokens, then `drafted` ones, then the prediction -> (steps, D) normalised actions; None where the history
@@ -73,11 +62,11 @@ def assemble(
 
     A step of which fewer than `min_verified` DoFs are known is dropped, unless nothing would be left.
     """
-    dofs, horizon = chunk.dofs, chunk.size // chunk.dofs
+    dofs, horizon = chunk.dofs, chunk.steps
     whole, part = divmod(len(tokens), dofs)
     filled = 1 if whole == 0 or (part and part >= settings.min_verified) else 0
     steps = min(horizon, whole + max(filled, settings.steps - 1 + filled))
-    values = values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
+    values = chunk.space.values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
     flat = np.full(steps * dofs, np.nan)
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)

@@ -4,12 +4,7 @@ and rounds it for use."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Protocol
-
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.settings import ThresholdSettings
-from kerv_cli.spaces import VOCABULARY
 
 
 class Threshold(Protocol):
@@ -25,8 +20,6 @@ class Threshold(Protocol):
 
 class Fixed:
     def __init__(self, r: int) -> None:
-        if not 0 <= r < VOCABULARY:
-            raise UsageError(f"threshold.r={r}: bins from 0 to {VOCABULARY - 1}")
         self.r = r
 
     def reset(self) -> None:
@@ -122,45 +115,3 @@ def falling(low: float, high: float, x: float, phi: float) -> float:
 def nearest(r: float) -> int:
     """To the nearest bin, halves up."""
     return math.floor(r + 0.5)
-
-
-def build_threshold(settings: ThresholdSettings) -> Threshold:
-    """The threshold of a method.
-
-    Raises:
-        UnknownName: no such kind.
-        UsageError: a number out of range, or no reference level K_S where the kind needs one.
-    """
-    builders: dict[str, Callable[[ThresholdSettings], Threshold]] = {
-        "fixed": lambda s: Fixed(s.r),
-        "kinematic": lambda s: Kinematic(*_range(s), _reference(s)),
-        "change": lambda s: Change(*_range(s), _reference(s)),
-        "schedule": lambda s: Schedule(*_range(s), _positive("tau", s.tau, 1e9)),
-    }
-    if settings.kind not in builders:
-        raise UnknownName("threshold.kind", settings.kind, builders)
-    return builders[settings.kind](settings)
-
-
-def _range(settings: ThresholdSettings) -> tuple[int, int, float]:
-    low, high = settings.r_min, settings.r_max
-    if not 0 <= low <= high < VOCABULARY:
-        raise UsageError(
-            f"threshold.r_min={low} threshold.r_max={high}: bins from 0 to {VOCABULARY - 1}, r_min not above r_max"
-        )
-    return low, high, _positive("phi", settings.phi, 50)
-
-
-def _reference(settings: ThresholdSettings) -> float:
-    if settings.k_s is None:
-        raise UsageError(
-            f"threshold.kind={settings.kind} needs the reference level K_S of the task: run 'kerv calibrate', or set "
-            "threshold.k_s"
-        )
-    return _positive("k_s", settings.k_s, 1e9)
-
-
-def _positive(name: str, value: float, limit: float) -> float:
-    if not 0 < value <= limit:
-        raise UsageError(f"threshold.{name}={value}: above 0, at most {limit:g}")
-    return value

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.decoding.proposers import RetrievalProposer
-from kerv_cli.decoding.record import Round
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import SkipSettings
+from kerv_cli.parts import SimilaritySkipSettings
 
 
 @dataclass(frozen=True)
@@ -32,9 +31,7 @@ class VerifySkip:
     rises by `up` of the calibrated range after a failure and falls by `down` after a success.
     """
 
-    def __init__(self, settings: SkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:
-        if settings.max_skips < 1 or min(settings.up, settings.down) < 0:
-            raise UsageError("skip: max_skips must be at least 1, up and down at least 0")
+    def __init__(self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:
         self.settings, self.retrieval, self.levels = settings, retrieval, levels
         self.s_min = levels.s_min
         self.in_a_row = 0
@@ -62,10 +59,7 @@ class VerifySkip:
             self.in_a_row = 0
             return False
         self.in_a_row += 1
-        if found.left[0] <= chunk.size // chunk.dofs:
+        if found.left[0] <= chunk.steps:
             self.ended.add(seed)
-        chunk.tokens = found.chunks[0, : chunk.size].tolist()
-        chunk.rounds.append(
-            Round("skip", self.retrieval.name, 0, tuple(chunk.tokens), (), chunk.size, chunk.size, 0, ())
-        )
+        chunk.skip(found.chunks[0].tolist(), self.retrieval.name)
         return True

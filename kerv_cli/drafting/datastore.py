@@ -1,52 +1,93 @@
-"""Retrieval: the demonstrations' action chunks, found by what the target itself sees (METHODS §4.1, §4.2; HeiSD).
+"""Retrieval: the demonstrations' action chunks, found by what the target itself sees (docs/methods.md §4; HeiSD).
 
 The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
-normalised again. The default is the scene segment alone, which holds the vision encoder's object and goal positions
-together with hand and gripper. Measured on MT10, nearest neighbour in another episode, its chunks agree best; pooled
-patch tokens agree worse and lower the agreement of what they are added to. The payload is the expert's next H actions
-as tokens.
+normalised again; optionally projected onto the directions that hold nearly all of the keys. The default is the scene
+segment alone, which holds the vision encoder's object and goal positions together with hand and gripper. Measured on
+MT10, nearest neighbour in another episode, its chunks agree best; pooled patch tokens agree worse and lower the
+agreement of what they are added to. The payload is the expert's next H actions as tokens.
 
-On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json`; rows by task, seed, step.
+On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `projection.npy` where keys are projected, and
+`manifest.json`; rows by task, seed, step.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from heapq import heappop, heappush
-from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.drafting.groups import Groups, segments
+from kerv_cli import registry
+from kerv_cli.artifacts import Artifact, Request, artifact_folder
 from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.files import read_json, sha256_of
-from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings
+from kerv_cli.environments import spec_of
+from kerv_cli.errors import CheckpointError, UnknownName
+from kerv_cli.files import sha256_of
+from kerv_cli.manifests import read_file
+from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.protocol import ReadableTarget
 
-FORMAT = 1
-FILES = ("vectors.npy", "payload.parquet")
-REQUIRED = ("key", "width", "rows", "chunk", "dofs", "actions", "target", "demos", "files", "tasks")
+FORMAT = 2
+VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 CROSS = 0.1  # probability that a path leaves the neighbours that it has followed
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
-BACKENDS = ("exact", "qdrant")
+AGAIN = "build one with 'kerv build datastore'"
 
 
-def prompt_key(prompt: Tensor, known: Mapping[str, slice], segments: Sequence[str]) -> np.ndarray:
-    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E. known: where the target's prompt has its
-    parts.
+@dataclass(frozen=True)
+class Shard:
+    """One task's part: its rows [first, last) and the seeds of its episodes."""
+
+    rows: tuple[int, int]
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """`manifest.json`: what the entries are, whom they were made for, and proof of the seeds.
+
+    key: parts of the prompt that are pooled. width: numbers of a key. chunk: H. actions: the target's action space.
+    target, demos, files: SHA-256 of the target's weights, the demonstrations and the files beside this one.
+    """
+
+    format: Literal[2]
+    kind: Literal["datastore"]
+    key: tuple[str, ...]
+    width: int
+    rows: int
+    chunk: int
+    actions: ActionSpace
+    target: str
+    demos: str
+    files: dict[str, str]
+    tasks: dict[str, Shard]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def content(self) -> str:
+        """SHA-256 of what retrieval finds: it survives a rebuild from the same target and demonstrations."""
+        text = json.dumps([self.key, self.chunk, self.target, sorted(self.files.items())])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
+    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
 
     Raises:
         UnknownName: a segment that this target's prompt does not have.
     """
+    known = target.segments
     for name in segments:
         if name not in known:
             raise UnknownName("part of the prompt", name, known)
@@ -58,18 +99,26 @@ def _unit(vectors: Tensor) -> Tensor:
     return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
+def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
+    """keys (n, d) along the directions projection (d, c) -> (n, c) float32 of length 1."""
+    inside = keys @ projection
+    found: np.ndarray = inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
+    return found.astype(np.float32)
+
+
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
-    """Prove that training and evaluation share no world: seeds per task, all below the first evaluation seed.
+    """Prove that training and evaluation share no world: seeds per task, all of them training seeds.
 
     Raises:
         CheckpointError: one is not.
     """
     for task, used in seeds.items():
-        shared = [seed for seed in used if seed >= EVALUATION_SEED]
+        training = spec_of(task).seeds.training
+        shared = [seed for seed in used if seed not in training]
         if shared:
             raise CheckpointError(
-                f"{where} holds seed {shared[0]} of {task}: seeds from {EVALUATION_SEED} on are for evaluation, "
-                "retrieval would know the worlds it is judged on; build it from training demonstrations"
+                f"{where} holds seed {shared[0]} of {task}: seeds from {training.stop} on are for selection and "
+                "evaluation, retrieval would know the worlds it is judged on; build it from training demonstrations"
             )
 
 
@@ -91,14 +140,14 @@ class Neighbours:
 class Datastore:
     """An opened datastore. shards: task -> its rows."""
 
-    manifest: dict[str, Any]
+    manifest: Manifest
     vectors: np.ndarray  # (rows, d) float32
     tokens: np.ndarray  # (rows, N) uint8
     seeds: np.ndarray  # (rows,) int64, as the next two
     steps: np.ndarray
     left: np.ndarray
     shards: dict[str, slice]
-
+    projection: np.ndarray | None = None  # (pooled numbers, d)
     index: Index | None = None  # who searches; None: ExactIndex
 
     def __post_init__(self) -> None:
@@ -106,13 +155,35 @@ class Datastore:
             object.__setattr__(self, "index", ExactIndex(self.vectors, self.seeds, self.shards))
 
     @classmethod
-    def open(cls, folder: Path, description: TargetDescription) -> Datastore:
-        """With exact search; see `open_datastore`."""
-        return cls(**_read(folder, description))
+    def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
+        """The datastore in `folder`, made for the target described.
 
-    def key(self, prompt: Tensor, segments: Mapping[str, slice]) -> np.ndarray:
-        """prompt (1, P, E) of the target, and where its parts lie -> (d,) float32."""
-        return prompt_key(prompt, segments, self.manifest["key"])[0]
+        search: settings of who searches (registry kind datastore), None for exact search; every one finds the same
+        neighbours.
+
+        Raises:
+            CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
+                statistics or another chunk length, or from evaluation seeds.
+            UsageError: an unknown backend, one whose packages are not installed, a server that does not answer.
+        """
+        manifest = read_manifest(folder)
+        check_target(manifest, description, folder)
+        parts = _read(folder, manifest)
+        index = None
+        if search is not None:
+            part = registry.find("datastore", search.kind, "datastore.kind")
+            index = part.built(parts["vectors"], parts["seeds"], parts["shards"], manifest.content, search)
+        return cls(manifest, **parts, index=index)
+
+    @property
+    def content(self) -> str:
+        """SHA-256 of what is found in it."""
+        return self.manifest.content
+
+    def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
+        """prompt (1, P, E) of the target -> (d,) float32."""
+        keys = prompt_key(prompt, target, self.manifest.key)
+        return (keys if self.projection is None else projected(keys, self.projection))[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
         """Exact search among the entries of `task`: key (d,) -> its k nearest (all, where there are fewer).
@@ -130,59 +201,25 @@ class Datastore:
         return Neighbours(similarity, self.tokens[at].astype(np.int64), self.seeds[at], self.steps[at], self.left[at])
 
 
-def open_datastore(folder: Path, description: TargetDescription, settings: DatastoreSettings) -> Datastore:
-    """A datastore, searched by the backend asked for; every backend finds the same neighbours.
-
-    description: the target's, as `load_target` returns it.
-
-    Raises:
-        CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
-            statistics or another chunk length, or from evaluation seeds.
-        UsageError: an unknown backend, one whose packages are not installed, a server that does not answer.
-    """
-    check_backend(settings)
-    parts = _read(folder, description)
-    if settings.backend == "exact":
-        return Datastore(**parts)
-    from kerv_cli.drafting.qdrant import QdrantIndex
-
-    digest = sha256_of(folder / "manifest.json")
-    index = QdrantIndex(parts["vectors"], parts["seeds"], parts["shards"], digest, settings.url)
-    return Datastore(**parts, index=index)
-
-
-def check_backend(settings: DatastoreSettings) -> None:
-    """Refuse a backend that cannot work here, before anything is loaded.
-
-    Raises:
-        UsageError: an unknown one, one whose packages are not installed, a server for a search in this process.
-    """
-    if settings.backend not in BACKENDS:
-        raise UnknownName("datastore.backend", settings.backend, BACKENDS)
-    if settings.backend == "exact" and settings.url is not None:
-        raise UsageError(f"datastore.url={settings.url}: exact search is in this process, use datastore.backend=qdrant")
-    if settings.backend == "qdrant" and find_spec("qdrant_client" if settings.url else "qdrant_edge") is None:
-        raise UsageError("datastore.backend=qdrant needs the extra: pip install 'kerv[qdrant]'")
-
-
-def _read(folder: Path, description: TargetDescription) -> dict[str, Any]:
-    """What a datastore's files hold, checked against each other and the target."""
-    manifest = read_manifest(folder)
-    check_target(manifest, description, folder)
+def _read(folder: Path, manifest: Manifest) -> dict[str, Any]:
+    """The arrays of a datastore's files, checked against each other."""
     try:
-        vectors = np.load(folder / FILES[0]).astype(np.float32, copy=False)
-        payload = _read_payload(folder / FILES[1])
-        shards = {task: slice(*shard["rows"]) for task, shard in manifest["tasks"].items()}
-        rows, size = manifest["rows"], manifest["chunk"] * manifest["dofs"]
-        fits = vectors.shape == (rows, manifest["width"]) and payload["tokens"].shape == (rows, size)
+        vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
+        payload = _read_payload(folder / PAYLOAD)
+        projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None
+        rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
+        fits = vectors.shape == (rows, manifest.width) and payload["tokens"].shape == (rows, size)
     except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
         raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
-    if not fits:
-        raise CheckpointError(f"the datastore in {folder} is damaged: its files differ in length, build it again")
-    return {"manifest": manifest, "vectors": vectors, "shards": shards, **payload}
+    if not fits or not np.isfinite(vectors).all():
+        raise CheckpointError(
+            f"the datastore in {folder} is damaged: its files do not fit its manifest, build it again"
+        )
+    shards = {task: slice(*shard.rows) for task, shard in manifest.tasks.items()}
+    return {"vectors": vectors, "shards": shards, "projection": projection, **payload}
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> Manifest:
     """The manifest of a datastore whose files are as they were written and whose seeds are training seeds.
 
     Raises:
@@ -190,44 +227,30 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / "manifest.json"
     if not path.is_file():
-        raise CheckpointError(f"no datastore in {folder}: build one with 'kerv build datastore'")
-    manifest = read_json(path)
-    if not isinstance(manifest, dict) or (manifest.get("format"), manifest.get("kind")) != (FORMAT, "datastore"):
-        raise CheckpointError(f"{path} is not a datastore of format {FORMAT}: build it again")
-    missing = [name for name in REQUIRED if name not in manifest]
-    if missing:
-        raise CheckpointError(f"{path} is damaged, it has no {missing[0]}: build the datastore again")
-    try:
-        for name in FILES:
-            if sha256_of(folder / name) != manifest["files"][name]:
-                raise CheckpointError(f"{folder / name} does not match its manifest: build the datastore again")
-        check_seeds({task: shard["seeds"] for task, shard in manifest["tasks"].items()}, folder)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}): build the datastore again") from error
+        raise CheckpointError(f"no datastore in {folder}: {AGAIN}")
+    manifest = read_file(Manifest, path, f"a datastore's manifest of format {FORMAT}: {AGAIN}")
+    for name, digest in manifest.files.items():
+        if sha256_of(folder / name) != digest:
+            raise CheckpointError(f"{folder / name} does not match its manifest: {AGAIN}")
+    check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, folder)
     return manifest
 
 
-def check_target(manifest: Mapping[str, Any], description: TargetDescription, folder: Path) -> None:
+def check_target(manifest: Manifest, description: TargetDescription, folder: Path) -> None:
     """Refuse a datastore whose keys or tokens mean something else to this target.
 
     Raises:
-        CheckpointError: another chunk length, other action statistics, other weights.
+        CheckpointError: another chunk length, action space or action statistics, other weights.
     """
-    again, dofs = "build one with 'kerv build datastore'", description.actions.dofs
-    if (manifest["chunk"], manifest["dofs"]) != (description.chunk, dofs):
+    where = f"the datastore in {folder}"
+    manifest.actions.check_same(description.actions, where, "the target", statistics=True)
+    if manifest.chunk != description.chunk:
         raise CheckpointError(
-            f"the datastore in {folder} holds chunks of {manifest['chunk']} steps of {manifest['dofs']} DoFs, the "
-            f"target decodes {description.chunk} of {dofs}: {again}"
+            f"{where} holds chunks of {manifest.chunk} steps, the target decodes {description.chunk}: {AGAIN}"
         )
-    if manifest["actions"] != {"low": list(description.actions.low), "high": list(description.actions.high)}:
+    if manifest.target != description.sha256:
         raise CheckpointError(
-            f"the datastore in {folder} was made with other action statistics than the target's, the same token is "
-            f"another action there: {again}"
-        )
-    if manifest["target"] != description.sha256:
-        raise CheckpointError(
-            f"the datastore in {folder} was built for target {manifest['target'][:12]}, not for "
-            f"{description.sha256[:12]}: {again}"
+            f"{where} was built for target {manifest.target[:12]}, not for {description.sha256[:12]}: {AGAIN}"
         )
 
 
@@ -240,10 +263,23 @@ def _read_payload(path: Path) -> dict[str, np.ndarray]:
     return {"tokens": flat.reshape(len(table), -1), **columns}
 
 
+def _check(folder: Path, request: Request) -> str:
+    manifest = read_manifest(folder)
+    check_target(manifest, request.description, folder)
+    return manifest.content
+
+
+def _load(folder: Path, request: Request) -> Datastore:
+    return Datastore.open(folder, request.description, request.search)
+
+
+ARTIFACT = Artifact("datastore", artifact_folder("datastore"), _check, _load)
+
+
 def neighbour_tree(
     chunks: np.ndarray,
     start: int,
-    groups: Groups,
+    space: ActionSpace,
     nodes: int = 50,
     depth: int | None = None,
     cross: float = CROSS,
@@ -258,7 +294,7 @@ def neighbour_tree(
     the neighbours that it has followed with probability `cross`; 0 keeps to the neighbours' own chunks.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
-    ways = _Ways(chunks.tolist(), list(segments(start, stop, groups)), cross)
+    ways = _Ways(chunks.tolist(), list(space.segments(start, stop)), cross)
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}

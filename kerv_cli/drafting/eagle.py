@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from kerv_cli.artifacts import Artifact, Request, artifact_folder
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
@@ -173,3 +174,15 @@ def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tu
     drafter = drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)
     pack(drafter)
     return drafter, description
+
+
+def _check(folder: Path, request: Request) -> str:
+    return read_drafter(folder, request.description.sha256, request.description.actions).sha256
+
+
+def _load(folder: Path, request: Request) -> Drafter:
+    target: Any = request.target
+    return load_drafter(folder, target, request.description.sha256)[0]
+
+
+ARTIFACT = Artifact("drafter", artifact_folder("drafter"), _check, _load)

@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.artifacts import Artifact, Request, artifact_folder
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
@@ -193,3 +194,13 @@ def load_early(
     early = early.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)
     pack(early)
     return early, own
+
+
+def _load(folder: Path, request: Request) -> EarlyDrafter:
+    drafted_for: Any = request.target
+    return load_early(folder, drafted_for, request.description)[0]
+
+
+ARTIFACT = Artifact(
+    "early", artifact_folder("early"), lambda folder, request: read_early(folder, request.description).sha256, _load
+)

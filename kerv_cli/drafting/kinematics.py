@@ -59,7 +59,7 @@ class ActionHistory:
 
 @dataclass(frozen=True)
 class Noise:
-    """What a Kalman filter assumes of each DoF; the gripper's entries are not used.
+    """What a Kalman filter assumes of each DoF; the entries of held DoFs are not used.
 
     q: variance of the random acceleration (order 2) or change of acceleration (order 3) in one step. r: variance of
     the observation. Only their ratio matters, because the prior is scaled by r. damping: share of the velocity that is
@@ -103,18 +103,21 @@ def filter_states(ratio: float, window: int, order: int, damping: float) -> tupl
     ratio: q / r. The filter begins on the first action with state [a₀, 0(, 0)] and covariance r · I; it then predicts
     and updates once per further action.
     """
+    from filterpy.kalman import KalmanFilter
+
     transition, noise = motion_model(order, damping)
+    model = KalmanFilter(dim_x=order, dim_z=1)
+    model.F, model.H = transition, np.eye(1, order)
+    model.P, model.Q, model.R = np.eye(order), ratio * noise, np.eye(1)  # in units of r
     state = np.eye(order, 1)
-    covariance = np.eye(order)  # in units of r
     states = [state]
     for i in range(1, window):
         state = transition @ np.pad(state, ((0, 0), (0, 1)))
-        covariance = transition @ covariance @ transition.T + ratio * noise
-        gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
+        model.predict()
+        model.update(0.0)  # the gain does not depend on what is measured
         innovation = -state[0]
         innovation[i] += 1.0
-        state = state + np.outer(gain, innovation)
-        covariance = covariance - np.outer(gain, covariance[0])
+        state = state + model.K @ innovation[None]
         states.append(state)
     return tuple(states)
 
@@ -127,23 +130,21 @@ def kalman_weights(q: float, r: float, window: int, horizon: int, order: int = 2
 
 
 class Predictor:
-    """Predicts the next actions from the last ones; the gripper is held, never extrapolated."""
+    """Predicts the next actions from the last ones; held DoFs (a gripper) keep their last value."""
 
     name = ""
     least = 1  # actions without which the weights are not defined
 
-    def __init__(
-        self, dofs: int, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON, gripper: int = -1
-    ) -> None:
-        """minimum: actions without which predict() gives None. gripper: index of its DoF.
+    def __init__(self, held: np.ndarray, minimum: int = MINIMUM, window: int = WINDOW, horizon: int = HORIZON) -> None:
+        """held: (D,) bool, DoFs that are never extrapolated. minimum: actions without which predict() gives None.
 
         Raises:
             UsageError: minimum or window out of range.
         """
         if not self.least <= minimum <= window:
             raise UsageError(f"{self.name}: a minimum history of {minimum} does not lie in {self.least}…{window}")
-        self.dofs, self.minimum, self.window, self.horizon = dofs, minimum, window, horizon
-        self.gripper = gripper % dofs
+        self.held, self.dofs = np.asarray(held, dtype=bool), len(held)
+        self.minimum, self.window, self.horizon = minimum, window, horizon
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
     def weights(self, dof: int, window: int) -> np.ndarray:
@@ -153,7 +154,7 @@ class Predictor:
     def _table(self, window: int) -> np.ndarray:
         """(D, horizon, window)."""
         rows = [
-            hold_weights(window, self.horizon) if dof == self.gripper else self.weights(dof, window)
+            hold_weights(window, self.horizon) if self.held[dof] else self.weights(dof, window)
             for dof in range(self.dofs)
         ]
         return np.stack(rows)
@@ -219,14 +220,14 @@ class Kalman(Predictor):
 
     def __init__(
         self,
+        held: np.ndarray,
         noise: Noise,
         minimum: int = MINIMUM,
         window: int = WINDOW,
         horizon: int = HORIZON,
-        gripper: int = -1,
     ) -> None:
         self.noise = noise
-        super().__init__(len(noise.q), minimum, window, horizon, gripper)
+        super().__init__(held, minimum, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
@@ -253,25 +254,25 @@ PREDICTORS = (Hold.name, Linear.name, *FILTERS)
 
 def build_predictor(
     kind: str,
-    dofs: int,
+    held: np.ndarray,
     noise: Mapping[str, Noise],
     minimum: int = MINIMUM,
     window: int = WINDOW,
     horizon: int = HORIZON,
-    gripper: int = -1,
 ) -> Predictor:
-    """The predictor `kind`; `noise` holds the fitted noise of each kind of filter.
+    """The predictor `kind`; held: (D,) bool, DoFs that keep their last value; `noise` holds the fitted noise of each
+    kind of filter.
 
     Raises:
         UnknownName: no such predictor.
         UsageError: a filter without its noise, or a number out of range.
     """
     if kind == Hold.name:
-        return Hold(dofs, minimum, window, horizon, gripper)
+        return Hold(held, minimum, window, horizon)
     if kind == Linear.name:
-        return Linear(dofs, minimum, window, horizon, gripper)
+        return Linear(held, minimum, window, horizon)
     if kind not in FILTERS:
         raise UnknownName("predictor", kind, PREDICTORS)
     if kind not in noise:
         raise UsageError(f"predictor '{kind}' has no fitted noise: run 'kerv calibrate'")
-    return FILTERS[kind](noise[kind], minimum, window, horizon, gripper)
+    return FILTERS[kind](held, noise[kind], minimum, window, horizon)

@@ -12,12 +12,14 @@ import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
 
 from kerv_cli.drafting.search import best, length_of_longest, slack
 from kerv_cli.errors import StorageError, UsageError
+from kerv_cli.parts import QdrantSearchSettings
 
 BATCH = 131_072  # numbers sent at once: below a server's limit for one request
 SPARE = 8  # rows asked for beyond k, so that rounding and ties at the k-th seldom need a second search
@@ -83,6 +85,20 @@ class QdrantIndex:
         above = least - slack(self.longest, key) - 1e-9  # Qdrant leaves out what scores just as much
         found = self.engine.search(sent, task, shard.stop - shard.start, without, above)
         return np.sort(np.array([row for row, _ in found], dtype=np.int64))
+
+
+def qdrant_index(
+    vectors: np.ndarray, seeds: np.ndarray, shards: Mapping[str, slice], digest: str, settings: QdrantSearchSettings
+) -> QdrantIndex:
+    """datastore=qdrant; errors as `QdrantIndex`."""
+    check_qdrant(settings)
+    return QdrantIndex(vectors, seeds, shards, digest, settings.url)
+
+
+def check_qdrant(settings: QdrantSearchSettings) -> None:
+    """Raises UsageError where the packages of the extra are not installed."""
+    if find_spec("qdrant_client" if settings.url else "qdrant_edge") is None:
+        raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
 
 
 class EmbeddedEngine:

@@ -77,6 +77,13 @@ class Outline:
         return (bounds >= least - slack(self.longest, key)).nonzero()[0]
 
 
+def exact_index(
+    vectors: np.ndarray, seeds: np.ndarray, shards: Mapping[str, slice], digest: str, settings: object
+) -> ExactIndex:
+    """datastore=exact."""
+    return ExactIndex(vectors, seeds, shards)
+
+
 class ExactIndex:
     """The default: in this process, numpy."""
 

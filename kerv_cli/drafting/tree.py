@@ -56,16 +56,6 @@ class TokenTree:
                 seen[i] |= seen[parent]
         return seen
 
-    def seen(self, before: int) -> np.ndarray:
-        """(before + n, before + n) bool: which of `before` tokens and the nodes behind them each of these sees. The
-        tokens in front are causal; a node sees all of them and its path."""
-        n = len(self)
-        seen = np.zeros((before + n, before + n), dtype=bool)
-        seen[:before, :before] = np.tri(before, dtype=bool)
-        seen[before:, :before] = True
-        seen[before:, before:] = self.ancestors()
-        return seen
-
     def down_from(self, node: int) -> list[int]:
         """`node` and what lies below it along first children, down to a leaf."""
         found = [node]
@@ -98,3 +88,22 @@ def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
                 parents.append(node)
             node = children[key]
     return TokenTree.build(tokens, parents)
+
+
+def visible_in_prefill(tree: TokenTree, prompt: int) -> np.ndarray:
+    """(P + n, P + n) bool for [prompt, nodes…]: causal in the prompt; a node sees the prompt and its path."""
+    n = len(tree)
+    seen = np.zeros((prompt + n, prompt + n), dtype=bool)
+    seen[:prompt, :prompt] = np.tri(prompt, dtype=bool)
+    seen[prompt:, :prompt] = True
+    seen[prompt:, prompt:] = tree.ancestors()
+    return seen
+
+
+def visible_in_verification(tree: TokenTree) -> np.ndarray:
+    """(1 + n, 1 + n) bool for [last committed token, nodes…]: a node sees that token, its ancestors and itself."""
+    n = len(tree)
+    seen = np.zeros((1 + n, 1 + n), dtype=bool)
+    seen[:, 0] = True
+    seen[1:, 1:] = tree.ancestors()
+    return seen

@@ -95,12 +95,13 @@ def _seconds(episodes: pd.DataFrame, phase: str) -> float:
 
 
 def is_autoregressive(settings: Mapping[str, Any]) -> bool:
+    """Whether a setting decodes token by token, without drafts."""
     return bool(settings["method"] == AUTOREGRESSIVE)
 
 
-def opens_with_drafts(settings: Mapping[str, Any]) -> bool:
-    """Whether a method verifies inside the prefill; settings of before it could have none of its sources."""
-    return bool((settings.get("opening") or {}).get("sources"))
+def verifies_in_prefill(settings: Mapping[str, Any]) -> bool:
+    """Whether a setting drafts before the prefill."""
+    return bool(settings["prefill_draft"]["kind"] != "none")
 
 
 def chunk_ratio(settings: Mapping[str, Any], baseline: Mapping[str, Any]) -> float:

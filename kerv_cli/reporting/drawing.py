@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kerv_cli.files import atomic_path
+from kerv_cli.registry import parts
 
 INK, MUTED, GRID = "#1f2933", "#6b7785", "#e3e8ee"
 COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # told apart when colour-blind
@@ -60,16 +64,65 @@ def colour(place: int) -> str:
     return COLOURS[place % len(COLOURS)]
 
 
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Writes a figure as the format of its suffix (.png, .svg), atomically and without a date.
+_COLOURED = ("policy", "prefill_draft", "proposer")
+"""Kinds of parts whose colour a setting takes, by columns `<kind>.kind`."""
+
+
+def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """A colour per setting, from its row of a study's table: the baseline's ink, that of the first of its parts that
+    has one which no setting before has taken, else the next of the palette."""
+    taken: list[str] = []
+    for row in rows:
+        if row["label"] == row["baseline"]:
+            taken.append(INK)
+            continue
+        known = [parts(kind).get(str(row.get(f"{kind}.kind"))) for kind in _COLOURED]
+        own = [f"#{part.colour:06x}" for part in known if part is not None and part.colour is not None]
+        free = [shade for shade in (*own, *COLOURS) if shade not in taken]
+        taken.append(free[0] if free else colour(len(taken)))
+    return taken
+
+
+SVG_LIMIT = 100_000  # bytes; a larger one is a picture of many points, which a PNG holds better
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure on disk, and the element that shows it in a page that stands alone."""
+
+    files: tuple[Path, ...]
+    html: str
+
+
+def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
+    """Writes `name`.png and, up to `SVG_LIMIT`, `name`.svg, atomically and without a date. An older SVG of a figure
+    that is too large now is removed.
 
     Raises:
         StorageError: the disk refused.
     """
-    content = figure_bytes(figure, path.suffix[1:])
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-    return path
+    contents = {kind: figure_bytes(figure, kind) for kind in ("png", "svg")}
+    small = len(contents["svg"]) <= SVG_LIMIT
+    if not small:
+        del contents["svg"]
+        (folder / f"{name}.svg").unlink(missing_ok=True)
+    for kind, content in contents.items():
+        with atomic_path(folder / f"{name}.{kind}") as temporary:
+            temporary.write_bytes(content)
+    files = tuple(folder / f"{name}.{kind}" for kind in contents)
+    return Plot(files, _inline(contents["svg"].decode(), f"{name}-") if small else _embedded(contents["png"]))
+
+
+def _inline(svg: str, prefix: str) -> str:
+    """The <svg> element alone, its ids made unique: two figures in one page must not share clip paths."""
+    text = svg[svg.index("<svg") :]
+    for before in ('id="', 'xlink:href="#', "url(#"):
+        text = text.replace(before, before + prefix)
+    return text
+
+
+def _embedded(png: bytes) -> str:
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 
 def figure_bytes(figure: Figure, kind: str) -> bytes:

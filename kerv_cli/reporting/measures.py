@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 
 from kerv_cli.decoding.record import PHASES
@@ -16,7 +17,7 @@ MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 
 COMPARABLE = ("device", "device_name", "dtype", "threads")  # what times must agree in to be compared
-_SAME = (*COMPARABLE, "rand_vec")  # what two episodes of a pair must agree in
+_SAME = (*COMPARABLE, "initial_state")  # what two episodes of a pair must agree in
 
 _RATIOS = {
     "AL": ("committed", "verifications"),
@@ -35,12 +36,14 @@ _RATIOS = {
 class Measured:
     """One setting over some episodes."""
 
-    values: dict[str, float]  # every measure but the two below
+    values: dict[str, float]  # every measure but those below
     success: Estimate  # Wilson interval
-    speedup: Estimate  # bootstrap interval; NaN without pairs, and where no target decodes
+    speedup: Estimate  # of time per step; bootstrap interval; NaN without pairs, and where no target decodes
+    episode_speedup: Estimate  # of time per episode, likewise: methods also change how long episodes are
     counts: stats.PairedCounts
     mcnemar_p: float  # NaN without pairs
     same_run: bool  # all pairs were measured in one run
+    same_block: float  # share of the pairs that were measured in one block, in turn; NaN without pairs
 
 
 def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Measured:
@@ -50,30 +53,33 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> M
     the ratio of the two macro means. Paired counts and p are no averages: they are those of all pairs.
 
     Args:
-        episodes: the setting's, columns of rows.EPISODE_SCHEMA and task, difficulty, run and the columns of `_SAME`.
-        baseline: the baseline's, same columns; only pairs of equal task, seed, world and device are compared.
+        episodes: the setting's, columns of rows.EPISODE_SCHEMA, decode_seconds, difficulty, run and those of `_SAME`.
+        baseline: the baseline's, same columns; only pairs of equal task, seed, repeat, world and device are compared.
     """
     pairs = paired(episodes, baseline)
     macro = averaging == MACRO
     counts = stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
+    decodes = _decodes(episodes)
     return Measured(
         values=_by_group(episodes, _means) if macro else _means(episodes),
         success=_success(episodes, macro),
-        speedup=_speedup(pairs, macro) if _decodes(episodes) else stats.NO_ESTIMATE,
+        speedup=_speedup(pairs, "time", macro) if decodes else stats.NO_ESTIMATE,
+        episode_speedup=_speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE,
         counts=counts,
         mcnemar_p=stats.mcnemar(counts) if len(pairs) else math.nan,
         same_run=bool(len(pairs) and pairs["same_run"].all()),
+        same_block=float(pairs["same_block"].mean()) if len(pairs) else math.nan,
     )
 
 
 def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
-    """Pairs of equal task, seed, initial state and device, sorted by task and seed.
+    """Pairs of equal task, seed, repeat, initial state and device, sorted by task, seed and repeat.
 
-    Columns: task, difficulty, seed, time_baseline and time_method (seconds per step), success_baseline and
-    success_method, same_run.
+    Columns: task, difficulty, seed, repeat; with the suffixes _baseline and _method: time (seconds per step), seconds
+    (of the episode), success, block; same_run, same_block.
     """
-    keys = ["task", "seed"]
-    columns = [*keys, "difficulty", "run", "success", *_SAME]
+    keys = ["task", "seed", "repeat"]
+    columns = [*keys, "difficulty", "run", "block", "success", "seconds", *_SAME]
     method = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
     other = baseline[columns].assign(time=baseline["seconds"] / baseline["steps"])
     both = method.merge(other, on=keys, suffixes=("_method", "_baseline"))
@@ -82,6 +88,7 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
         agree &= both[f"{name}_method"] == both[f"{name}_baseline"]
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     both["same_run"] = both["run_method"] == both["run_baseline"]
+    both["same_block"] = (both["block_method"] == both["block_baseline"]) & (both["block_method"] != "")
     return both.rename(columns={"difficulty_method": "difficulty"})
 
 
@@ -90,18 +97,36 @@ def _decodes(episodes: pd.DataFrame) -> bool:
     return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
 
 
-def _speedup(pairs: pd.DataFrame, macro: bool) -> Estimate:
-    times = pairs["time_baseline"].to_numpy(), pairs["time_method"].to_numpy()
-    return stats.speedup(*times, list(pairs["task"]), list(pairs["difficulty"]) if macro else None)
+def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
+    blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
+    return stats.speedup(
+        pairs[f"{time}_baseline"].to_numpy(),
+        pairs[f"{time}_method"].to_numpy(),
+        list(pairs["task"]),
+        list(pairs["difficulty"]) if macro else None,
+        list(blocks),
+    )
 
 
 def _means(episodes: pd.DataFrame) -> dict[str, float]:
     per_step = 1000.0 / episodes["steps"]
-    values = {"time_per_step_ms": float((episodes["seconds"] * per_step).mean())}
+    values = {
+        "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
+        "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
+        **_latencies(episodes["decode_seconds"]),
+        "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
+    }
     values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
     sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
     values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     return values
+
+
+def _latencies(decode_seconds: pd.Series) -> dict[str, float]:
+    """Milliseconds from an observation to its actions, over all decodes of all episodes."""
+    times = 1000.0 * np.concatenate(list(decode_seconds))
+    middle, late, worst = np.quantile(times, [0.5, 0.95, 1.0])
+    return {"latency_p50_ms": float(middle), "latency_p95_ms": float(late), "latency_worst_ms": float(worst)}
 
 
 def _by_group(episodes: pd.DataFrame, measure_of: Callable[[pd.DataFrame], dict[str, float]]) -> dict[str, float]:

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.decoding.record import PHASES
-from kerv_cli.reporting.drawing import COLOURS, DASHES, INK, MUTED, STYLE, colour, entitle, new_figure
+from kerv_cli.reporting.drawing import COLOURS, DASHES, INK, MUTED, STYLE, entitle, new_figure, setting_colours
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.scatter import tradeoff_figure
 from kerv_cli.reporting.tables import is_number
@@ -107,9 +107,11 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
     figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns))
     axes = figure.subplots(1, len(_PANELS))
     ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
+    others = [group[~_is_baseline(group)].iloc[0] for group in series.values()]
+    shades = setting_colours({str(k): v for k, v in row.items()} for row in others)
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
         for place, (label, group) in enumerate(series.items()):
-            _draw_series(panel, group, measure, scale, place, label)
+            _draw_series(panel, group, measure, scale, shades[place], DASHES[place % len(DASHES)], label)
         _draw_baseline(panel, rows, measure, scale)
         panel.set(title=name, ylabel=unit, xlabel=axis)
         if len(ticks) <= 9:
@@ -121,18 +123,19 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
     return figure
 
 
-def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, place: int, label: str) -> None:
+def _draw_series(
+    panel: Axes, group: pd.DataFrame, measure: str, scale: float, shade: str, dashes: Any, label: str
+) -> None:
     if len(group) == 1:  # a setting that the axis does not touch: a level to compare with
         level = group[measure].iloc[0] * scale
         if is_number(level):
-            dashes = DASHES[place % len(DASHES)]
-            panel.axhline(level, color=colour(place), linestyle=dashes, linewidth=1.4, label=label)
+            panel.axhline(level, color=shade, linestyle=dashes, linewidth=1.4, label=label)
         return
     x, y = group["x"].to_numpy(float), group[measure].to_numpy(float) * scale
-    panel.plot(x, y, color=colour(place), marker="o", markersize=5, linewidth=1.8, label=label)
+    panel.plot(x, y, color=shade, marker="o", markersize=5, linewidth=1.8, label=label)
     if f"{measure}_low" in group:
         low, high = group[f"{measure}_low"].to_numpy(float) * scale, group[f"{measure}_high"].to_numpy(float) * scale
-        panel.fill_between(x, low, high, color=colour(place), alpha=0.15, linewidth=0)
+        panel.fill_between(x, low, high, color=shade, alpha=0.15, linewidth=0)
 
 
 def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) -> None:

@@ -16,17 +16,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kerv_cli.decoding.calibration_file import FORMAT, Errors, calibration_beside
+from kerv_cli.decoding.calibration_file import Calibration, calibration_place, read_calibration
 from kerv_cli.drafting.kinematics import PREDICTORS
 from kerv_cli.errors import CheckpointError
-from kerv_cli.files import read_json, sha256_of
+from kerv_cli.files import sha256_of
 from kerv_cli.places import find_target
 from kerv_cli.reporting.drawing import INK, STYLE, colour, entitle, new_figure
-from kerv_cli.settings import opening_sources
-from kerv_cli.spaces import DOF_NAMES, GRIPPER
 
 REFERENCE = "hold"
-_POSITION = DOF_NAMES[:GRIPPER]
 
 
 @dataclass(frozen=True)
@@ -34,11 +31,7 @@ class Predictions:
     """The predictors' errors of one target's calibration."""
 
     target: str
-    errors: Errors
-    window: int  # control steps that predictions were made from
-    target_sha256: str
-    demos: Mapping[str, Any]  # {"sha256", "tasks": {task: {"training": episodes, "held_out": episodes}}}
-    provenance: Mapping[str, Any]
+    calibration: Calibration
     sha256: str  # of the calibration's file
 
     @property
@@ -48,35 +41,20 @@ class Predictions:
 
 
 def read_predictions(results: Path, target: str) -> Predictions | None:
-    """The errors of the target `target`; None where there is no such target, or nothing calibrated for it.
+    """The errors of the target `target`; None where there is no such target, or nothing calibrated for it. The target
+    may be another since: the errors are the demonstrations'.
 
     Raises:
         CheckpointError: the calibration is damaged or of another format.
     """
     try:
-        path = calibration_beside(find_target(str(results), target))
+        path = calibration_place(str(results), None, find_target(str(results), target))
     except CheckpointError:
         return None
     if not path.is_file():
         return None
-    value = read_json(path)
-    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, "calibration"):
-        raise CheckpointError(f"{path} is not a calibration of format {FORMAT}: run 'kerv calibrate' again")
-    # only what the report shows: the rest may be of another version, and the target another since, the errors are
-    # the demonstrations'
-    try:
-        found = Predictions(
-            target,
-            errors=value["errors"],
-            window=value["window"],
-            target_sha256=value["target"]["sha256"],
-            demos=value["demos"],
-            provenance=value.get("provenance", {}),
-            sha256=sha256_of(path),
-        )
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged ({error} is missing): run 'kerv calibrate' again") from error
-    return found if found.errors else None
+    calibration = read_calibration(path)
+    return Predictions(target, calibration, sha256_of(path)) if calibration.errors else None
 
 
 def calibrated_targets(results: Path) -> list[str]:
@@ -91,25 +69,25 @@ def predicting_targets(settings: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def _predicts(settings: Mapping[str, Any]) -> bool:
-    opening = (settings.get("opening") or {}).get("sources") or []
-    drafts = {settings["proposer"]["kind"], *opening_sources(opening)} & set(PREDICTORS)
-    return bool(drafts or settings["rectifier"]["kind"] == "compensate")
+    drafting = [settings[kind] for kind in ("prefill_draft", "proposer")]
+    named = {name for part in drafting for name in (part["kind"], *part.get("sources", ()), *part.get("fallback", ()))}
+    return bool(named & set(PREDICTORS) or settings["rectifier"]["kind"] == "compensate")
 
 
 def prediction_table(predictions: Predictions) -> pd.DataFrame:
     """One row per predictor, task, DoF and step ahead; errors in normalised action units."""
-    errors = predictions.errors
+    calibration, errors = predictions.calibration, predictions.calibration.errors
     origin = {
-        "window": predictions.window,
+        "window": calibration.window,
         "calibration_sha256": predictions.sha256,
-        "target_sha256": predictions.target_sha256,
-        "demos_sha256": predictions.demos.get("sha256", ""),
-        "git_commit": predictions.provenance.get("git_commit", ""),
+        "target_sha256": calibration.target.sha256,
+        "demos_sha256": calibration.demos.sha256,
+        "git_commit": calibration.provenance.get("git_commit", ""),
     }
     rows = []
     for predictor, tasks in errors.items():
         for task, dofs in tasks.items():
-            counts = predictions.demos.get("tasks", {}).get(task, {})
+            counts = calibration.demos.tasks.get(task, {})
             held_out = {"held_out_episodes": counts.get("held_out"), "training_episodes": counts.get("training")}
             for dof, steps in dofs.items():
                 for step, error in enumerate(steps):
@@ -125,16 +103,25 @@ def _against(error: float, hold: list[float]) -> dict[str, float]:
     return {"error": error, "hold_error": reference, "ratio_to_hold": ratio}
 
 
-def position_means(table: pd.DataFrame) -> pd.DataFrame:
-    """Mean error over dx, dy, dz: columns predictor, task, steps_ahead, error."""
-    position = table[table["dof"].isin(_POSITION)]
-    return position.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
+def predicted_dofs(table: pd.DataFrame) -> list[str]:
+    """The DoFs that the predictors predict: all but those, a gripper, which every one of them holds."""
+    others = table[table["predictor"] != REFERENCE]
+    differs = others[others["error"] != others["hold_error"]]
+    return [dof for dof in dict.fromkeys(table["dof"]) if dof in set(differs["dof"])] or list(
+        dict.fromkeys(table["dof"])
+    )
+
+
+def predicted_means(table: pd.DataFrame) -> pd.DataFrame:
+    """Mean error over `predicted_dofs`: columns predictor, task, steps_ahead, error."""
+    own = table[table["dof"].isin(predicted_dofs(table))]
+    return own.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
 
 
 def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Texts: one row per predictor, the mean error over dx, dy, dz and all tasks by steps ahead; beside it, as a share
-    of hold's."""
-    means = position_means(table).groupby(["predictor", "steps_ahead"], sort=False)["error"].mean().reset_index()
+    """Texts: one row per predictor, the mean error over the predicted DoFs and all tasks by steps ahead; beside it, as
+    a share of hold's."""
+    means = predicted_means(table).groupby(["predictor", "steps_ahead"], sort=False)["error"].mean().reset_index()
     errors = {(str(p), int(s)): float(e) for p, s, e in means.itertuples(index=False)}
     rows: dict[str, dict[str, str]] = {}
     for (predictor, step), error in errors.items():
@@ -146,7 +133,7 @@ def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
 
 def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
     """Error against steps ahead, one line per predictor, and every task's error one step ahead."""
-    means = position_means(table)
+    means = predicted_means(table)
     predictors, tasks = list(dict.fromkeys(means["predictor"])), list(dict.fromkeys(means["task"]))
     with mpl.rc_context(STYLE):
         figure = new_figure(11.5, max(4.8, 1.9 + len(tasks) * (0.1 + 0.085 * len(predictors))))
@@ -157,7 +144,7 @@ def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
         handles, labels = ahead.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         held_out = table.drop_duplicates("task")["held_out_episodes"].sum()
-        about = f"mean of dx, dy, dz · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
+        about = f"mean of {', '.join(predicted_dofs(table))} · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
         about += f" · from the last {table['window'][0]} steps"
         entitle(figure, f"Prediction of the next actions, {predictions.target}", about)
     return figure

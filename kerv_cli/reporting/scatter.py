@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
-from kerv_cli.reporting.drawing import INK, MUTED, colour, entitle, new_figure
+from kerv_cli.reporting.drawing import INK, MUTED, entitle, new_figure, setting_colours
 from kerv_cli.reporting.tables import is_number
 
 _DISTANCES = (9.0, 14.0, 21.0, 30.0, 40.0, 52.0, 66.0, 82.0, 100.0)  # points from the marker, tried in turn
@@ -32,7 +32,7 @@ def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
     panel = figure.subplots()
     drawn = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
     points = [row for row in drawn if is_number(row["speedup"])]
-    shades = [INK if row["label"] == row["baseline"] else colour(i) for i, row in enumerate(points)]
+    shades = setting_colours(points)
     for row, shade in zip(points, shades, strict=True):
         _draw_point(panel, row, shade)
     for row in drawn:

@@ -83,20 +83,24 @@ def speedup(
     method: np.ndarray,
     strata: Sequence[str],
     groups: Sequence[str] | None = None,
+    blocks: Sequence[str] | None = None,
     *,
     resamples: int = RESAMPLES,
     seed: int = BOOTSTRAP_SEED,
 ) -> Estimate:
-    """Ratio of mean time per step, baseline over method, with a paired bootstrap 95 % interval.
+    """Ratio of mean times, baseline over method, with a paired bootstrap 95 % interval.
 
-    Pairs are drawn with replacement within their stratum (the task), both times of a pair together, and the ratio of
-    the means is taken of every draw.
+    Within every stratum (the task) blocks are drawn with replacement, then within each drawn block its pairs, both
+    times of a pair together, and the ratio of the means is taken of every draw. So the interval knows that what was
+    measured in one block shares the machine's state. With pairs that are independent of their block it is wider than it
+    need be, never narrower.
 
     Args:
-        baseline: (pairs,) time per step of the baseline's episodes, any unit.
+        baseline: (pairs,) time of the baseline's episodes, any unit.
         method: (pairs,) the method's, same initial states, same unit.
         strata: (pairs,) task of each pair.
         groups: (pairs,) difficulty group of each pair: the means are then unweighted means over the groups' means.
+        blocks: (pairs,) block of each pair; without, every pair is a block.
 
     Returns:
         NaN without pairs; NaN bounds where a stratum has one pair only, which resampling cannot vary.
@@ -108,18 +112,41 @@ def speedup(
     weights = _weights(a.size, groups)
     mean_a, mean_b = weights @ times
     value = float(mean_a / mean_b)
-    names, members = np.unique(np.asarray(strata, dtype=object).astype(str), return_inverse=True)
+    members = _numbered(strata)
     if np.bincount(members).min() < 2:
         return Estimate(value, math.nan, math.nan)
+    blocked = np.arange(a.size) if blocks is None else _numbered(blocks)
     generator = np.random.default_rng(seed)
     means = np.zeros((resamples, 2))
-    for stratum in range(len(names)):
+    for stratum in range(int(members.max()) + 1):
         rows = np.flatnonzero(members == stratum)
-        drawn = generator.integers(0, rows.size, size=(resamples, rows.size))
         # a stratum lies in one group, so its pairs weigh the same
-        means += times[rows][drawn].mean(axis=1) * weights[rows].sum()
+        means += _resampled_means(times[rows], blocked[rows], resamples, generator) * weights[rows].sum()
     low, high = np.quantile(means[:, 0] / means[:, 1], [0.025, 0.975])
     return Estimate(value, float(low), float(high))
+
+
+def _resampled_means(
+    times: np.ndarray, blocks: np.ndarray, resamples: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Means (resamples, 2) of times (pairs, 2) drawn by block (pairs,), then within the block."""
+    _, members, sizes = np.unique(blocks, return_inverse=True, return_counts=True)
+    sorted_times = times[np.argsort(members, kind="stable")]
+    first = np.cumsum(sizes) - sizes  # of every block, in the sorted order
+    drawn = generator.integers(0, sizes.size, size=(resamples, sizes.size))
+    drawn_sizes = sizes[drawn]  # (resamples, blocks)
+    within = generator.random((resamples, sizes.size, int(sizes.max())))
+    places = first[drawn][..., None] + (within * drawn_sizes[..., None]).astype(np.int64)
+    used = np.arange(sizes.max()) < drawn_sizes[..., None]  # a small block gives fewer pairs
+    sums = np.einsum("rbpk,rbp->rk", sorted_times[np.where(used, places, 0)], used)
+    means: np.ndarray = sums / drawn_sizes.sum(axis=1, keepdims=True)
+    return means
+
+
+def _numbered(names: Sequence[str]) -> np.ndarray:
+    """(n,) numbers 0, 1, … of the distinct names."""
+    numbers: np.ndarray = np.unique(np.asarray(names, dtype=object).astype(str), return_inverse=True)[1]
+    return numbers
 
 
 def _weights(pairs: int, groups: Sequence[str] | None) -> np.ndarray:

@@ -19,7 +19,7 @@ from kerv_cli.reporting.ceiling import (
     ceiling,
     chunk_ratio,
     is_autoregressive,
-    opens_with_drafts,
+    verifies_in_prefill,
 )
 from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, Measured, measure
 from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
@@ -27,6 +27,7 @@ from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
 
 _STATUS_COLUMNS = (
+    "executor",
     "workers",
     "device_name",
     "host",
@@ -35,6 +36,7 @@ _STATUS_COLUMNS = (
     "git_commit",
     "run",
 )
+_RUNTIME_ELSEWHERE = frozenset({"workers", "executor", "executor_options"})
 _SETTINGS_ELSEWHERE = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
 
 
@@ -66,7 +68,7 @@ def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyD
 def _labelled(cell: Cell, stored: StoredCell) -> pd.DataFrame:
     runtime = cell.settings["runtime"]
     return stored.episodes.assign(
-        rand_vec=stored.episodes["rand_vec"].map(tuple),  # comparable
+        initial_state=stored.episodes["initial_state"].map(tuple),  # comparable
         label=cell.label,
         cell=cell.id,
         difficulty=difficulty_of(cell.task),
@@ -79,7 +81,7 @@ def _labelled(cell: Cell, stored: StoredCell) -> pd.DataFrame:
 
 
 def difficulty_of(task: str) -> str:
-    """The task's difficulty group; `other` for a task that is not Meta-World's."""
+    """The task's difficulty group; `other` for a task that no environment has."""
     return TASKS[task].difficulty if task in TASKS else "other"
 
 
@@ -126,6 +128,7 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "tasks": len(tasks),
         "difficulty": _joined(sorted(set(episodes["difficulty"]))),
         "seeds": seeds_text(episodes["seed"]),
+        "repeats": int(episodes["repeat"].nunique()),
         "episodes": len(episodes),
         "baseline": data.plan.baseline,
     }
@@ -147,7 +150,7 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
     for name in ("task", *COMPARABLE):
         reference = reference[reference[name].isin(set(episodes[name]))]
     chunks = chunk_ratio(cell.settings, found[0].settings)
-    return ceiling(episodes, reference, opens_with_drafts(cell.settings), chunks, averaging == MACRO)
+    return ceiling(episodes, reference, verifies_in_prefill(cell.settings), chunks, averaging == MACRO)
 
 
 def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[str, Any]:
@@ -162,12 +165,16 @@ def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[st
         "speedup": found.speedup.value,
         "speedup_low": found.speedup.low,
         "speedup_high": found.speedup.high,
+        "episode_speedup": found.episode_speedup.value,
+        "episode_speedup_low": found.episode_speedup.low,
+        "episode_speedup_high": found.episode_speedup.high,
         "ceiling": limit.pop("ceiling"),
         **rest,
         "pairs": sum(found.counts),
         **found.counts._asdict(),
         "mcnemar_p": found.mcnemar_p,
         "same_run": found.same_run,
+        "same_block": found.same_block,
         "steps": int(episodes["steps"].sum()),
         "decodes": int(episodes["decodes"].sum()),
         "deviation_samples": int(episodes["deviation_count"].sum()),
@@ -193,7 +200,7 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "horizon": world["horizon"],
         "camera": world["camera"]["name"],
         **flatten({"camera": {k: v for k, v in world["camera"].items() if k != "name"}}),
-        **{key: value for key, value in runtime.items() if key != "workers"},
+        **{key: value for key, value in runtime.items() if key not in _RUNTIME_ELSEWHERE},
         **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),
     }

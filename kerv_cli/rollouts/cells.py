@@ -1,16 +1,23 @@
-"""A sweep's cell -> its episodes. Runs in whatever process the executor chose."""
+"""A sweep's cell -> its episodes, and the load gauge beside them. Runs in whatever process the executor chose."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
+from torch import Tensor
+
 from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.rollouts.run import run_task
-from kerv_cli.settings import RolloutSettings
+from kerv_cli.rollouts.run import Runner, is_recorded
+from kerv_cli.settings import settings_from
+
+_TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
 
 
 class CellLike(Protocol):
@@ -23,40 +30,54 @@ class CellLike(Protocol):
     @property
     def task(self) -> str: ...
     @property
-    def seeds(self) -> tuple[int, ...]: ...
+    def repeat(self) -> int: ...
     @property
     def settings(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
 class CellRunner:
-    """Picklable. rollouts: folder of the .rrd files, one per recorded episode."""
+    """Makes cells ready. Picklable. rollouts: folder of the .rrd files, one per recorded episode."""
 
     rollouts: Path
 
-    def __call__(self, cell: CellLike) -> list[EpisodeRecord]:
-        from kerv_cli.viewing.rerun_log import save_episode  # rerun is needed only where an episode is drawn
-
+    def __call__(self, cell: CellLike) -> Callable[[int], EpisodeRecord]:
+        """The function that runs a seed's episode, its setting ready. Repeats are not recorded again."""
         settings = settings_from(cell.settings)
-        records = []
-        for record in run_task(settings, cell.task, cell.seeds):
+        runner = Runner(settings, cell.task)
+
+        def episode(seed: int) -> EpisodeRecord:
+            record = runner.episode(seed, cell.repeat == 0 and is_recorded(settings, seed))
             if record.frames:
-                name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{record.seed}-{cell.id[:6]}.rrd"
+                from kerv_cli.viewing.rerun_log import save_episode  # only a recording needs rerun
+
+                name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
                 save_episode(record, self.rollouts / name, method=cell.label)
-            records.append(dataclasses.replace(record, frames={}))
-        return records
+            return dataclasses.replace(record, frames={})
+
+        return episode
 
 
-def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
-    """The inverse of `as_plain`."""
-    return _fill(RolloutSettings, plain)
+def reference_decode(device: str) -> float:
+    """Seconds of a small fixed workload with a decode's shape, a chain of products of few tokens with one matrix. It
+    is the same always and everywhere, so its changes are the machine's: how loaded it is, how fast it clocks."""
+    x, weights = _reference(device)
+    begin = time.perf_counter()
+    _chain(x, weights)
+    return time.perf_counter() - begin
 
 
-def _fill(kind: type, plain: Mapping[str, Any]) -> Any:
-    defaults = kind()
-    values = {}
-    for field in dataclasses.fields(kind):
-        value = plain[field.name]
-        default = getattr(defaults, field.name)
-        values[field.name] = _fill(type(default), value) if dataclasses.is_dataclass(default) else value
-    return kind(**values)
+def _chain(x: Tensor, weights: Tensor) -> float:
+    for _ in range(_LAYERS):
+        x = torch.tanh(x @ weights)
+    return float(x[0, 0])  # waits for the device
+
+
+@functools.cache
+def _reference(device: str) -> tuple[Tensor, Tensor]:
+    """Operands (tokens, width) and (width, width), after a first run that allocates and chooses kernels."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(_TOKENS, _WIDTH, generator=generator).to(device)
+    weights = (torch.randn(_WIDTH, _WIDTH, generator=generator) / _WIDTH**0.5).to(device)
+    _chain(x, weights)
+    return x, weights

@@ -1,170 +1,170 @@
-"""The policy of a rollout: which files it needs, whether they fit together, and loading them once per process."""
+"""The policy of a rollout: whether its parts and files fit together, its identity, and the decoder that acts."""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
-from pathlib import Path
+import dataclasses
+from collections.abc import Mapping
 
-from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration
-from kerv_cli.drafting.datastore import Datastore, check_backend, check_target, open_datastore, read_manifest
-from kerv_cli.drafting.eagle import Drafter, load_drafter, read_drafter
-from kerv_cli.drafting.early import EarlyDrafter, load_early, read_early
-from kerv_cli.drafting.kinematics import FILTERS
-from kerv_cli.environments import resolve_tasks
-from kerv_cli.errors import UsageError
-from kerv_cli.files import sha256_of
-from kerv_cli.places import drafter_folder, early_folder, find_target
-from kerv_cli.rollouts.composition import check_composition
-from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import EVALUATION_SEED, DatastoreSettings, MethodSettings, RolloutSettings, opening_sources
-from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_target
-from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.datastore import datastore_beside
+import numpy as np
 
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.decoding.build import check as check_method
+from kerv_cli.decoding.build import compose, needs
+from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.decoding.record import DecodeRecord
+from kerv_cli.environments import resolve_tasks, spec_of
+from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.rollouts.episode import ActionDecoder
+from kerv_cli.rollouts.expert import ExpertDecoder
+from kerv_cli.runtime import set_up
+from kerv_cli.settings import EXPERT, MODEL, RolloutSettings
+from kerv_cli.spaces import Observation
 
-@dataclass(frozen=True)
-class Policy:
-    """Loaded weights and the hashes that name them."""
-
-    target: CompactTarget
-    drafter: Drafter | None
-    early: EarlyDrafter | None
-    calibration: Calibration | None
-    datastore: Datastore | None
-    datastore_sha256: str
+WARM_UP_DECODES = 6
+OBSERVATION = "observation"
+"""The identity's one entry that is no hash: what the target is shown. The target's hash implies it."""
 
 
-def identity_of(settings: RolloutSettings) -> dict[str, str]:
-    """Hashes of the weights that determine a result, without loading them."""
-    if is_expert(settings):
-        return {"target": "", "observation": "state (privileged)"}
-    folder = find_target(settings.results, settings.policy.target)
-    description = read_target(folder)
-    identity = {"target": description.sha256, "observation": observation_of(description)}
-    method = settings.parts()
-    if needs_drafter(method):
-        beside = drafter_folder(settings.results, settings.policy.drafter, folder)
-        identity["drafter"] = read_drafter(beside, description.sha256, description.actions).sha256
-    if needs_early(method):
-        beside = early_folder(settings.results, settings.policy.early, folder)
-        identity["early"] = read_early(beside, description).sha256
-    if needs_calibration(method):
-        identity["calibration"] = sha256_of(calibration_beside(folder))
-    if needs_datastore(method):
-        identity["datastore"] = sha256_of(datastore_beside(folder) / "manifest.json")
-    return identity
+def artifacts_of(settings: RolloutSettings) -> Artifacts:
+    """The policy's files; loaded objects are shared by all settings of this process."""
+    device, _ = set_up(settings.runtime)
+    return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
 def is_expert(settings: RolloutSettings) -> bool:
-    """Whether Meta-World's scripted policy acts in the target's place."""
-    return settings.proposer.kind == "expert"
+    """Whether the environment's scripted policy acts in the target's place."""
+    return settings.policy.kind == EXPERT
 
 
-def needs_drafter(method: MethodSettings) -> bool:
-    return method.proposer.kind in ("drafter", "hybrid")
+def identity_of(settings: RolloutSettings) -> dict[str, str]:
+    """Hashes of everything that determines a result besides the settings, without loading weights."""
+    if is_expert(settings):
+        return {"target": "", OBSERVATION: "state (privileged)"}
+    artifacts = artifacts_of(settings)
+    shown = shown_to(artifacts.description.settings)
+    return {**artifacts.check(needs(settings.parts())), OBSERVATION: shown}
 
 
-def needs_early(method: MethodSettings) -> bool:
-    return method.proposer.kind == "early" or "early" in opening_sources(method.opening.sources)
-
-
-def needs_datastore(method: MethodSettings) -> bool:
-    """Whether a part retrieves stored chunks."""
-    if method.proposer.kind in ("retrieval", "hybrid") or method.skip.kind != "none":
-        return True
-    return "retrieval" in opening_sources(method.opening.sources)
-
-
-def observation_of(description: TargetDescription) -> str:
-    """What the target is shown, for every row: one that is given the scene must not pass for one that sees it."""
-    kind = description.settings["observation"]
-    return "state (privileged)" if kind == "state" else str(kind)
-
-
-def needs_calibration(method: MethodSettings) -> bool:
-    """Whether a part reads what `kerv calibrate` fitted."""
-    predictors = {method.proposer.kind, *opening_sources(method.opening.sources)}
-    if method.rectifier.kind == "compensate":
-        predictors.add(method.rectifier.predictor)
-    return (
-        not predictors.isdisjoint(FILTERS)
-        or (method.threshold.kind in ("kinematic", "change") and method.threshold.k_s is None)
-        or method.boundary.kind == "fused"
-        or (method.skip.kind == "similarity" and method.skip.s_min is None)
-    )
+def shown_to(target: Mapping[str, object]) -> str:
+    """What a target of these settings is shown, for every row: one that is given the scene must not pass for one that
+    sees it."""
+    kind = str(target.get(OBSERVATION, "vision"))
+    return "state (privileged)" if kind == "state" else kind
 
 
 def check(settings: RolloutSettings) -> None:
     """Refuse what cannot run before anything heavy starts.
 
     Raises:
-        UsageError: a number out of range, training seeds, a camera that the policy was not trained on.
-        CheckpointError: no such policy, a damaged one, a drafter of another target.
+        UsageError: a number out of range, training seeds, a camera that the policy was not trained on, parts that do
+            not belong together.
+        CheckpointError: no such policy, a damaged one, an artifact of another target or another action space.
     """
     if settings.episodes < 1:
         raise UsageError(f"episodes={settings.episodes}: at least 1")
-    if settings.seed < EVALUATION_SEED:
-        raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {EVALUATION_SEED}")
+    if settings.policy.kind not in (MODEL, EXPERT):
+        raise UnknownName("policy.kind", settings.policy.kind, (MODEL, EXPERT))
+    tasks = resolve_tasks(settings.task)
+    spec = spec_of(tasks[0])
+    _check_seeds(settings, spec)
     if is_expert(settings):
-        if settings.deviation_every > 0:
-            raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
+        _check_expert(settings)
         return
-    folder = find_target(settings.results, settings.policy.target)
-    description = read_target(folder)
-    size, camera = description.settings["image_size"], settings.world.camera
-    if description.cameras and camera.size != size:
+    artifacts = artifacts_of(settings)
+    target, camera = artifacts.description, settings.world.camera
+    size = target.settings.get("image_size", camera.size)
+    if target.cameras and camera.size != size:
         raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
+    target.actions.check_same(spec.actions, f"target '{settings.policy.target}'", f"environment {spec.name}")
     method = settings.parts()
-    check_composition(method, description.chunk)
-    if needs_drafter(method):
-        beside = drafter_folder(settings.results, settings.policy.drafter, folder)
-        read_drafter(beside, description.sha256, description.actions)
-    if needs_early(method):
-        read_early(early_folder(settings.results, settings.policy.early, folder), description)
-    if needs_datastore(method):
-        check_backend(settings.datastore)
-        check_target(read_manifest(datastore_beside(folder)), description, datastore_beside(folder))
-    if needs_calibration(method):
-        calibration = load_calibration(calibration_beside(folder), description.sha256, description.chunk)
-        for name in resolve_tasks(settings.task):
-            calibration.threshold(settings.threshold, name)
+    check_method(method, settings.chunk, target.chunk)
+    wanted = needs(method)
+    artifacts.check(wanted)
+    if "calibration" in wanted and method["threshold"].kind in ("kinematic", "change"):
+        calibration = artifacts.load("calibration")
+        for task in tasks if method["threshold"].k_s is None else ():
+            calibration.k_s(task)
 
 
-@functools.lru_cache(maxsize=4)
-def _load(
-    target: Path,
-    drafter: Path | None,
-    early: Path | None,
-    calibrated: bool,
-    stored: tuple[str, str | None] | None,
-    device: str,
-    dtype_name: str,
-) -> Policy:
-    """stored: the datastore's backend and url."""
-    loaded, description = load_target(target, device, DTYPES[dtype_name])
-    sha256, chunk, at = description.sha256, loaded.chunk, datastore_beside(target)
-    return Policy(
-        target=loaded,
-        drafter=load_drafter(drafter, loaded, sha256)[0] if drafter is not None else None,
-        early=load_early(early, loaded, description)[0] if early is not None else None,
-        calibration=load_calibration(calibration_beside(target), sha256, chunk) if calibrated else None,
-        datastore=open_datastore(at, description, DatastoreSettings(*stored)) if stored else None,
-        datastore_sha256=sha256_of(at / "manifest.json") if stored else "",
-    )
+def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
+    seeds = range(settings.seed, settings.seed + settings.episodes)
+    if settings.seed in spec.seeds.training:
+        first = spec.seeds.evaluation.start
+        raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {first}")
+    purpose = "selection" if settings.seed in spec.seeds.selection else "evaluation"
+    spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
 
 
-def load_policy(settings: RolloutSettings) -> Policy:
-    """The policy on its device; kept, so that the cells of a sweep share it."""
-    device, _ = set_up(settings.runtime)
-    results, policy, method = settings.results, settings.policy, settings.parts()
-    folder = find_target(results, policy.target)
-    return _load(
-        folder,
-        drafter_folder(results, policy.drafter, folder) if needs_drafter(method) else None,
-        early_folder(results, policy.early, folder) if needs_early(method) else None,
-        needs_calibration(method),
-        (settings.datastore.backend, settings.datastore.url) if needs_datastore(method) else None,
-        device,
-        settings.runtime.dtype,
-    )
+def _check_expert(settings: RolloutSettings) -> None:
+    if settings.deviation_every > 0:
+        raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
+    if settings.chunk:
+        raise UsageError(f"policy=expert with chunk={settings.chunk}: the expert decodes nothing, leave it out")
+    for kind, part in settings.parts().items():
+        if part != getattr(RolloutSettings(), kind):
+            raise UsageError(f"policy=expert with {kind}={part.kind}: the expert decodes nothing, leave it out")
+
+
+class Sampled:
+    """A decoder that, every so many decodes, also asks AR about the same observation, outside the timing."""
+
+    def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
+        self.decoder, self.reference, self.every, self.count = decoder, reference, every, 0
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """As the decoder's."""
+        return self.decoder.cameras
+
+    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
+        """A new episode begins."""
+        self.count = 0
+        self.decoder.reset(task, instruction, seed)
+        self.reference.reset(task, instruction, seed)
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The decoder's record; every `every`-th with its deviation from AR, in normalised action units."""
+        record = self.decoder.decode(observation)
+        self.count += 1
+        if self.count % self.every:
+            return record
+        space = self.decoder.target.actions
+        wanted = self.reference.decode(observation).actions[: len(record.actions)]
+        gap = np.abs(space.normalise(record.actions) - space.normalise(wanted))
+        return dataclasses.replace(record, deviation=float(gap.mean()))
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """An action was executed; AR needs no history."""
+        self.decoder.observe(action, end_effector)
+
+    def finish(self, success: bool) -> None:
+        """The episode ended."""
+        self.decoder.finish(success)
+
+
+def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
+    """What acts in the episodes of one setting on one task, warmed up."""
+    spec = spec_of(task)
+    if is_expert(settings):
+        decoder: ActionDecoder = ExpertDecoder()
+    else:
+        artifacts = artifacts_of(settings)
+        decoder = compose(settings.parts(), artifacts.target, artifacts.load, task, settings.chunk)
+        if settings.deviation_every > 0:
+            reference = Decoder(artifacts.target, chunk=settings.chunk)
+            decoder = Sampled(decoder, reference, settings.deviation_every)
+    warm_up(decoder, task, spec, settings.world.camera.size)
+    return decoder
+
+
+def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: int) -> None:
+    """First calls allocate, choose kernels and fault pages in: they are no part of any inference time. The hand moves,
+    so that parts which wait for a history or a path take their turn."""
+    images = {name: np.zeros((pixels, pixels, 3), dtype=np.uint8) for name in decoder.cameras}
+    space = spec.observation
+    still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+    decoder.reset(task, "", 0)
+    for i in range(WARM_UP_DECODES):
+        for action in decoder.decode(still).actions:
+            decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

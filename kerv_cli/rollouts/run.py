@@ -1,9 +1,9 @@
-"""Episodes of one method on one task, seed by seed, in this process's one world."""
+"""Episodes of one setting on one task, in the worlds of this process."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -13,62 +13,74 @@ from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
-from kerv_cli.rollouts.assemble import episode_decoder, warm_up
-from kerv_cli.rollouts.episode import ActionDecoder, Recording, run_episode
-from kerv_cli.rollouts.expert import ExpertDecoder
-from kerv_cli.rollouts.policy import is_expert, load_policy
-from kerv_cli.settings import CameraSettings, MethodSettings, RolloutSettings, WorldSettings
+from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.policy import decoder_for
+from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
 from kerv_cli.targets.protocol import Target
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:
+    """The view that these settings describe."""
     return CameraConfig(**dataclasses.asdict(settings))
 
 
-@functools.lru_cache(maxsize=1)
-def _world(task: str, camera: CameraConfig, horizon: int) -> World:
-    return spec_of(task).open_world(task, camera, horizon)
-
-
-_opened: list[World] = []
+_WORLDS = 4  # kept open per process: fifty would take 1.2 GB
+_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the one used last at the end
 
 
 def open_world(task: str, settings: WorldSettings) -> World:
-    """This process's world for `task`; only one is kept, fifty would take 1.2 GB."""
-    world = _world(task, camera_config(settings.camera), settings.horizon)
-    for other in [w for w in _opened if w is not world]:
-        other.close()
-        _opened.remove(other)
-    if world not in _opened:
-        _opened.append(world)
-    return world
+    """This process's world for a task, camera and horizon; all settings that agree in them share it."""
+    key = task, camera_config(settings.camera), settings.horizon
+    if key not in _opened:
+        _opened[key] = spec_of(task).open_world(*key)
+    _opened.move_to_end(key)
+    while len(_opened) > _WORLDS:
+        _opened.popitem(last=False)[1].close()
+    return _opened[key]
 
 
 def close_worlds() -> None:
-    _world.cache_clear()
+    """Closes every open world."""
     while _opened:
-        _opened.pop().close()
+        _opened.popitem()[1].close()
+
+
+class Runner:
+    """One setting on one task, ready: its decoder is built and warmed up. Episodes may alternate with those of other
+    runners; what a decoder learns from an episode stays its own.
+
+    Raises:
+        UsageError, CheckpointError: the setting cannot run; see `policy.check`.
+    """
+
+    def __init__(self, settings: RolloutSettings, task: str) -> None:
+        self.settings, self.task = settings, task
+        self.decoder = decoder_for(settings, task)
+        self._recording = Recording(
+            dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
+        )
+
+    def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
+        """The episode of a seed; with its frames where it is recorded."""
+        world = open_world(self.task, self.settings.world)  # another runner may have closed it since
+        return run_episode(world, self.decoder, seed, self._recording if recorded else None)
 
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
-    """One method on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
-    world = open_world(task, settings.world)
-    decoder: ActionDecoder = ExpertDecoder()
-    if not is_expert(settings):
-        decoded = episode_decoder(load_policy(settings), settings, task)
-        warm_up(decoded, task, settings.world.camera.size)
-        decoder = decoded
-    logged = dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
-    for number, seed in enumerate(seeds):
-        recorded = settings.record < 0 or number < settings.record
-        yield run_episode(world, decoder, seed, Recording(logged if recorded else None))
+    """One setting on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
+    runner = Runner(settings, task)
+    for seed in seeds:
+        yield runner.episode(seed, is_recorded(settings, seed))
+
+
+def is_recorded(settings: RolloutSettings, seed: int) -> bool:
+    """Whether the episode of a seed keeps its frames."""
+    return settings.record < 0 or seed - settings.seed < settings.record
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share of successful AR episodes over tasks and seeds."""
-    decoder, outcomes = Decoder(target, MethodSettings()), []
-    for task in tasks:
-        world = open_world(task, settings)
-        outcomes += [run_episode(world, decoder, seed).success for seed in seeds]
+    decoder = Decoder(target)
+    outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
     close_worlds()
     return float(np.mean(outcomes))

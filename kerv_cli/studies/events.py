@@ -1,11 +1,11 @@
-"""What happens while cells run, as values: the executor emits them, a progress display reads them."""
+"""What happens while cells run, as values: a sweep emits them, a progress display reads them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from kerv_cli.studies.plan import Cell
+from kerv_cli.studies.plan import Block, Cell
 
 
 @dataclass(frozen=True)
@@ -28,26 +28,41 @@ class Outcome:
 
 @dataclass(frozen=True)
 class SweepStarted:
-    total: int  # cells to run
+    """total: cells to run. workers: blocks that run at the same time."""
+
+    total: int
     reused: int
     workers: int
 
 
 @dataclass(frozen=True)
-class CellStarted:
-    cell: Cell
+class BlockStarted:
+    """A block was handed to the executor."""
+
+    block: Block
+
+
+@dataclass(frozen=True)
+class BlockWaits:
+    """Another sweep computes cells of the block; it is looked at again later."""
+
+    block: Block
 
 
 @dataclass(frozen=True)
 class CellDone:
+    """seconds: wall time of its episodes, with what it took to prepare them."""
+
     cell: Cell
     episodes: int
     successes: int
-    seconds: float  # wall time of the cell
+    seconds: float
 
 
 @dataclass(frozen=True)
 class CellFailed:
+    """A cell did not complete; the rest of its block goes on."""
+
     cell: Cell
     reason: str
 
@@ -61,8 +76,10 @@ class CellReused:
 
 @dataclass(frozen=True)
 class SweepFinished:
+    """The last event."""
+
     outcome: Outcome
 
 
-Event = SweepStarted | CellStarted | CellDone | CellFailed | CellReused | SweepFinished
+Event = SweepStarted | BlockStarted | BlockWaits | CellDone | CellFailed | CellReused | SweepFinished
 OnEvent = Callable[[Event], None]

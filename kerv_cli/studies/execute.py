@@ -1,262 +1,192 @@
-"""Run cells here or over local processes: resume, isolate failures, tell what happens.
+"""Run a study's blocks through an executor: resume, isolate failures, share the work, tell what happens.
 
-The process that runs a cell also writes it, so whatever dies loses at most the cells that were running.
+The process that runs a block also writes its cells, so whatever dies loses at most what was running.
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-import re
 import secrets
-import signal
-import threading
 import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
-from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.errors import CheckpointError, KervError, StorageError
-from kerv_cli.provenance import git_commit, stamp
+from kerv_cli.errors import CheckpointError, StorageError
+from kerv_cli.provenance import git_commit
+from kerv_cli.settings import RuntimeSettings
+from kerv_cli.studies.block import BlockRun, CellResult, Gauge, Prepare, failed
+from kerv_cli.studies.claims import is_claimed, release, running_cell
 from kerv_cli.studies.events import (
+    BlockStarted,
+    BlockWaits,
     CellDone,
     CellFailed,
     CellReused,
-    CellStarted,
     Failure,
     OnEvent,
     Outcome,
     SweepFinished,
     SweepStarted,
 )
-from kerv_cli.studies.plan import Cell, unique_cells
+from kerv_cli.studies.executors import Executor, WorkerLost, check_executor, open_executor
+from kerv_cli.studies.plan import Block, Cell, blocks_of
 from kerv_cli.studies.store import StudyStore
 
-RunCell = Callable[[Cell], list[EpisodeRecord]]
-"""Runs a cell's episodes, one per seed, in order. Picklable; keeps what it loaded between calls in its module."""
-
-# Libraries read these when they load, before run_cell can set torch's own number.
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-_WATCH_SECONDS = 1.0
-
-
-@dataclass(frozen=True)
-class _Result:
-    """How a cell ended; plain values, because an exception may not survive pickling."""
-
-    episodes: int = 0
-    successes: int = 0
-    seconds: float = 0.0
-    reason: str = ""  # empty: complete
-    reused: bool = False  # another sweep completed it meanwhile
-    trace: str = ""
-    storage: bool = False  # the disk refused: no other cell could be written either
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What a worker does with a cell; picklable."""
-
-    run_cell: RunCell
-    store: StudyStore
-    status: dict[str, Any] = field(default_factory=dict)  # run id, workers, git commit
-
-    def __call__(self, cell: Cell) -> _Result:
-        started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
-        try:
-            if self.store.has_cell(cell.id):
-                return _Result(reused=True)
-            records = self.run_cell(cell)
-            seconds = time.perf_counter() - clock
-            status = {**stamp(cell.settings["runtime"]["device"]), **self.status, "pid": os.getpid()}
-            self.store.write_cell(cell, records, {**status, "seconds": seconds}, started)
-        except Exception as error:  # noqa: BLE001 - one cell's failure of any kind must not end the others
-            storage = isinstance(error, StorageError)
-            return _Result(reason=one_line(error), trace=traceback.format_exc(), storage=storage)
-        return _Result(len(records), sum(r.success for r in records), seconds)
+_POLL_SECONDS = 1.0  # between two looks at what another sweep computes
 
 
 def execute(
     cells: Sequence[Cell],
-    run_cell: RunCell,
+    prepare: Prepare,
     store: StudyStore,
-    workers: int = 1,
+    runtime: RuntimeSettings | None = None,
     on_event: OnEvent = lambda event: None,
+    gauge: Gauge | None = None,
 ) -> Outcome:
-    """Runs the cells that are not complete yet; cells of one id run once.
+    """Runs the cells that are not complete yet, block by block; cells of one id run once.
 
-    A cell that raises, or whose worker is killed, is reported as failed and the others go on. With one worker
-    everything happens in this process. On KeyboardInterrupt the workers are stopped; completed cells stay.
+    A cell that raises, or whose worker is killed, is reported as failed and the rest of its block goes on. Cells that
+    another sweep computes at the moment are waited for. With one local worker everything happens in this process. On
+    KeyboardInterrupt the workers are stopped; completed cells stay.
 
     Raises:
         StorageError: the disk refused a result; going on would compute what cannot be kept.
-        ValueError: fewer than one worker.
+        UsageError: the executor cannot be used.
     """
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, not {workers}")
+    runtime = runtime or RuntimeSettings()
+    check_executor(runtime)
     clock = time.perf_counter()
-    outcome = Outcome()
+    sweep = _Sweep(prepare, store, runtime, on_event, gauge)
     store.clean_stale()
-    todo, damaged = _split(cells, store, outcome)
-    on_event(SweepStarted(len(todo) + len(damaged), len(outcome.reused), workers))
-    for failure in damaged:
-        _note(failure.cell, _Result(reason=failure.reason, trace=failure.reason), store, outcome, on_event)
-    run = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
-    job = _Job(run_cell, store, {"run": run, "workers": workers, "git_commit": git_commit()})
-    results = _here(todo, job, on_event) if workers == 1 else _over_processes(todo, job, workers, on_event)
-    with contextlib.closing(results):  # stops the workers, whatever is raised below
-        for cell, result in results:
-            _note(cell, result, store, outcome, on_event)
-    finished = Outcome(outcome.done, outcome.reused, outcome.failed, time.perf_counter() - clock)
-    on_event(SweepFinished(finished))
-    return finished
-
-
-def _split(cells: Sequence[Cell], store: StudyStore, outcome: Outcome) -> tuple[list[Cell], list[Failure]]:
-    """Cells to run and cells that are damaged; complete ones are added to the outcome."""
-    todo: list[Cell] = []
-    damaged: list[Failure] = []
-    for cell in unique_cells(cells):
-        try:
-            (outcome.reused if store.has_cell(cell.id) else todo).append(cell)
-        except CheckpointError as error:
-            damaged.append(Failure(cell, str(error)))
-    return todo, damaged
-
-
-def _note(cell: Cell, result: _Result, store: StudyStore, outcome: Outcome, on_event: OnEvent) -> None:
-    if result.storage:
-        raise StorageError(result.reason)
-    if result.reason:
-        store.write_failure(cell.id, f"{cell.label} on {cell.task}\n\n{result.trace}")
-        outcome.failed.append(Failure(cell, result.reason))
-        on_event(CellFailed(cell, result.reason))
-    elif result.reused:
-        outcome.reused.append(cell)
-        on_event(CellReused(cell))
-    else:
-        store.clear_failure(cell.id)
-        outcome.done.append(cell)
-        on_event(CellDone(cell, result.episodes, result.successes, result.seconds))
-
-
-def _here(cells: Sequence[Cell], job: _Job, on_event: OnEvent) -> Generator[tuple[Cell, _Result], None, None]:
-    for cell in cells:
-        on_event(CellStarted(cell))
-        yield cell, job(cell)
-
-
-def _over_processes(
-    cells: Sequence[Cell], job: _Job, workers: int, on_event: OnEvent
-) -> Generator[tuple[Cell, _Result], None, None]:
-    """Loky pools of one persistent worker each: when one dies, only its own cell is lost, and it is known which."""
-    waiting = deque(cells)
+    blocks, damaged = sweep.split(cells)
     threads = max((cell.settings["runtime"]["threads"] for cell in cells), default=1)
-    free = [_pool(threads) for _ in range(min(workers, len(cells)))]
-    running: dict[Future[_Result], tuple[Any, Cell]] = {}
-    finished = False
-    try:
-        while waiting or running:
-            while waiting and free:
-                pool, cell = free.pop(), waiting.popleft()
-                on_event(CellStarted(cell))
-                running[pool.submit(job, cell)] = (pool, cell)
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                pool, cell = running.pop(future)
-                result, alive = _result(future)
-                if not alive:
-                    pool.shutdown(wait=False, kill_workers=True)
-                    pool = _pool(threads)
-                free.append(pool)
-                yield cell, result
-        finished = True
-    finally:
-        for pool in [*free, *(pool for pool, _ in running.values())]:
-            pool.shutdown(wait=True, kill_workers=not finished)
+    executor = open_executor(runtime, threads, store.jobs) if blocks else None
+    total = sum(len(block.cells) for block in blocks) + len(damaged)
+    on_event(SweepStarted(total, len(sweep.outcome.reused), runtime.workers))
+    for cell, result in damaged:
+        sweep.note(cell, result)
+    if executor is not None:
+        sweep.run(blocks, executor)
+    found = sweep.outcome
+    outcome = Outcome(found.done, found.reused, found.failed, time.perf_counter() - clock)
+    on_event(SweepFinished(outcome))
+    return outcome
 
 
-def _result(future: Future[_Result]) -> tuple[_Result, bool]:
-    """A worker's result and whether the worker still lives."""
-    from joblib.externals.loky.process_executor import BrokenProcessPool
+class _Sweep:
+    """What one call of `execute` knows while it runs."""
 
-    try:
-        return future.result(), True
-    except BrokenProcessPool as error:
-        signals = re.findall(r"SIG[A-Z]+", str(error))
-        how = f"killed by {signals[0]}" if signals else "lost"
-        return _Result(reason=f"its worker process was {how}", trace=str(error)), False
-    except Exception as error:  # noqa: BLE001 - the cell could not be sent or its result not be read
-        return _Result(reason=one_line(error), trace=traceback.format_exc()), True
+    def __init__(
+        self, prepare: Prepare, store: StudyStore, runtime: RuntimeSettings, on_event: OnEvent, gauge: Gauge | None
+    ) -> None:
+        self.prepare, self.store, self.on_event, self.gauge = prepare, store, on_event, gauge
+        self.outcome = Outcome()
+        self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+        self.status = {"workers": runtime.workers, "executor": runtime.executor, "git_commit": git_commit()}
+        self.waiting: deque[Block] = deque()
+        self.elsewhere: list[Block] = []  # another sweep computes them
+        self.running: dict[Future[Any], BlockRun] = {}
 
+    def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
+        """Blocks of what is to be run, and the cells that are damaged; complete ones are added to the outcome."""
+        damaged: dict[str, tuple[Cell, CellResult]] = {}
+        for cell in (cell for block in blocks_of(cells) for cell in block.cells):
+            try:
+                if self.store.has_cell(cell.id):
+                    self.outcome.reused.append(cell)
+            except CheckpointError as error:
+                damaged[cell.id] = cell, failed(error)
+        settled = {*damaged, *(cell.id for cell in self.outcome.reused)}
+        left = [block.without(settled) for block in blocks_of(cells)]
+        return [block for block in left if block is not None], list(damaged.values())
 
-def _pool(threads: int) -> Any:
-    """A pool of one worker, started when it gets its first cell."""
-    from joblib.externals.loky import ProcessPoolExecutor
+    def run(self, blocks: Sequence[Block], executor: Executor) -> None:
+        """Keeps every slot busy until all blocks are settled."""
+        self.waiting.extend(blocks)
+        finished = False
+        try:
+            while self.waiting or self.running or self.elsewhere:
+                while self.waiting and len(self.running) < executor.slots:
+                    self._start(self.waiting.popleft(), executor)
+                for future in wait(self.running, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done:
+                    self._settle(self.running.pop(future), future)
+                self._look_elsewhere()
+            finished = True
+        finally:
+            executor.close(abandon=not finished)
+            for attempt in self.running.values():
+                release(self.store.claims, attempt.block.cells, attempt.name)
 
-    return ProcessPoolExecutor(
-        max_workers=1,
-        initializer=_begin_worker,
-        initargs=(os.getpid(),),
-        env=dict.fromkeys(_THREAD_VARIABLES, str(threads)),
-    )
+    def _start(self, block: Block, executor: Executor) -> None:
+        name = f"{self.run_id}-{secrets.token_hex(4)}"
+        attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
+        self.on_event(BlockStarted(block))
+        self.running[executor.submit(attempt)] = attempt
 
+    def _settle(self, attempt: BlockRun, future: Future[dict[str, CellResult] | None]) -> None:
+        block = attempt.block
+        try:
+            results = future.result()
+        except WorkerLost as error:
+            self._lost(attempt, failed(error))
+            return
+        except Exception as error:  # noqa: BLE001 - the block could not be sent or its result not be read
+            self._note_all(block, dict.fromkeys((cell.id for cell in block.cells), failed(error)))
+            return
+        if results is None:
+            self.elsewhere.append(block)
+            self.on_event(BlockWaits(block))
+        else:
+            self._note_all(block, results)
 
-def _begin_worker(parent: int) -> None:
-    """Ctrl-C is the parent's business; and a worker whose parent was killed ends instead of running on unseen."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    def _note_all(self, block: Block, results: Mapping[str, CellResult]) -> None:
+        for cell in block.cells:
+            if cell.id in results:
+                self.note(cell, results[cell.id])
 
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_WATCH_SECONDS)
-        os._exit(1)
+    def _lost(self, attempt: BlockRun, result: CellResult) -> None:
+        """The cell that ran when the worker ended has failed; what it had completed is done, the rest runs again."""
+        cells = attempt.block.cells
+        guilty = running_cell(self.store.claims, cells, attempt.name)
+        release(self.store.claims, cells, attempt.name)
+        results = {} if guilty is None else {guilty.id: result}
+        for cell in cells:
+            if guilty is None:  # nothing says that another attempt would come further
+                results[cell.id] = result
+            elif self.store.has_cell(cell.id):
+                stored = self.store.read_cell(cell.id)
+                sums = stored.status["episodes"], stored.status["successes"], stored.status["seconds"]
+                results[cell.id] = CellResult(*sums, reused=stored.status["run"] != self.run_id)
+        self._note_all(attempt.block, results)
+        rest = attempt.block.without(results)
+        if rest is not None:
+            self.waiting.append(rest)
 
-    threading.Thread(target=watch, daemon=True).start()
+    def _look_elsewhere(self) -> None:
+        """When nothing else is left, takes up the blocks that no other sweep computes any more."""
+        if self.waiting or self.running or not self.elsewhere:
+            return
+        claimed = [any(is_claimed(self.store.claims, cell) for cell in block.cells) for block in self.elsewhere]
+        if all(claimed):
+            time.sleep(_POLL_SECONDS)
+            return
+        self.waiting.extend(block for block, theirs in zip(self.elsewhere, claimed, strict=True) if not theirs)
+        self.elsewhere = [block for block, theirs in zip(self.elsewhere, claimed, strict=True) if theirs]
 
-
-def one_line(error: BaseException) -> str:
-    """An error for a summary: kerv's own message, or type, message and place of a foreign one."""
-    text = " ".join(str(error).split())
-    if isinstance(error, KervError):
-        return text
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {text[:200]}{place}"
-
-
-@dataclass(frozen=True)
-class TimeEstimate:
-    """How long a plan will take."""
-
-    seconds: float
-    to_run: int  # cells
-    reused: int
-    measured: bool  # False: a guess from `prior_seconds`
-    source: str  # for people
-
-
-def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:
-    """Time for the cells that are not complete, from the mean wall seconds per episode of the study's stored cells.
-
-    A label with stored cells uses its own mean, others the mean over all; `prior_seconds` per episode is the guess
-    where nothing is stored. Workers are taken to scale perfectly.
-
-    Raises:
-        CheckpointError: a stored cell is damaged.
-    """
-    todo = [cell for cell in unique_cells(cells) if not store.has_cell(cell.id)]
-    reused = len(unique_cells(cells)) - len(todo)
-    known: dict[str, list[float]] = {}
-    for folder in sorted(store.cells.glob("[0-9a-f]*")):
-        stored = store.read_cell(folder.name)
-        known.setdefault(stored.config["label"], []).extend(stored.episodes["wall_seconds"])
-    every = [seconds for times in known.values() for seconds in times]
-    prior = sum(every) / len(every) if every else prior_seconds
-    means = {label: sum(times) / len(times) for label, times in known.items()}
-    total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
-    source = f"measured on {len(every)} stored episodes" if every else f"a guess of {prior_seconds:g} s per episode"
-    return TimeEstimate(total / max(1, min(workers, len(todo))), len(todo), reused, bool(every), source)
+    def note(self, cell: Cell, result: CellResult) -> None:
+        """Adds a cell's end to the outcome and tells it."""
+        if result.storage:
+            raise StorageError(result.reason)
+        if result.reason:
+            self.store.write_failure(cell.id, f"{cell.label} on {cell.task}\n\n{result.trace}")
+            self.outcome.failed.append(Failure(cell, result.reason))
+            self.on_event(CellFailed(cell, result.reason))
+        elif result.reused:
+            self.outcome.reused.append(cell)
+            self.on_event(CellReused(cell))
+        else:
+            self.store.clear_failure(cell.id)
+            self.outcome.done.append(cell)
+            self.on_event(CellDone(cell, result.episodes, result.successes, result.seconds))

@@ -33,7 +33,10 @@ def plan_text(plan: StudyPlan) -> str:
         settings = {key: value for key, value in cell.settings.items() if key != "task"}
         labels.setdefault(cell.label, {"overrides": cell.overrides, "identity": cell.identity, "settings": settings})
     head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "labels": labels}
-    cells = [{"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds)} for c in plan.cells]
+    cells = [
+        {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}
+        for c in plan.cells
+    ]
     lines = yaml.safe_dump({"cells": cells}, sort_keys=False, default_flow_style=None, width=1000)
     return yaml.safe_dump(head, sort_keys=False) + lines
 
@@ -57,6 +60,7 @@ def plan_from_text(text: str) -> StudyPlan:
                 seeds=parse_seeds(entry["seeds"]),
                 settings={**label["settings"], "task": [entry["task"]]},
                 identity=label["identity"],
+                repeat=entry["repeat"],
             )
         )
     return StudyPlan(loaded["study"], loaded["title"], loaded["baseline"], loaded["axis"], tuple(cells))
@@ -66,16 +70,21 @@ def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
     """`new`, preceded by the cells of `old` that have its settings and seeds but a task that it does not name."""
     if (old.name, old.baseline) != (new.name, new.baseline):
         return new
-    settings = {cell.label: cell for cell in reversed(new.cells)}
     tasks = {cell.task for cell in new.cells}
+    first = new.cells[0].task if new.cells else ""
+    wanted = {_key(cell): cell for cell in new.cells if cell.task == first}
     kept = tuple(
         cell
         for cell in old.cells
-        if cell.task not in tasks and cell.label in settings and cell.id == _moved(settings[cell.label], cell.task)
+        if cell.task not in tasks and _key(cell) in wanted and cell.id == _moved(wanted[_key(cell)], cell.task)
     )
     return StudyPlan(new.name, new.title, new.baseline, new.axis, kept + new.cells)
 
 
+def _key(cell: Cell) -> tuple[str, tuple[int, ...], int]:
+    return cell.label, cell.seeds, cell.repeat
+
+
 def _moved(cell: Cell, task: str) -> str:
     """The id that a cell would have on another task."""
-    return make_cell(cell.label, cell.overrides, cell.settings, cell.identity, task).id
+    return make_cell(cell.label, cell.overrides, cell.settings, cell.identity, task, cell.seeds, cell.repeat).id

@@ -16,8 +16,17 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from kerv_cli.studies.events import CellDone, CellFailed, CellReused, CellStarted, Event, SweepFinished, SweepStarted
-from kerv_cli.studies.plan import Cell
+from kerv_cli.studies.events import (
+    BlockStarted,
+    BlockWaits,
+    CellDone,
+    CellFailed,
+    CellReused,
+    Event,
+    SweepFinished,
+    SweepStarted,
+)
+from kerv_cli.studies.plan import Block, Cell
 
 
 class ProgressDisplay:
@@ -28,7 +37,7 @@ class ProgressDisplay:
         self._bar: Progress | None = None
         self._task = TaskID(0)
         self._total = self._finished = 0
-        self._running: dict[str, Cell] = {}
+        self._running: dict[str, Block] = {}  # by name, with what is left of them
 
     def __enter__(self) -> ProgressDisplay:
         return self
@@ -42,8 +51,11 @@ class ProgressDisplay:
     def __call__(self, event: Event) -> None:
         if isinstance(event, SweepStarted):
             self._start(event)
-        elif isinstance(event, CellStarted):
-            self._running[event.cell.id] = event.cell
+        elif isinstance(event, BlockStarted):
+            self._running[event.block.name] = event.block
+        elif isinstance(event, BlockWaits):
+            self._running.pop(event.block.name, None)
+            self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
         elif isinstance(event, CellDone):
             rate = event.seconds / max(1, event.episodes)
             result = f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode"
@@ -76,7 +88,12 @@ class ProgressDisplay:
         self._bar.start()
 
     def _finish(self, cell: Cell, line: str) -> None:
-        self._running.pop(cell.id, None)
+        for name, block in list(self._running.items()):
+            left = block.without({cell.id})
+            if left is None:
+                del self._running[name]
+            else:
+                self._running[name] = left
         self._finished += 1
         width = len(str(self._total))
         self.console.print(f"[dim]{self._finished:{width}}/{self._total}[/dim] {line}", soft_wrap=True, highlight=False)
@@ -84,7 +101,7 @@ class ProgressDisplay:
     def _refresh(self) -> None:
         if self._bar is None:
             return
-        names = [f"{cell.label} on {cell.task}" for cell in self._running.values()]
+        names = [f"{name}: {len(block.cells)} settings in turn" for name, block in self._running.items()]
         more = f" +{len(names) - 1}" if len(names) > 1 else ""
         now = escape(names[0] + more if names else "cells")
         self._bar.update(self._task, completed=self._finished, description=now)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from kerv_cli.config import compose, expand, swept_keys
+from kerv_cli.environments import resolve_tasks, settled, spec_of
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
 
@@ -37,6 +38,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     if sweep.study.baseline not in written:
         raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(written)}")
     settings = {label: compose("rollout", [*common, *words], RolloutSettings) for label, words in written.items()}
+    for setting in settings.values():
+        setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
     return ResolvedStudy(sweep.study, settings, {label: " ".join(words) for label, words in written.items()})
 
 

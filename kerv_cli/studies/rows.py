@@ -1,9 +1,12 @@
-"""Records of episodes and decodes as rows of parquet tables, and back."""
+"""Records of episodes and decodes as rows of parquet tables."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -38,9 +41,13 @@ EPISODE_SCHEMA = pa.schema(
         ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
         ("deviation_count", pa.int64()),
         ("wall_seconds", pa.float64()),
-        ("rand_vec", pa.list_(pa.float64())),
+        ("initial_state", pa.list_(pa.float64())),
+        ("repeat", pa.int64()),
+        ("block", pa.string()),  # which run of which block; empty where it is not known
+        ("order", pa.int64()),  # episodes that the block ran before it
+        ("started", pa.string()),  # ISO 8601
+        ("gauge_seconds", pa.float64()),  # of the reference decode just before the episode: the machine's load
         ("worker_pid", pa.int64()),
-        ("started", pa.string()),  # ISO 8601, when the cell began
     ]
 )
 
@@ -80,7 +87,17 @@ DECODE_SCHEMA = pa.schema(
 )
 
 
-def episode_row(record: EpisodeRecord, worker_pid: int, started: str) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Circumstances:
+    """When an episode ran, beside what, and how loaded the machine was; the columns of episodes.parquet say more."""
+
+    block: str = ""
+    order: int = 0
+    started: str = ""
+    gauge_seconds: float = math.nan
+
+
+def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> dict[str, Any]:
     """One row of episodes.parquet.
 
     Raises:
@@ -115,9 +132,10 @@ def episode_row(record: EpisodeRecord, worker_pid: int, started: str) -> dict[st
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),
         "wall_seconds": record.wall_seconds,
-        "rand_vec": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
-        "worker_pid": worker_pid,
-        "started": started,
+        "initial_state": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
+        "repeat": repeat,
+        **asdict(at),
+        "worker_pid": os.getpid(),
     }
 
 
@@ -161,29 +179,6 @@ def _round_row(r: Round) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in row.items()}
 
 
-def decode_record(row: Mapping[str, Any]) -> DecodeRecord:
-    """A row of decodes.parquet (as `to_pylist` gives it) as the record it was made from."""
-    prefix = "seconds."
-    phases = {key.removeprefix(prefix): value for key, value in row.items() if key.startswith(prefix)}
-    return DecodeRecord(
-        tokens=tuple(row["tokens"]),
-        actions=np.asarray(row["actions"], dtype=np.float32),
-        forwards=row["forwards"],
-        rounds=tuple(_round(r) for r in row["rounds"]),
-        mode=row["mode"],
-        seconds=row["seconds"],
-        phases={phase: seconds for phase, seconds in phases.items() if seconds is not None},
-        compensated=row["compensated"],
-        skipped=row["skipped"],
-        **{name: row[name] for name in _MEASURES},
-    )
-
-
-def _round(row: Mapping[str, Any]) -> Round:
-    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in row.items()}
-    return Round(**values)
-
-
 def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
     """Rows as the bytes of a parquet file. Written to memory first: the disk is the store's business.
 
@@ -196,7 +191,3 @@ def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer, compression="zstd")
     return buffer.getvalue()
-
-
-def episode_rows(records: Iterable[EpisodeRecord], worker_pid: int, started: str) -> list[dict[str, Any]]:
-    return [episode_row(record, worker_pid, started) for record in records]

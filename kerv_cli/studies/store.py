@@ -4,6 +4,7 @@ results/studies/<name>/
     plan.yaml                     what was asked for
     cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
     failures/<id>.txt             traceback of the last attempt, until one succeeds
+    claims/<id>.json              who computes a cell now; see claims.py
     rollouts/*.rrd
 """
 
@@ -29,13 +30,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
+from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, sync
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies import rows
+from kerv_cli.studies.claims import is_alive, write_lock
 from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+from kerv_cli.studies.rows import Circumstances
 
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
@@ -51,7 +54,7 @@ class StoredCell:
     folder: Path
     config: dict[str, Any]  # study, label, overrides, task, seeds, identity, settings
     status: dict[str, Any]  # provenance, run, seconds, sums
-    episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA
+    episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA, and decode_seconds: per episode (decodes,) seconds
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,8 @@ class StudyStore:
         self.rollouts = self.root / "rollouts"
         self.plan_path = self.root / "plan.yaml"
         self.failures = self.root / "failures"
+        self.claims = self.root / "claims"
+        self.jobs = self.root / "jobs"  # an executor's own files
 
     def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
         """Stores the plan; cells of an earlier plan stay where this one would hold them had it named their task.
@@ -91,7 +96,7 @@ class StudyStore:
             StorageError: the disk refused.
         """
         new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells))
-        with _write_lock(self.plan_path):
+        with write_lock(self.plan_path):
             with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
                 new = merge_plans(self.read_plan(), new)
             with atomic_path(self.plan_path) as temporary:
@@ -144,7 +149,11 @@ class StudyStore:
         return CheckpointError(f"cell {folder} is damaged ({why}): delete that folder and {self.how_to_run()} again")
 
     def write_cell(
-        self, cell: Cell, records: Sequence[EpisodeRecord], status: Mapping[str, Any], started: str = ""
+        self,
+        cell: Cell,
+        records: Sequence[EpisodeRecord],
+        status: Mapping[str, Any],
+        circumstances: Sequence[Circumstances] = (),
     ) -> bool:
         """Writes a complete cell under a temporary name, syncs it and renames it.
 
@@ -152,7 +161,7 @@ class StudyStore:
             cell: what ran.
             records: its episodes, in the order of `cell.seeds`.
             status: provenance, run and seconds, JSON values.
-            started: ISO time of the cell's beginning.
+            circumstances: of each record; unknown without.
 
         Returns:
             False where another process had completed the cell before: its result stays, this one is discarded.
@@ -165,7 +174,7 @@ class StudyStore:
             raise ValueError(f"records of other episodes than cell {cell.id} asks for ({cell.task}, {cell.seeds})")
         folder = self.cells / cell.id
         temporary = self.cells / f".{cell.id}.{socket.gethostname()}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
-        files = self._cell_files(cell, records, status, started)
+        files = self._cell_files(cell, records, status, circumstances or [Circumstances()] * len(records))
         try:
             with storage_errors(folder):
                 temporary.mkdir(parents=True)
@@ -177,7 +186,11 @@ class StudyStore:
             shutil.rmtree(temporary, ignore_errors=True)
 
     def _cell_files(
-        self, cell: Cell, records: Sequence[EpisodeRecord], status: Mapping[str, Any], started: str
+        self,
+        cell: Cell,
+        records: Sequence[EpisodeRecord],
+        status: Mapping[str, Any],
+        circumstances: Sequence[Circumstances],
     ) -> dict[str, bytes]:
         config = {
             "study": self.name,
@@ -186,15 +199,17 @@ class StudyStore:
             "overrides": cell.overrides,
             "task": cell.task,
             "seeds": list(cell.seeds),
+            "repeat": cell.repeat,
             "identity": cell.identity,
             "settings": cell.settings,
         }
+        episodes = [
+            rows.episode_row(record, at, cell.repeat) for record, at in zip(records, circumstances, strict=True)
+        ]
         decodes = [row for record in records for row in rows.decode_rows(record)]
         files = {
             "config.yaml": yaml.safe_dump(config, sort_keys=False).encode(),
-            "episodes.parquet": rows.parquet_bytes(
-                rows.episode_rows(records, os.getpid(), started), rows.EPISODE_SCHEMA
-            ),
+            "episodes.parquet": rows.parquet_bytes(episodes, rows.EPISODE_SCHEMA),
             "decodes.parquet": rows.parquet_bytes(decodes, rows.DECODE_SCHEMA),
         }
         full = {
@@ -202,7 +217,7 @@ class StudyStore:
             "episodes": len(records),
             "successes": sum(r.success for r in records),
             "wall_seconds": sum(r.wall_seconds for r in records),
-            "started": started,
+            "started": circumstances[0].started,
             **status,
             "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
         }
@@ -222,23 +237,12 @@ class StudyStore:
         try:
             config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
             episodes = pq.read_table(folder / "episodes.parquet", columns=rows.EPISODE_SCHEMA.names).to_pandas()
+            decodes = pq.read_table(folder / "decodes.parquet", columns=["seed", "seconds"]).to_pandas()
         except (OSError, yaml.YAMLError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
             raise self._damaged(folder, error) from error
+        seconds = {seed: group.to_numpy() for seed, group in decodes.groupby("seed")["seconds"]}
+        episodes["decode_seconds"] = [seconds[seed] for seed in episodes["seed"]]
         return StoredCell(name, folder, config, status, episodes)
-
-    def read_decodes(self, name: str) -> dict[int, list[DecodeRecord]]:
-        """Seed -> that episode's decodes, in order, as they were recorded.
-
-        Raises:
-            CheckpointError: the cell is absent or damaged.
-        """
-        if not self.has_cell(name):
-            raise CheckpointError(f"cell {self.cells / name} is missing: {self.how_to_run()}")
-        table = pq.read_table(self.cells / name / "decodes.parquet")
-        by_seed: dict[int, list[DecodeRecord]] = {}
-        for row in table.to_pylist():
-            by_seed.setdefault(row["seed"], []).append(rows.decode_record(row))
-        return by_seed
 
     def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
         """The complete ones of these cells by id, and those that are absent.
@@ -300,17 +304,7 @@ def _is_stale(folder: Path, host: str, pid: int, hours: float) -> bool:
         return False
     if host != socket.gethostname():
         return age > max(hours, _OTHER_HOSTS_STALE_HOURS)
-    return age > hours and not _alive(pid)
-
-
-def _alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    return age > hours and not is_alive(pid)
 
 
 def _write_synced(path: Path, content: bytes) -> None:
@@ -330,18 +324,6 @@ def _rename_once(temporary: Path, folder: Path) -> bool:
         raise
     sync(folder.parent)
     return True
-
-
-@contextlib.contextmanager
-def _write_lock(path: Path) -> Any:
-    """One writer at a time reads, merges and replaces `path`; readers need no lock."""
-    import fcntl
-
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.with_name(f".{path.name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
 
 
 __all__ = ["StorageError", "StoredCell", "StudyStore", "StudySummary", "list_studies"]

@@ -6,22 +6,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kerv_cli.artifacts import Artifacts
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
-from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration, save_calibration
+from kerv_cli.decoding.build import compose
+from kerv_cli.decoding.calibration_file import (
+    BoundarySection,
+    CalibratedTarget,
+    Calibration,
+    Demonstrations,
+    SkipSection,
+    Variability,
+    load_calibration,
+    save_calibration,
+)
 from kerv_cli.drafting.kinematics import MINIMUM
 from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.files import sha256_of
-from kerv_cli.places import artifact, find_target
+from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
-from kerv_cli.settings import CalibrateSettings, MethodSettings, RolloutSettings, as_plain
-from kerv_cli.spaces import CENTRES, ActionTokenizer, Observation, values_of
+from kerv_cli.settings import CalibrateSettings, RolloutSettings, as_plain
+from kerv_cli.spaces import Observation, ObservationSpace
 from kerv_cli.training.predictor_fit import (
     HISTORIES,
     Windows,
@@ -39,37 +49,23 @@ Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # episodes per task that pre-sampling spreads its decodes over, where there are so many
 
 
-def kinematic_variability(drafted: np.ndarray, target_tokens: np.ndarray) -> np.ndarray:
-    """K (METHODS §3.2): drafted tokens (..., k) and the target_tokens at the same places (..., k) -> (...,).
-
-    The sum over the compared places of the absolute difference, in normalised action units.
-
-    Raises:
-        ValueError: the shapes differ.
-    """
-    if np.shape(drafted) != np.shape(target_tokens):
-        raise ValueError(
-            f"{np.shape(drafted)} drafted tokens cannot be compared with {np.shape(target_tokens)} target_tokens"
-        )
-    return np.abs(values_of(drafted) - values_of(target_tokens)).sum(-1)
-
-
-def reference_level(levels: Sequence[float]) -> float:
-    """K_S: the median K of pre-sampled decodes, at least one bin so that it can divide.
+def reference_level(levels: Sequence[float], bin_width: float) -> float:
+    """K_S: the median K of pre-sampled decodes, at least the width of one bin so that it can divide.
 
     Raises:
         ValueError: no decode compared anything.
     """
     if not levels:
         raise ValueError("no decode compared a draft with a verdict")
-    return max(float(np.median(levels)), float(CENTRES[1] - CENTRES[0]))
+    return max(float(np.median(levels)), bin_width)
 
 
-def presample(decoder: Decoder, episode: DemoEpisode, instruction: str, decodes: int) -> list[float]:
+def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
     """K of up to `decodes` decodes, spread evenly over the observations of a demonstration.
 
     The decoder sees every executed action in between, so that methods with a history have one.
     """
+    instruction, felt = spec_of(episode.task).tasks[episode.task].instruction, len(space.proprioception)
     chosen = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
     levels, seen = [], 0
     decoder.reset(episode.task, instruction, episode.seed)
@@ -77,10 +73,9 @@ def presample(decoder: Decoder, episode: DemoEpisode, instruction: str, decodes:
         step = int(episode.frame_steps[index])
         for t in range(seen, step):
             decoder.observe(episode.executed[t], episode.end_effector[t + 1])
-        seen = step
+        seen, state = step, episode.states[step]
         images = dict.fromkeys(decoder.cameras, episode.frames[index])
-        felt = episode.states[step][: len(spec_of(episode.task).observation.proprioception)]
-        record = decoder.decode(Observation(felt, episode.states[step], instruction, images))
+        record = decoder.decode(Observation(state[:felt], state, instruction, images))
         if record.variability is not None:
             levels.append(record.variability)
     return levels
@@ -106,34 +101,33 @@ class CalibrationRun:
     """
 
     def __init__(self, settings: CalibrateSettings) -> None:
-        from kerv_cli.drafting.datastore import check_target, read_manifest
-        from kerv_cli.targets.checkpoint import read_target
-        from kerv_cli.training.datastore import datastore_beside
-
         self.settings = settings
         _check_settings(settings)
         self.tasks = resolve_tasks(settings.task)
-        folder = find_target(settings.results, settings.policy.target)
-        self.described = read_target(folder)
-        self.chunk = self.described.chunk
-        if not 0 <= settings.fit_steps <= self.chunk:
+        self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
+        self.described = self.artifacts.description
+        if not 0 <= settings.fit_steps <= self.described.chunk:
             raise UsageError(
-                f"fit_steps={settings.fit_steps}: at most the target's chunk of {self.chunk}, 0 for all of it"
+                f"fit_steps={settings.fit_steps}: at most the target's chunk of {self.described.chunk}, 0 for all of it"
             )
-        self.path = calibration_beside(folder)
+        self.path = self.artifacts.place("calibration")
         if settings.name is not None:
-            self.path = artifact(settings.results, "calibration", settings.name) / "calibration.json"
+            self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.dataset.manifest.actions.check_same(
+            self.described.actions, f"the demonstrations in {self.dataset.path}", "the target"
+        )
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
-        self.datastore = datastore_beside(folder)
+        self.datastore = self.artifacts.place("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()
         if self.stored:
-            check_target(read_manifest(self.datastore), self.described, self.datastore)
+            self.artifacts.check(["datastore"])
         self.windows: Windows | None = None
         self.paths: list[np.ndarray] = []  # of the training episodes
         self.notes: list[str] = []
 
     def plan(self) -> str:
+        """What would be done, in one line."""
         held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
         skip = f"skip levels from {self.datastore}" if self.stored else f"no skip levels: no datastore {self.datastore}"
         return (
@@ -144,13 +138,14 @@ class CalibrationRun:
 
     def load(self, progress: Progress) -> None:
         """Reads the actions and paths of the chosen episodes."""
-        s, space = self.settings, self.described.actions
-        actions = ActionTokenizer(np.asarray(space.low), np.asarray(space.high))
+        s = self.settings
         reader = PathReader(self.dataset.path, self.dataset.manifest, self.dataset.episodes)
-        self.windows = read_windows(reader, self.chosen, actions, s.history, s.window, self.chunk, progress)
+        self.windows = read_windows(
+            reader, self.chosen, self.described.actions, s.history, s.window, self.described.chunk, progress
+        )
         self.paths = [reader.paths[index] for index, held_out in self.chosen.items() if not held_out]
 
-    def boundary(self, progress: Progress) -> dict[str, Any]:
+    def boundary(self, progress: Progress) -> BoundarySection:
         """Ranges of R and D over every window of every training episode, in metres; none is left out.
 
         Raises:
@@ -164,67 +159,61 @@ class CalibrationRun:
                 progress(done, len(self.paths) * len(windows))
 
         for number, window in enumerate(windows):
-            found[str(window)] = asdict(BoundaryRanges.fit(read(number * len(self.paths)), window))
-        return {"episodes": len(self.paths), "windows": found}
+            found[str(window)] = BoundaryRanges.fit(read(number * len(self.paths)), window)
+        return BoundarySection(len(self.paths), found)
 
-    def skip(self, progress: Progress) -> dict[str, Any]:
-        """The tasks' skip levels, from the datastore beside the target; empty where there is none."""
-        from kerv_cli.drafting.datastore import Datastore
+    def skip(self, progress: Progress) -> SkipSection | None:
+        """The tasks' skip levels, from the datastore beside the target; None where there is none."""
         from kerv_cli.training.skip_levels import skip_section
 
         if not self.stored:
-            return {}
-        store = Datastore.open(self.datastore, self.described)
-        sha256 = sha256_of(self.datastore / "manifest.json")
-        return skip_section(store, sha256, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
+            return None
+        store = self.artifacts.load("datastore")
+        return skip_section(store, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
 
-    def presample(self, progress: Progress) -> dict[str, dict[str, float]]:
+    def presample(self, progress: Progress) -> dict[str, Variability]:
         """task -> K_S and how K is spread, from decodes of training observations with the settings' method."""
         if not self.settings.decodes:
             return {}
-        decoder, size = self.decoder()
+        decoder, space = self.decoder(), self.dataset.manifest.observation
+        pixels = self.described.settings.get("image_size")
         share = math.ceil(self.settings.decodes / PRESAMPLED)
-        found: dict[str, dict[str, float]] = {}
+        found: dict[str, Variability] = {}
         for number, name in enumerate(self.tasks):
             levels: list[float] = []
             for index in self._training(name):
                 episode = self.dataset.load(index)
-                if decoder.cameras and episode.frames.shape[1] != size:
+                if decoder.cameras and episode.frames.shape[1] != pixels:
                     raise CheckpointError(
-                        f"the demonstrations' frames have {episode.frames.shape[1]} pixels, not {size}"
+                        f"the demonstrations' frames have {episode.frames.shape[1]} pixels, not {pixels}"
                     )
                 budget = min(share, self.settings.decodes - len(levels))
-                levels += presample(decoder, episode, spec_of(name).task(name).instruction, budget)
+                levels += presample(decoder, episode, space, budget)
                 if len(levels) >= self.settings.decodes:
                     break
             if not levels:
-                raise KervError(f"{name}: no decode compared a draft with a verdict, so there is no K to take K_S from")
-            found[name] = spread(levels)
+                raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K for K_S")
+            found[name] = spread(levels, 2.0 / self.described.actions.tokens)
             progress(number + 1, len(self.tasks))
         return found
 
     def _training(self, name: str) -> list[int]:
         return [i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name]
 
-    def decoder(self) -> tuple[Decoder, int]:
-        """The decoder that pre-samples, and the pixels of the frames it takes."""
-        from kerv_cli.rollouts.assemble import build_decoder
-        from kerv_cli.rollouts.policy import load_policy
-
+    def decoder(self) -> Decoder:
+        """The decoder that pre-samples."""
         s = self.settings
-        policy = load_policy(
-            RolloutSettings(policy=s.policy, proposer=s.proposer, runtime=s.runtime, results=s.results)
-        )
-        method = MethodSettings("presampling", s.proposer, s.acceptance, s.threshold)
-        return build_decoder(policy, method), policy.target.settings.image_size
+        method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
+        return compose(method.parts(), self.artifacts.target, self.artifacts.load)
 
     def finish(
-        self, variability: dict[str, dict[str, float]], boundary: dict[str, Any], skip: dict[str, Any]
+        self, variability: dict[str, Variability], boundary: BoundarySection | None, skip: SkipSection | None
     ) -> Calibration:
         """Fits, measures and writes the calibration. A section that is empty now keeps what the file holds for the
         same target."""
         assert self.windows is not None
-        noise = fit_filters(self.windows, self.settings.fit_steps or self.chunk)
+        space, chunk = self.described.actions, self.described.chunk
+        noise = fit_filters(self.windows, self.settings.fit_steps or chunk, space.is_strict)
         made = {
             "command": "kerv calibrate",
             "settings": as_plain(self.settings),
@@ -232,11 +221,11 @@ class CalibrationRun:
         }
         sections, origins = self._kept({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target={"sha256": self.described.sha256, "chunk": self.chunk, "dofs": len(self.windows.past[0, 0])},
-            demos={"sha256": self.dataset.sha256, "tasks": self.windows.episodes},
+            target=CalibratedTarget(self.described.sha256, chunk, space),
+            demos=Demonstrations(self.dataset.sha256, self.windows.episodes),
             window=self.settings.window,
             noise=noise,
-            errors=prediction_errors(self.windows, noise),
+            errors=prediction_errors(self.windows, noise, space),
             **sections,
             provenance={**made, "kept": origins} if origins else made,
         )
@@ -246,7 +235,7 @@ class CalibrationRun:
     def _kept(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """The sections, empty ones as an earlier run left them, and the provenance of each that was taken over."""
         try:
-            earlier = load_calibration(self.path, self.described.sha256, self.chunk)
+            earlier = load_calibration(self.path, self.described)
         except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew
             earlier = None
         reasons = {
@@ -255,7 +244,7 @@ class CalibrationRun:
         }
         origins = {}
         for name in [name for name, section in sections.items() if not section]:
-            kept = getattr(earlier, name) if earlier else {}
+            kept = getattr(earlier, name) if earlier else None
             if earlier and kept:
                 sections[name] = kept
                 made = {key: value for key, value in earlier.provenance.items() if key != "kept"}
@@ -281,7 +270,7 @@ def _check_settings(settings: CalibrateSettings) -> None:
         raise UsageError("proposer.kind=none drafts nothing to compare: choose a proposer, or decodes=0")
 
 
-def spread(levels: Sequence[float]) -> dict[str, float]:
+def spread(levels: Sequence[float], bin_width: float) -> Variability:
     """K_S and the quartiles of pre-sampled levels of K."""
     low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
-    return {"k_s": reference_level(levels), "decodes": len(levels), "p25": low, "p75": high, "p90": top}
+    return Variability(reference_level(levels, bin_width), len(levels), low, high, top)

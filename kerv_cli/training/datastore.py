@@ -6,7 +6,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,27 +15,33 @@ from typing import Any
 import numpy as np
 import torch
 
-from kerv_cli.drafting.datastore import FILES, FORMAT, Datastore, check_seeds, prompt_key
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.drafting.datastore import (
+    PAYLOAD,
+    PROJECTION,
+    VECTORS,
+    Datastore,
+    Manifest,
+    Shard,
+    check_seeds,
+    projected,
+    prompt_key,
+)
 from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, write_json
-from kerv_cli.places import artifact, beside, find_target
+from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
-from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, TargetSettings
-from kerv_cli.targets.checkpoint import TargetDescription, load_target
+from kerv_cli.settings import BuildDatastoreSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.training.imitation import instruction_of, observed
+from kerv_cli.training.imitation import frames_and_steps, instruction_of
 
 BATCH = 128  # observations encoded at once
+KEYS = ("vision", "scene", "proprioception")  # parts of the prompt; instructions are the same within a task
 WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
-
-
-def datastore_beside(target: Path) -> Path:
-    """Shipped: pretrained/<name>/{target,datastore}; built: artifacts/target/<name> and artifacts/datastore/<name>."""
-    return beside(target, "datastore")
 
 
 @dataclass(frozen=True)
@@ -48,47 +54,31 @@ class Entries:
     left: np.ndarray  # (n,) int64
 
 
-def observed_steps(episode: DemoEpisode, settings: TargetSettings) -> np.ndarray:
-    """Control steps that become entries: with a frame for a vision policy, all of them for a state policy.
-
-    Raises:
-        CheckpointError: too few labels behind the episode's end for a whole chunk, frames of another size.
-    """
-    tail = len(episode.labels) - episode.steps
-    if settings.chunk > tail + 1:
-        raise CheckpointError(
-            f"the demonstrations have {tail} labels behind an episode's end, chunks of {settings.chunk} need "
-            f"{settings.chunk - 1}: record them again with a longer tail"
-        )
-    if settings.observation == "state":
-        return np.arange(episode.steps)
-    if episode.frames.shape[1] != settings.image_size:
-        raise CheckpointError(
-            f"the demonstrations' frames have {episode.frames.shape[1]} pixels, the policy takes {settings.image_size}:"
-            " record them again with world.camera.size"
-        )
-    return episode.frame_steps
-
-
 @torch.inference_mode()
-def entries_of(target: CompactTarget, episode: DemoEpisode, segments: list[str], stride: int = 1) -> Entries:
+def entries_of(target: CompactTarget, episode: DemoEpisode, segments: Sequence[str], stride: int = 1) -> Entries:
     """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions. A
     chunk that begins near the end takes the labels recorded beyond the success: it never reaches into another episode.
     """
-    settings = target.settings
-    steps = observed_steps(episode, settings)[::stride]
-    felt, states = (torch.from_numpy(x) for x in observed(episode, steps, target.observation))
-    frames = torch.from_numpy(episode.frames[::stride]).permute(0, 3, 1, 2) if target.cameras else None
+    frames, steps = frames_and_steps(episode, target.settings)
+    frames, steps = frames if frames is None else frames[::stride], steps[::stride]
     words = target.words_of(instruction_of(episode.task))
     keys = []
-    for rows in torch.arange(len(steps)).split(BATCH):
-        images = frames[rows].to(target.device) if frames is not None else None
-        told = words.expand(len(rows), -1)
-        inputs = Inputs(images, felt[rows].to(target.device), states[rows].to(target.device), told)
-        keys.append(prompt_key(target.encode_batch(inputs)[0], target.segments, segments))
-    chunks = np.stack([episode.labels[t : t + settings.chunk] for t in steps])
+    for rows in np.array_split(np.arange(len(steps)), -(-len(steps) // BATCH)):
+        images = None if frames is None else torch.from_numpy(frames[rows]).permute(0, 3, 1, 2).to(target.device)
+        states = torch.from_numpy(episode.states[steps[rows]]).to(target.device)
+        felt = states[:, : len(target.observation.proprioception)]
+        inputs = Inputs(images, felt, states, words.expand(len(rows), -1))
+        keys.append(prompt_key(target.encode_batch(inputs)[0], target, segments))
+    chunks = np.stack([episode.labels[t : t + target.chunk] for t in steps])
     tokens = target.actions.encode(chunks).reshape(len(steps), -1).astype(np.uint8)
     return Entries(np.concatenate(keys), tokens, steps.astype(np.int64), (episode.steps - steps).astype(np.int64))
+
+
+def directions(keys: np.ndarray, count: int) -> np.ndarray:
+    """keys (n, d) -> (d, count) float32: the orthonormal directions that hold most of their squared length."""
+    values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
+    found: np.ndarray = vectors[:, np.argsort(-values)[:count]].astype(np.float32)
+    return found
 
 
 class DatastoreBuild:
@@ -102,20 +92,23 @@ class DatastoreBuild:
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         self.settings = settings
         tasks = sorted(resolve_tasks(settings.task))
-        self.target_folder = find_target(settings.results, settings.policy.target)
-        target, _ = load_target(self.target_folder)
-        known = target.segments
-        for name in settings.key:
-            if name not in known:
-                raise UnknownName("key", name, known)
-        if not settings.key or settings.episodes < 0 or settings.stride < 1:
+        self.device, _ = set_up(settings.runtime)
+        self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
+        if not settings.key or settings.episodes < 0 or settings.stride < 1 or settings.components < 0:
             raise UsageError(
-                f"key={settings.key} episodes={settings.episodes} stride={settings.stride}: name a key, episodes from "
-                "0 on, stride from 1 on"
+                f"key={settings.key} episodes={settings.episodes} stride={settings.stride} "
+                f"components={settings.components}: name a key, episodes and components from 0 on, stride from 1 on"
             )
-        beside = datastore_beside(self.target_folder)
-        self.folder = artifact(settings.results, "datastore", settings.name) if settings.name else beside
+        for name in settings.key:
+            if name not in KEYS:
+                raise UnknownName("key", name, KEYS)
+        self.folder = self.artifacts.place("datastore")
+        if settings.name:
+            self.folder = artifact(settings.results, "datastore", settings.name)
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.dataset.manifest.actions.check_same(
+            self.artifacts.description.actions, f"the demonstrations in {self.dataset.path}", "the target"
+        )
         self.chosen = {name: self._episodes_of(name) for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
         _refuse_foreign(self.folder)
@@ -138,13 +131,12 @@ class DatastoreBuild:
         steps = sum(self.dataset.episodes[i].steps for i in episodes)
         return (
             f"{self.folder}: {len(episodes)} demonstrations of {len(self.chosen)} tasks, {steps} control steps, "
-            f"through {self.target_folder}, keys from {' + '.join(self.settings.key)}"
+            f"through {self.artifacts.folder}, keys from {' + '.join(self.settings.key)}"
         )
 
     def build(self, progress: Callable[[int, int], None] = lambda done, total: None) -> Datastore:
         """Write the datastore; it appears complete or not at all, and replaces an older one as a whole."""
-        device, dtype = set_up(self.settings.runtime)
-        target, description = load_target(self.target_folder, device, dtype)
+        target: Any = self.artifacts.target
         total, parts, seeds, shards, rows = sum(map(len, self.chosen.values())), [], [], {}, 0
         for name, chosen in self.chosen.items():
             first = rows
@@ -154,34 +146,65 @@ class DatastoreBuild:
                 seeds.append(np.full(len(parts[-1].steps), episode.seed))
                 rows += len(parts[-1].steps)
                 progress(len(parts), total)
-            shards[name] = {"rows": [first, rows], "seeds": self.seeds[name]}
-        manifest = self._manifest(target, description, shards, rows, device)
+            shards[name] = Shard((first, rows), tuple(self.seeds[name]))
+        files = self._arrays(parts, np.concatenate(seeds), shards)
         with _new_folder(self.folder) as folder:
-            _write(folder, parts, np.concatenate(seeds), manifest, np.float16 if self.settings.half else np.float32)
-        return Datastore.open(self.folder, description)
+            self._write(folder, files, shards)
+        return Datastore.open(self.folder, self.artifacts.description)
 
-    def _manifest(
-        self, target: CompactTarget, description: TargetDescription, shards: dict[str, Any], rows: int, device: str
-    ) -> dict[str, Any]:
-        return {
-            "format": FORMAT,
-            "kind": "datastore",
-            "key": list(self.settings.key),
-            "width": len(self.settings.key) * target.settings.width,
-            "rows": rows,
-            "chunk": target.settings.chunk,
-            "dofs": target.actions.dofs,
-            "actions": {"low": list(description.actions.low), "high": list(description.actions.high)},
-            "target": description.sha256,
-            "demos": self.dataset.sha256,
-            "first_evaluation_seed": EVALUATION_SEED,
-            "tasks": shards,
-            "provenance": {
+    def _arrays(self, parts: list[Entries], seeds: np.ndarray, shards: Mapping[str, Shard]) -> dict[str, Any]:
+        """File name -> what it holds."""
+        import pyarrow as pa
+
+        keys, files = np.concatenate([p.keys for p in parts]), {}
+        if self.settings.components:
+            files[PROJECTION] = directions(keys, self.settings.components)
+            keys = projected(keys, files[PROJECTION])
+        tokens = np.concatenate([p.tokens for p in parts])
+        counts = [shard.rows[1] - shard.rows[0] for shard in shards.values()]
+        columns = {
+            "task": pa.DictionaryArray.from_arrays(
+                np.repeat(np.arange(len(shards), dtype=np.int32), counts), [*shards]
+            ),
+            "seed": seeds,
+            "step": np.concatenate([p.steps for p in parts]),
+            "left": np.concatenate([p.left for p in parts]),
+            "tokens": pa.FixedSizeListArray.from_arrays(pa.array(tokens.ravel()), tokens.shape[1]),
+        }
+        files[VECTORS] = keys.astype(np.float16 if self.settings.half else np.float32)
+        return {**files, PAYLOAD: pa.table(columns)}
+
+    def _write(self, folder: Path, files: Mapping[str, Any], shards: dict[str, Shard]) -> None:
+        """Every file, and last the manifest with their hashes."""
+        import pyarrow.parquet as pq
+
+        for name, content in files.items():
+            with atomic_path(folder / name) as temporary:
+                if name == PAYLOAD:
+                    pq.write_table(content, temporary, compression="zstd")
+                else:
+                    with temporary.open("wb") as file:
+                        np.save(file, content)
+        target = self.artifacts.description
+        manifest = Manifest(
+            format=2,
+            kind="datastore",
+            key=tuple(self.settings.key),
+            width=files[VECTORS].shape[1],
+            rows=len(files[VECTORS]),
+            chunk=target.chunk,
+            actions=target.actions,
+            target=target.sha256,
+            demos=self.dataset.sha256,
+            files={name: sha256_of(folder / name) for name in files},
+            tasks=shards,
+            provenance={
                 "command": "kerv build datastore",
                 "settings": asdict(self.settings),
-                **provenance(device),
+                **provenance(self.device),
             },
-        }
+        )
+        write_json(folder / "manifest.json", asdict(manifest))
 
 
 def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
@@ -189,7 +212,7 @@ def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
     of each task. Shares of tokens, the median similarity, and the median seconds of a search for five neighbours."""
     gaps, similarities, seconds = [], [], []
     for name, shard in store.shards.items():
-        if len(store.manifest["tasks"][name]["seeds"]) < 2:
+        if len(store.manifest.tasks[name].seeds) < 2:
             continue
         for row in np.linspace(shard.start, shard.stop - 1, min(per_task, shard.stop - shard.start)).astype(int):
             began = time.perf_counter()
@@ -209,32 +232,10 @@ def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
     }
 
 
-def _write(folder: Path, parts: list[Entries], seeds: np.ndarray, manifest: dict[str, Any], dtype: type) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    tokens = np.concatenate([p.tokens for p in parts])
-    names = list(manifest["tasks"])
-    counts = [shard["rows"][1] - shard["rows"][0] for shard in manifest["tasks"].values()]
-    task_column = pa.DictionaryArray.from_arrays(np.repeat(np.arange(len(names), dtype=np.int32), counts), names)
-    columns = {
-        "task": task_column,
-        "seed": seeds,
-        "step": np.concatenate([p.steps for p in parts]),
-        "left": np.concatenate([p.left for p in parts]),
-        "tokens": pa.FixedSizeListArray.from_arrays(pa.array(tokens.ravel()), tokens.shape[1]),
-    }
-    with atomic_path(folder / FILES[0]) as temporary, temporary.open("wb") as file:
-        np.save(file, np.concatenate([p.keys for p in parts]).astype(dtype))
-    with atomic_path(folder / FILES[1]) as temporary:
-        pq.write_table(pa.table(columns), temporary, compression="zstd")
-    files = {name: sha256_of(folder / name) for name in FILES}
-    write_json(folder / "manifest.json", {**manifest, "files": files})
-
-
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` when the block ends well; what lay there goes when the new one is there.
+    """A temporary folder that becomes `folder` when the block ends well. An older folder of that name is deleted once
+    the new one stands in its place.
 
     Raises:
         StorageError: the disk refused.

@@ -13,16 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.decoding.acceptance import Acceptance
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer
+from kerv_cli.decoding.thresholds import Fixed
 from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.settings import (
-    AcceptanceSettings,
-    DrafterSettings,
-    MethodSettings,
-    ProposerSettings,
-    ThresholdSettings,
-)
+from kerv_cli.settings import DrafterSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.protocol import Target
 from kerv_cli.training.imitation import Samples
@@ -138,10 +134,9 @@ class Distillation:
 
 def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r: int) -> float:
     """AL (docs/methods.md §7) of decoding `prompts` with a chain of up to 5 drafts at radius r."""
-    tree = ProposerSettings(kind="drafter", depth=5, top_k=1, nodes=5)
-    acceptance = AcceptanceSettings(kind="relaxed" if r else "strict", strict_gripper=True)
-    method = MethodSettings("validation", tree, acceptance, ThresholdSettings(r=r))
-    decoder = Decoder(target, method, Parts(proposer=DrafterProposer(drafter, target, tree)))
+    acceptance = Acceptance(target.actions, "relaxed" if r else "strict")
+    proposer = DrafterProposer(drafter, target, depth=5, top_k=1, nodes=5)
+    decoder = Decoder(target, Parts(acceptance, Fixed(r), proposer=proposer))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     verified = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in verified) / max(1, len(verified))

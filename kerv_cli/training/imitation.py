@@ -76,7 +76,7 @@ def load_samples(
     parts: list[dict[str, Tensor]] = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
-        frames, steps = _frames_and_steps(episode, settings)
+        frames, steps = frames_and_steps(episode, settings)
         felt, states = observed(episode, steps, dataset.manifest.observation)
         ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
         parts.append(
@@ -106,7 +106,13 @@ def observed(episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace) -
     return states[:, : len(space.proprioception)], states
 
 
-def _frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
+def frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
+    """The episode's frames (n, size, size, 3), None for a state policy, and the control steps (n,) that a policy of
+    these settings learns from.
+
+    Raises:
+        CheckpointError: too few labels behind the episode's end for a whole chunk, or frames of another size.
+    """
     if settings.chunk > len(episode.labels) - episode.steps + 1:
         raise CheckpointError(
             f"the demonstrations have {len(episode.labels) - episode.steps} labels behind an episode's end, "
@@ -231,9 +237,8 @@ def new_target(
 ) -> CompactTarget:
     """A fresh policy of the dataset's spaces with the samples' action statistics."""
     torch.manual_seed(seed)
-    manifest = dataset.manifest
-    actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    return CompactTarget(replace(settings), actions, manifest.observation, words, camera)
+    actions = dataset.manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
+    return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
 
 
 def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kerv_cli.decoding.calibration_file import Errors
 from kerv_cli.drafting.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
 from kerv_cli.errors import CheckpointError, KervError, UsageError
-from kerv_cli.spaces import DOF_NAMES, GRIPPER, ActionTokenizer
+from kerv_cli.spaces import ActionSpace
 
 if TYPE_CHECKING:
     from kerv_cli.environments.demos.dataset import DemoDataset
@@ -43,7 +44,7 @@ class Windows:
 
 
 def episode_windows(
-    episode: DemoEpisode, actions: ActionTokenizer, history: str, window: int, horizon: int
+    episode: DemoEpisode, actions: ActionSpace, history: str, window: int, horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """(past (n, window, D), future (n, horizon, D)) of every moment of an episode that has a full window behind it.
 
@@ -70,7 +71,7 @@ def episode_windows(
 def read_windows(
     dataset: DemoDataset,
     chosen: Mapping[int, bool],
-    actions: ActionTokenizer,
+    actions: ActionSpace,
     history: str,
     window: int,
     horizon: int,
@@ -140,38 +141,35 @@ def fit_noise(past: np.ndarray, future: np.ndarray, order: int, dampings: Sequen
     return min(((float(q), damping) for damping in dampings for q in RATIOS), key=error)
 
 
-def fit_filters(windows: Windows, steps: int) -> dict[str, Noise]:
-    """The noise of every kind of filter, per DoF, from the training episodes; the gripper is held and not fitted."""
+def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noise]:
+    """The noise of every kind of filter, per DoF, from the training episodes; held DoFs (D,) bool are not fitted."""
     past, future = windows.where(~windows.held_out)
     fitted = {}
     for kind, model in FILTERS.items():
         dampings = DAMPINGS if kind == "damped" else (1.0,)
         found = [
-            (0.0, 1.0) if dof == GRIPPER else fit_noise(past[..., dof], future[:, :steps, dof], model.order, dampings)
+            (0.0, 1.0) if held[dof] else fit_noise(past[..., dof], future[:, :steps, dof], model.order, dampings)
             for dof in range(past.shape[2])
         ]
         fitted[kind] = Noise(tuple(q for q, _ in found), (1.0,) * len(found), tuple(d for _, d in found))
     return fitted
 
 
-Errors = dict[str, dict[str, dict[str, list[float]]]]
-"""predictor -> task -> DoF -> mean absolute error 1 … H steps ahead, normalised action units."""
-
-
-def prediction_errors(windows: Windows, noise: Mapping[str, Noise]) -> Errors:
+def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: ActionSpace) -> Errors:
     """Errors of every predictor on the held-out episodes."""
-    window, horizon, dofs = windows.past.shape[1], windows.future.shape[1], windows.past.shape[2]
+    window, horizon = windows.past.shape[1], windows.future.shape[1]
     errors: Errors = {}
     for kind in PREDICTORS:
-        predictor = build_predictor(kind, dofs, noise, window, window, horizon, GRIPPER)
+        predictor = build_predictor(kind, space.is_strict, noise, window, window, horizon)
         errors[kind] = {}
         for number, task in enumerate(windows.tasks):
             past, future = windows.where(windows.held_out & (windows.task == number))
             mean = np.abs(predictor.predict_many(past, horizon) - future).mean(0)
-            errors[kind][task] = {name: mean[:, dof].tolist() for dof, name in enumerate(DOF_NAMES)}
+            errors[kind][task] = {name: mean[:, dof].tolist() for dof, name in enumerate(space.names)}
     return errors
 
 
-def position_errors(errors: Errors, kind: str) -> np.ndarray:
-    """(tasks, H): mean over dx, dy, dz."""
-    return np.array([[rows[name] for name in DOF_NAMES[:GRIPPER]] for rows in errors[kind].values()]).mean(1)
+def moving_errors(errors: Errors, kind: str, space: ActionSpace) -> np.ndarray:
+    """(tasks, H): mean over the DoFs that are predicted and not held."""
+    moving = [name for name in space.names if name not in space.strict]
+    return np.array([[rows[name] for name in moving] for rows in errors[kind].values()]).mean(1)

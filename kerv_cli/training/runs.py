@@ -12,12 +12,13 @@ from typing import Any
 import torch
 from torch import nn
 
+from kerv_cli.artifacts import artifact_folder
 from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
 from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.places import artifact, drafter_folder, early_folder, find_target
+from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
@@ -171,7 +172,7 @@ class DrafterRun:
 
     def place(self) -> Path:
         """Where the drafter is put."""
-        return drafter_folder(self.settings.results, self.settings.policy.drafter, self.target_folder)
+        return artifact_folder("drafter")(self.settings.results, self.settings.policy.drafter, self.target_folder)
 
     def plan(self) -> str:
         """One line: what the run would do."""
@@ -242,7 +243,7 @@ class EarlyRun(DrafterRun):
     noun = "early drafter"
 
     def place(self) -> Path:
-        return early_folder(self.settings.results, self.settings.policy.early, self.target_folder)
+        return artifact_folder("early")(self.settings.results, self.settings.policy.early, self.target_folder)
 
     def teach(self, progress: Progress) -> None:
         taught = teach_early(self.target, self.dataset, self.settings.drafter, progress)

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kerv_cli.decoding.calibration_file import NEVER
+from kerv_cli.decoding.calibration_file import NEVER, SkipLevel, SkipSection
 from kerv_cli.errors import UnknownName
-from kerv_cli.spaces import values_of
 
 if TYPE_CHECKING:
     from kerv_cli.drafting.datastore import Datastore
@@ -30,12 +29,12 @@ class Matches:
 
     similarity: np.ndarray  # (n,) float32, cosine
     error: np.ndarray  # (n,) mean absolute difference of the two chunks, normalised action units
-    gripper: np.ndarray  # (n,) bool, some gripper token differs
+    strict: np.ndarray  # (n,) bool, some token of a strict DoF differs
 
     def good(self, epsilon: float) -> np.ndarray:
-        """(n,) bool: the error is at most epsilon and the gripper is the expert's, token for token. A wrong gripper
+        """(n,) bool: the error is at most epsilon and strict DoFs are the expert's, token for token. A wrong gripper
         hides in a mean over all DoFs, and drops what is held."""
-        return (self.error <= epsilon) & ~self.gripper
+        return (self.error <= epsilon) & ~self.strict
 
 
 def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
@@ -47,7 +46,7 @@ def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
     """
     if task not in store.shards:
         raise UnknownName("task of the datastore", task, store.shards)
-    shard, dofs = store.shards[task], int(store.manifest["dofs"])
+    shard, space = store.shards[task], store.manifest.actions
     if len(np.unique(store.seeds[shard])) < 2:
         return Matches(np.zeros(0, np.float32), np.zeros(0), np.zeros(0, bool))
     rows = np.linspace(shard.start, shard.stop - 1, min(entries, shard.stop - shard.start)).astype(int)
@@ -57,9 +56,9 @@ def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
         similarity.append(found.similarity[0])
         chunks.append(found.chunks[0])
     own, drafted = store.tokens[rows].astype(np.int64), np.stack(chunks)
-    error = np.abs(values_of(drafted) - values_of(own)).mean(1)
-    gripper = (drafted != own)[:, dofs - 1 :: dofs].any(1)
-    return Matches(np.array(similarity, np.float32), error, gripper)
+    error = np.abs(space.values_of(drafted) - space.values_of(own)).mean(1)
+    strict = (drafted != own)[:, space.strict_tokens(own.shape[1])].any(1)
+    return Matches(np.array(similarity, np.float32), error, strict)
 
 
 def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
@@ -76,15 +75,12 @@ def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, le
     return float(ranked[enough][-1]) if enough.any() else None
 
 
-def task_levels(matches: Matches, epsilon: float, confidence: float) -> dict[str, Any]:
+def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLevel:
     """s_min of one task, the bounds between which feedback may move it, and what it would skip.
 
     low ≤ s_min ≤ high: the same level where twice and where a third of the wrong chunks are allowed (at a confidence
     of 0.9: 0.8 and 0.967). Where no level is that good, high is the largest similarity seen, where next to nothing is
     skipped. A task without an s_min has NEVER for all three: nothing lets it skip.
-
-    -> {"s_min", "low", "high", "share" of the entries that would be skipped, "within": the share of those that are
-    good, "error": their mean absolute error (None where there are none), "entries": how many were looked up}
     """
     good, wrong = matches.good(epsilon), 1 - confidence
     s_min = lowest_level(matches.similarity, good, confidence)
@@ -100,24 +96,21 @@ def task_levels(matches: Matches, epsilon: float, confidence: float) -> dict[str
             "within": float(good[skipped].mean()),
             "error": float(matches.error[skipped].mean()),
         }
-    return {**row, "entries": len(matches.similarity)}
+    return SkipLevel(**row, entries=len(matches.similarity))
 
 
 def skip_section(
     store: Datastore,
-    sha256: str,
     tasks: Sequence[str],
     epsilon: float,
     confidence: float,
     on_progress: Callable[[int, int], None],
-) -> dict[str, Any]:
-    """The calibration's `skip`: the levels of those `tasks` that the datastore holds, and which datastore it was.
-
-    sha256: of the datastore's manifest. Empty where it holds none of the tasks.
-    """
+) -> SkipSection | None:
+    """The calibration's `skip`: the levels of those `tasks` that the datastore holds, and which datastore it was. None
+    where it holds none of the tasks."""
     found = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:
             found[task] = task_levels(match(store, task), epsilon, confidence)
         on_progress(done, len(tasks))
-    return {"datastore": sha256, "epsilon": epsilon, "confidence": confidence, "tasks": found} if found else {}
+    return SkipSection(store.content, epsilon, confidence, found) if found else None

@@ -22,7 +22,7 @@ SPEC = EnvironmentSpec(
         high=(0.01, 0.01, 0.01, 0.06, 0.06, 0.06, 1.0),
     ),
     observation=ObservationSpace(
-        # hand [0:7]; peg [7:10] and mouth of the slot [10:13], metres; rotation vectors of slot [13:16] and peg [16:19]
+        # hand [0:7]; peg [7:10] and mouth of the slot [10:13], m; rotation vectors of slot [13:16] and peg [16:19], rad
         proprioception=("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
         state=19,
         places=(Place("peg", 7), Place("slot", 10)),

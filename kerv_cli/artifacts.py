@@ -1,0 +1,130 @@
+"""What a policy is made of on disk: the target and the artifacts that belong to it, each loaded and hashed once per
+process, however many settings of a study share them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.places import artifact, beside, find_target
+from kerv_cli.registry import find, load
+from kerv_cli.settings import PolicySettings
+
+if TYPE_CHECKING:
+    from kerv_cli.targets.checkpoint import TargetDescription
+    from kerv_cli.targets.protocol import Target
+
+
+@dataclass(frozen=True)
+class Request:
+    """Whom an artifact is wanted for. search: settings of who searches a datastore."""
+
+    description: TargetDescription
+    search: Any = None
+    target: Target | None = None  # loaded, where the artifact is to be loaded for it
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """One kind of artifact.
+
+    place: (results, name or None, the target's folder) -> where it lies; None names the one beside the target. check:
+    (place, request) -> its hash, or CheckpointError where it is missing, damaged or another target's. load: (place,
+    request) -> it.
+    """
+
+    kind: str
+    place: Callable[[str, str | None, Path], Path]
+    check: Callable[[Path, Request], str]
+    load: Callable[[Path, Request], Any]
+
+
+def artifact_folder(kind: str) -> Callable[[str, str | None, Path], Path]:
+    """`Artifact.place` of a kind that is a folder: the named one, else the one beside the target."""
+
+    def place(results: str, name: str | None, target: Path) -> Path:
+        return artifact(results, kind, name) if name else beside(target, kind)
+
+    return place
+
+
+class Artifacts:
+    """The artifacts of one policy, found, checked and loaded on demand.
+
+    results, policy, search: as in RolloutSettings. device, dtype: of what is loaded, as `runtime.set_up` gives them.
+    """
+
+    def __init__(
+        self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"
+    ) -> None:
+        self.results, self.policy, self.search, self.device, self.dtype = results, policy, search, device, dtype
+        self.folder = find_target(results, policy.target)
+
+    @functools.cached_property
+    def description(self) -> TargetDescription:
+        """The target's, read without its weights."""
+        from kerv_cli.targets.checkpoint import read_target
+
+        return read_target(self.folder)
+
+    @property
+    def target(self) -> Target:
+        """The target, loaded."""
+        return _target(self.folder, self.description.sha256, self.device, self.dtype)
+
+    def place(self, kind: str) -> Path:
+        """Where the artifact of this kind lies."""
+        return _kind(kind).place(self.results, self.policy.named(kind), self.folder)
+
+    def check(self, kinds: Iterable[str]) -> dict[str, str]:
+        """Kind -> hash, of the target and of `kinds`.
+
+        Raises:
+            CheckpointError: one is missing, damaged, or was made for another target.
+        """
+        request = Request(self.description, self.search)
+        found = {"target": self.description.sha256}
+        return found | {kind: _kind(kind).check(self.place(kind), request) for kind in kinds}
+
+    def load(self, kind: str) -> Any:
+        """The artifact, for the loaded target; the same object for everybody in this process."""
+        digest = self.check([kind])[kind]
+        return _artifact(kind, self.place(kind), digest, _Owner(self.folder, self.device, self.dtype, self.search))
+
+
+@dataclass(frozen=True)
+class _Owner:
+    """Of a loaded artifact. search: settings without a hash of their own, compared by their text."""
+
+    folder: Path
+    device: str
+    dtype: str
+    search: Any
+
+    def __hash__(self) -> int:
+        return hash((self.folder, self.device, self.dtype, repr(self.search)))
+
+
+def _kind(name: str) -> Artifact:
+    found: Artifact = load(find("artifact", name).build)
+    return found
+
+
+@functools.lru_cache(maxsize=16)
+def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
+    from kerv_cli.runtime import DTYPES
+    from kerv_cli.targets.checkpoint import load_target
+
+    return load_target(folder, device, DTYPES[dtype])[0]
+
+
+@functools.lru_cache(maxsize=64)
+def _artifact(kind: str, place: Path, digest: str, owner: _Owner) -> Any:
+    from kerv_cli.targets.checkpoint import read_target
+
+    description = read_target(owner.folder)
+    target = _target(owner.folder, description.sha256, owner.device, owner.dtype)
+    return _kind(kind).load(place, Request(description, owner.search, target))

@@ -1,0 +1,231 @@
+"""Each part's settings become the part: the functions that the registry names, and `compose`, which calls them.
+
+A build function takes (settings, context) and returns the part, or None where there is nothing to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from kerv_cli.decoding import boundary as boundaries
+from kerv_cli.decoding import thresholds
+from kerv_cli.decoding.acceptance import Acceptance
+from kerv_cli.decoding.calibration_file import Calibration
+from kerv_cli.decoding.chunk import DraftsChunks, Proposer, steps_of
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import (
+    DrafterProposer,
+    EarlyProposer,
+    HybridProposer,
+    JacobiProposer,
+    MergedProposer,
+    PredictionProposer,
+    RetrievalProposer,
+)
+from kerv_cli.decoding.rectify import DRAFT, Compensation
+from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
+from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
+from kerv_cli.errors import UsageError
+from kerv_cli.parts import METHOD_KINDS, PREFILL, PredictionProposerSettings, RetrievalProposerSettings
+from kerv_cli.registry import find
+from kerv_cli.targets.protocol import Target
+
+LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: kinematics.MINIMUM
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a part is built from. artifact: kind -> the loaded artifact. built: the method's parts so far, by kind."""
+
+    target: Any  # a Target; some parts want a ReadableTarget
+    artifact: Callable[[str], Any]
+    task: str = ""
+    built: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def calibration(self) -> Calibration:
+        """What `kerv calibrate` fitted."""
+        loaded: Calibration = self.artifact("calibration")
+        return loaded
+
+
+def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
+    """Refuse parts that do not belong together, and numbers out of range, before anything heavy is loaded.
+
+    method: kind -> settings, for every kind of METHOD_KINDS. chunk: asked for; trained: H of the target.
+
+    Raises:
+        UnknownName: no such part. UsageError: a composition that cannot work, or a number out of range.
+    """
+    chosen = {kind: find(registry_kind(kind), method[kind].kind, f"{kind}.kind") for kind in METHOD_KINDS}
+    for kind, part in chosen.items():
+        if not isinstance(method[kind], part.settings):
+            raise UsageError(f"{kind}.kind={part.name}: choose {kind}={part.name}, each has settings of its own")
+        if part.check is not None:
+            part.check(method[kind])
+    steps_of(chunk, trained)
+    proposer, boundary, draft = chosen["proposer"], chosen["boundary"], chosen["prefill_draft"]
+    if bool(proposer.traits.get("sides")) != bool(boundary.traits.get("chooses")):
+        raise UsageError(
+            f"proposer={proposer.name} with boundary={boundary.name}: a boundary chooses between the two sides of "
+            "proposer=hybrid, which needs one other than always"
+        )
+    if draft.traits.get("when") != PREFILL:
+        raise UsageError(
+            f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
+            f"proposer={draft.name}"
+        )
+
+
+def registry_kind(kind: str) -> str:
+    """The registry's kind of a method's part: what drafts before the prefill is an ordinary proposer."""
+    return "proposer" if kind == "prefill_draft" else kind
+
+
+def needs(method: Mapping[str, Any]) -> tuple[str, ...]:
+    """The kinds of artifacts that a method's parts read, each once, in the order of its parts."""
+    wanted = [
+        need for kind in METHOD_KINDS for need in find(registry_kind(kind), method[kind].kind).needs(method[kind])
+    ]
+    return tuple(dict.fromkeys(wanted))
+
+
+def compose(
+    method: Mapping[str, Any],
+    target: Target,
+    artifact: Callable[[str], Any],
+    task: str = "",
+    chunk: int = 0,
+) -> Decoder:
+    """The decoder of a method around a target.
+
+    method: kind -> settings. artifact: kind -> the loaded artifact, asked for what `needs` names and nothing else.
+    task: whose calibrated levels hold, where a part has one per task. chunk: H; 0: the target's.
+
+    Raises:
+        UsageError: as `check`. CheckpointError: an artifact is missing or belongs to another target.
+    """
+    check(method, chunk, target.chunk)
+    context = Context(target, artifact, task)
+    for kind in METHOD_KINDS:
+        part = find(registry_kind(kind), method[kind].kind)
+        context.built[kind] = part.built(method[kind], context)
+    return Decoder(target, Parts(**context.built), chunk)
+
+
+def nothing(settings: Any, context: Context) -> None:
+    """Parts that stand for the absence of one."""
+
+
+def drafter(settings: Any, context: Context) -> DrafterProposer:
+    """proposer=drafter, and the drafter's side of hybrid."""
+    return DrafterProposer(context.artifact("drafter"), context.target, settings.depth, settings.top_k, settings.nodes)
+
+
+def early(settings: Any, context: Context) -> EarlyProposer:
+    """proposer=early."""
+    return EarlyProposer(context.artifact("early"), context.target)
+
+
+def prediction(settings: PredictionProposerSettings, context: Context) -> PredictionProposer:
+    """proposer=hold, linear, kalman, …"""
+    return PredictionProposer(predictor(settings.kind, context))
+
+
+def retrieval(settings: Any, context: Context) -> RetrievalProposer:
+    """proposer=retrieval, and retrieval's side of hybrid."""
+    return RetrievalProposer(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
+
+
+def hybrid(settings: Any, context: Context) -> HybridProposer:
+    """proposer=hybrid."""
+    return HybridProposer(drafter(settings, context), retrieval(settings, context))
+
+
+def jacobi(settings: Any, context: Context) -> JacobiProposer:
+    """proposer=jacobi."""
+    return JacobiProposer(settings.depth)
+
+
+def merged(settings: Any, context: Context) -> MergedProposer:
+    """proposer=merged."""
+
+    def source(name: str) -> DraftsChunks:
+        part = find("proposer", name)
+        own: Any = part.settings(kind=name)
+        if isinstance(own, RetrievalProposerSettings):
+            own = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
+        built: DraftsChunks = part.built(own, context)
+        return built
+
+    sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
+    return MergedProposer(sources, settings.nodes, fallback)
+
+
+def predictor(name: str, context: Context) -> Predictor:
+    """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
+    target = context.target
+    if find("predictor", name).traits.get("fitted"):
+        return context.calibration.predictor(name, horizon=target.chunk)
+    least = LEAST_HISTORY.get(name, MINIMUM)
+    return build_predictor(name, target.actions.is_strict, {}, least, horizon=target.chunk)
+
+
+def compensation(settings: Any, context: Context) -> Compensation:
+    """rectifier=compensate."""
+    return Compensation(settings, predictor("hold" if settings.predictor == DRAFT else settings.predictor, context))
+
+
+def acceptance(settings: Any, context: Context) -> Acceptance:
+    """All acceptance rules."""
+    return Acceptance(
+        context.target.actions,
+        settings.kind,
+        getattr(settings, "strict_dofs", True),
+        getattr(settings, "group_limit", 0),
+        getattr(settings, "token_limit", 0),
+    )
+
+
+def threshold(settings: Any, context: Context) -> thresholds.Threshold:
+    """All thresholds; K_S is the task's, from the calibration, where none is given.
+
+    Raises:
+        UsageError: a radius that no token is away from another.
+    """
+    most = context.target.actions.tokens - 1
+    largest = settings.r if settings.kind == "fixed" else settings.r_max
+    if largest > most:
+        name = "r" if settings.kind == "fixed" else "r_max"
+        raise UsageError(f"threshold.{name}={largest}: bins from 0 to {most}")
+    if settings.kind == "fixed":
+        return thresholds.Fixed(settings.r)
+    if settings.kind == "schedule":
+        return thresholds.Schedule(settings.r_min, settings.r_max, settings.phi, settings.tau)
+    k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
+    kind = thresholds.Kinematic if settings.kind == "kinematic" else thresholds.Change
+    return kind(settings.r_min, settings.r_max, settings.phi, k_s)
+
+
+def boundary(settings: Any, context: Context) -> boundaries.Boundary:
+    """All boundaries that choose."""
+    if settings.kind == "random":
+        return boundaries.Random(settings.p, settings.seed)
+    if settings.kind == "fused":
+        ranges = context.calibration.ranges(settings.window)
+        return boundaries.Fused(ranges, settings.alpha, settings.window, settings.f_star)
+    return boundaries.Always("retrieval" if settings.kind == "always_retrieval" else "drafter")
+
+
+def similarity_skip(settings: Any, context: Context) -> VerifySkip:
+    """skip=similarity; it looks up what the method's proposer looks up, where that retrieves."""
+    own: Proposer | None = context.built["proposer"]
+    found = own.sides["retrieval"] if isinstance(own, HybridProposer) else own
+    if not isinstance(found, RetrievalProposer):  # nothing else of the method retrieves
+        found = RetrievalProposer(context.artifact("datastore"), context.target, 1, 1)
+    if settings.s_min is not None:
+        return VerifySkip(settings, found, SkipLevels(settings.s_min, settings.s_min, settings.s_min))
+    levels = context.calibration.skip_levels(context.task, found.datastore.content)
+    return VerifySkip(settings, found, SkipLevels(*levels))

@@ -1,0 +1,157 @@
+"""A block, run in one process: its settings take turns episode by episode, and every cell is written when its last
+episode is done."""
+
+from __future__ import annotations
+
+import os
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.errors import KervError, StorageError
+from kerv_cli.provenance import stamp
+from kerv_cli.studies.claims import claim, note_running, release
+from kerv_cli.studies.plan import Block, Cell
+from kerv_cli.studies.rows import Circumstances
+from kerv_cli.studies.store import StudyStore
+
+RunEpisode = Callable[[int], EpisodeRecord]
+"""Runs the episode of a seed."""
+
+Prepare = Callable[[Cell], RunEpisode]
+"""Makes a cell's setting ready on its task, warmed up. Picklable; keeps what it loaded between calls in its module."""
+
+Gauge = Callable[[str], float]
+"""Seconds of a fixed workload on a device. Picklable."""
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """How a cell ended; plain values, because an exception may not survive pickling."""
+
+    episodes: int = 0
+    successes: int = 0
+    seconds: float = 0.0
+    reason: str = ""  # empty: complete
+    reused: bool = False  # another sweep completed it meanwhile
+    trace: str = ""
+    storage: bool = False  # the disk refused: no other cell could be written either
+
+
+def failed(error: BaseException) -> CellResult:
+    """The result of a cell that raised `error`, inside an except clause."""
+    return CellResult(reason=one_line(error), trace=traceback.format_exc(), storage=isinstance(error, StorageError))
+
+
+@dataclass(frozen=True)
+class BlockRun:
+    """One attempt to run a block: what a worker does. Picklable.
+
+    name: unique among all attempts. run: the sweep's. status: what every cell's status.json says of the sweep.
+    """
+
+    block: Block
+    name: str
+    run: str
+    prepare: Prepare
+    store: StudyStore
+    gauge: Gauge | None = None
+    status: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self) -> dict[str, CellResult] | None:
+        """Results by cell id; None where another sweep computes one of the cells: nothing was run then."""
+        try:
+            if not claim(self.store.claims, self.block.cells, self.run, self.name):
+                return None
+        except StorageError as error:
+            return {self.block.cells[0].id: failed(error)}
+        try:
+            return self._take_turns()
+        finally:
+            release(self.store.claims, self.block.cells, self.name)
+
+    def _take_turns(self) -> dict[str, CellResult]:
+        results: dict[str, CellResult] = {}
+        turns: dict[int, _Turn] = {}
+        for place, cell in enumerate(self.block.cells):
+            turn = _Turn(cell, self)
+            result = turn.prepare()
+            if result is None:
+                turns[place] = turn
+            else:
+                results[cell.id] = result
+        order = 0
+        for seed in self.block.seeds:
+            for place in self.block.order(seed):
+                if place not in turns:
+                    continue
+                result = turns[place].take(seed, order)
+                order += 1
+                if result is not None:
+                    results[turns.pop(place).cell.id] = result
+                    if result.storage:
+                        return results
+        return results
+
+
+class _Turn:
+    """One cell's part in a block. Its calls return the cell's result once there is one: it failed, or is complete."""
+
+    def __init__(self, cell: Cell, work: BlockRun) -> None:
+        self.cell, self.work = cell, work
+        self.records: list[EpisodeRecord] = []
+        self.circumstances: list[Circumstances] = []
+        self.seconds = 0.0
+
+    def prepare(self) -> CellResult | None:
+        """Makes the setting ready, unless the cell is complete."""
+        clock = time.perf_counter()
+        try:
+            if self.work.store.has_cell(self.cell.id):
+                return CellResult(reused=True)
+            note_running(self.work.store.claims, self.cell, self.work.name)
+            self.run_episode = self.work.prepare(self.cell)
+        except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
+            return failed(error)
+        self.seconds += time.perf_counter() - clock
+        return None
+
+    def take(self, seed: int, order: int) -> CellResult | None:
+        """Runs one episode; writes the cell after its last one."""
+        try:
+            note_running(self.work.store.claims, self.cell, self.work.name)
+            at = Circumstances(self.work.name, order, datetime.now(UTC).isoformat(timespec="milliseconds"))
+            if self.work.gauge is not None:
+                at = Circumstances(at.block, order, at.started, self.work.gauge(self._device))
+            clock = time.perf_counter()
+            self.records.append(self.run_episode(seed))
+            self.circumstances.append(at)
+            self.seconds += time.perf_counter() - clock
+            return self._write() if len(self.records) == len(self.cell.seeds) else None
+        except Exception as error:  # noqa: BLE001 - as above
+            return failed(error)
+
+    @property
+    def _device(self) -> str:
+        return str(self.cell.settings["runtime"]["device"])
+
+    def _write(self) -> CellResult:
+        status = {**stamp(self._device), **self.work.status, "run": self.work.run, "pid": os.getpid()}
+        status |= {"seconds": self.seconds}
+        if not self.work.store.write_cell(self.cell, self.records, status, self.circumstances):
+            return CellResult(reused=True)
+        return CellResult(len(self.records), sum(record.success for record in self.records), self.seconds)
+
+
+def one_line(error: BaseException) -> str:
+    """An error for a summary: kerv's own message, or type, message and place of a foreign one."""
+    text = " ".join(str(error).split())
+    if isinstance(error, KervError):
+        return text
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {text[:200]}{place}"

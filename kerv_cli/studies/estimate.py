@@ -1,0 +1,46 @@
+"""How long a plan will take, from what the study measured before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from kerv_cli.studies.plan import Cell, blocks_of
+from kerv_cli.studies.store import StudyStore
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """How long a plan will take."""
+
+    seconds: float
+    to_run: int  # cells
+    reused: int
+    measured: bool  # False: a guess from `prior_seconds`
+    source: str  # for people
+
+
+def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:
+    """Time for the cells that are not complete, from the mean wall seconds per episode of the plan's complete cells.
+
+    A label with complete cells uses its own mean, others the mean over all; `prior_seconds` per episode is the guess
+    where nothing is complete. Workers are taken to scale perfectly, up to one per block.
+
+    Raises:
+        CheckpointError: a complete cell is damaged.
+    """
+    every_cell = [cell for block in blocks_of(cells) for cell in block.cells]
+    known: dict[str, list[float]] = {}
+    todo: list[Cell] = []
+    for cell in every_cell:
+        if store.has_cell(cell.id):
+            known.setdefault(cell.label, []).extend(store.read_cell(cell.id).episodes["wall_seconds"])
+        else:
+            todo.append(cell)
+    every = [seconds for times in known.values() for seconds in times]
+    prior = sum(every) / len(every) if every else prior_seconds
+    means = {label: sum(times) / len(times) for label, times in known.items()}
+    total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
+    source = f"measured on {len(every)} stored episodes" if every else f"a guess of {prior_seconds:g} s per episode"
+    at_once = max(1, min(workers, len(blocks_of(todo))))
+    return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), bool(every), source)
