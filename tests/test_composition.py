@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from kerv_cli.rollouts.composition import check_composition
 
 from kerv_cli.config import compose, groups
 from kerv_cli.errors import KervError
-from kerv_cli.rollouts.composition import check_composition
 from kerv_cli.rollouts.policy import needs_calibration, needs_datastore, needs_drafter, needs_early
 from kerv_cli.settings import RolloutSettings
 
