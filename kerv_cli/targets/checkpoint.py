@@ -12,7 +12,6 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
 from kerv_cli.manifests import read
@@ -22,7 +21,7 @@ from kerv_cli.spaces import ActionSpace, ObservationSpace
 if TYPE_CHECKING:
     from kerv_cli.targets.compact.target import CompactTarget
 
-FORMAT = 1
+FORMAT = 2
 WEIGHTS = "model.safetensors"
 
 
@@ -108,26 +107,12 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
     value = read_json(path)
     if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
-    description = read(schema, with_spaces(value), str(path))
+    description = read(schema, value, str(path))
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing: the {kind} is incomplete, train or copy it again")
     if sha256_of(weights) != description.sha256:
         raise CheckpointError(f"{weights} does not match its description: damaged or mixed up, copy the folder again")
     return description
-
-
-def with_spaces(value: dict[str, Any]) -> dict[str, Any]:
-    """A description as it is written today. One from before artifacts carried their spaces is Meta-World's."""
-    actions = value.get("actions", {})
-    if not isinstance(actions, dict) or "names" in actions:
-        return value
-    value = {**value, "actions": {**SPEC.actions.as_dict(), **actions}}
-    if value["kind"] == "target" and isinstance(value.get("settings"), dict):
-        settings = {k: v for k, v in value["settings"].items() if k != "dofs"}
-        cameras = ["corner4"] if settings.get("observation") == "vision" else []
-        of_target = {"settings": settings, "observation": SPEC.observation.as_dict(), "cameras": cameras}
-        value |= {"family": "compact", "environment": SPEC.name, **of_target}
-    return value
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:

@@ -99,9 +99,10 @@ class DatastoreBuild:
                 f"key={settings.key} episodes={settings.episodes} stride={settings.stride} "
                 f"components={settings.components}: name a key, episodes and components from 0 on, stride from 1 on"
             )
+        known = [name for name in KEYS if name != "vision" or self.artifacts.description.cameras]
         for name in settings.key:
-            if name not in KEYS:
-                raise UnknownName("key", name, KEYS)
+            if name not in known:
+                raise UnknownName("key", name, known)
         self.folder = self.artifacts.place("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
