@@ -158,7 +158,7 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
     try:
         keys = _keys(command, choices, schema)
     except HydraException:  # the choices alone do not compose
-        return UsageError(_one_line(error))
+        return UsageError(_one_line(error.__cause__ or error))
     for word in overrides:
         key = word.split("=", 1)[0].lstrip("+~")
         if key not in keys and key not in groups():
@@ -166,7 +166,7 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
             near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
             hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {command} --cfg' for the keys"
             return UsageError(f"unknown key '{key}': {hint}")
-    return UsageError(_one_line(error))
+    return UsageError(_one_line(error.__cause__ or error))
 
 
 def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 import subprocess
@@ -57,6 +58,11 @@ def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) 
     assert record.frames[0].shape == (24, 24, 3)
     found = read_back(save_episode(record, tmp_path / "point.rrd", method="expert"))
     assert found["timelines"]["time"] == (0, record.steps * 100_000_000)
+
+
+def test_an_environment_may_have_no_experts(spec: EnvironmentSpec) -> None:
+    with pytest.raises(UsageError, match="point-mass has no scripted experts"):
+        dataclasses.replace(spec, expert_class="").expert("push-point")
 
 
 def test_a_plugin_is_named_by_an_environment_variable() -> None:

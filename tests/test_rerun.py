@@ -17,7 +17,9 @@ from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, verify
 
 from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
+from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.errors import KervError, StorageError, UsageError
+from kerv_cli.registry import parts
 from kerv_cli.viewing import rerun_log, viewer
 from kerv_cli.viewing.rerun_log import readable, save_episode
 from kerv_cli.viewing.token_outcomes import chunk_size, outcomes_of
@@ -85,6 +87,23 @@ def test_a_recording_holds_what_the_record_says(kind: str, tmp_path: Path) -> No
     assert found["episode"]["task"] == record.task
     assert found["episode"]["forwards"] == record.forwards
     assert found["bytes"] < 600_000
+
+
+def test_seven_dofs_have_their_names_and_limits(tmp_path: Path) -> None:
+    limits = (9, 9, 9, 5, 5, 5, 0)
+    tokens = tuple(range(50, 64))
+    rounds = (prefill(50), verify(1, tokens[1:13], tokens[1:], 12, limits))
+    actions = np.linspace([-0.01] * 7, [0.01] * 7, 2, dtype=np.float32)
+    decode = replace(decode_of(tokens, rounds, 2), actions=actions)
+    record = replace(
+        episode("ar", horizon=2), space=INSERTION.actions, decodes=(decode,), decode_steps=(0,), actions=actions
+    )
+    path = saved(record, tmp_path)
+    assert named(path, "/actions") == list(INSERTION.actions.names)
+    assert named(path, "/decode/threshold") == ["r dx dy dz", "r droll dpitch dyaw", "r gripper"]
+    assert column(path, "/tokens/step_0", "state")[0] == ["target", *["accepted"] * 6]
+    assert "| 7 | 1 | dx | 1 | 57 | 57 | 0 | 9 | 57 | ✓ accepted |" in column(path, "/decode/table", "text")[0][0]
+    assert read_back(path)["timelines"]["time"] == (0, 100_000_000)
 
 
 def test_values_survive_to_the_last_digit(tmp_path: Path) -> None:
@@ -229,6 +248,12 @@ def test_token_lanes_and_modes(tmp_path: Path) -> None:
     for decode, step in zip(record.decodes, record.decode_steps, strict=True):
         shown = changes.get(step, shown)
         assert shown == decode.mode
+
+
+def test_a_modes_colour_is_its_proposers() -> None:
+    assert rerun_log._mode_color("drafter", 0) == parts("proposer")["drafter"].colour * 256 + 255
+    assert rerun_log._mode_color("expert", 0) != rerun_log._mode_color("ar", 0)
+    assert rerun_log._mode_color("mine", 0) != rerun_log._mode_color("mine too", 1)
 
 
 def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:

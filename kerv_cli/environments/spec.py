@@ -150,8 +150,9 @@ class EnvironmentSpec:
     begins with the proprioception. tasks: by full name. suites: name in capitals -> full task names. difficulties:
     groups of tasks, in the order of tables. horizon: control steps of an episode, the most that the simulator runs.
     cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
-    with (spec, task, camera, horizon) and with (spec, task). upside_down: cameras whose images come out rotated by
-    180 degrees. suffix: of all full task names, which may be left out. packages: whose versions decide the physics.
+    with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras
+    whose images come out rotated by 180 degrees. suffix: of all full task names, which may be left out. packages:
+    whose versions decide the physics.
     """
 
     name: str
@@ -164,7 +165,7 @@ class EnvironmentSpec:
     cameras: tuple[str, ...]
     seeds: Seeds
     world_class: str
-    expert_class: str
+    expert_class: str = ""
     upside_down: tuple[str, ...] = ()
     suffix: str = ""
     packages: tuple[str, ...] = ()
@@ -229,6 +230,12 @@ class EnvironmentSpec:
         return world
 
     def expert(self, task: str) -> Expert:
-        """The scripted expert of the task. Raises UnknownName for a task that does not exist."""
+        """The scripted expert of the task.
+
+        Raises:
+            UnknownName: a task that does not exist. UsageError: the environment has no experts.
+        """
+        if not self.expert_class:
+            raise UsageError(f"{self.name} has no scripted experts: record demonstrations with its own tools")
         expert: Expert = load(self.expert_class)(self, task)
         return expert

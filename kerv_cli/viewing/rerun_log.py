@@ -22,22 +22,13 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord
 from kerv_cli.files import atomic_path
+from kerv_cli.registry import parts
 from kerv_cli.viewing.blueprint import CELL_HEIGHT, CELL_WIDTH, KEY_ROWS, SIGNALS, STEP, TIME, EpisodeMeta, blueprint
 from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, acceptance, chunk_size, decode_table, outcomes_of
 
 JPEG_QUALITY = 85
 _SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in OUTCOMES.values()}
-_MODE_COLORS = {
-    "ar": 0x6E7B8BFF,
-    "drafter": 0x56B4E9FF,
-    "retrieval": 0x009E73FF,
-    "merged": 0xCC79A7FF,
-    "early": 0xD4A6C8FF,
-    "jacobi": 0x8A7FD4FF,
-    "skip": 0xF0E442FF,
-    "hold": 0xE69F00FF,
-    "kalman": 0xD55E00FF,
-}
+_MODE_COLORS = {"ar": 0x6E7B8BFF, "skip": 0xF0E442FF, "expert": 0x4E79A7FF}  # all other modes are names of proposers
 _OTHER_COLORS = (0x0072B2FF, 0xA0522DFF, 0x4C9F70FF, 0xB07AA1FF)
 _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
@@ -200,13 +191,20 @@ def _modes(record: EpisodeRecord, starts: NDArray[np.int64]) -> Entity:
     modes = [d.mode for d in record.decodes]
     changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]
     used = sorted(set(modes))
-    others = [m for m in used if m not in _MODE_COLORS]
-    colors = [_MODE_COLORS.get(m) or _OTHER_COLORS[others.index(m) % len(_OTHER_COLORS)] for m in used]
+    colors = [_mode_color(mode, i) for i, mode in enumerate(used)]
     style = rr.StateConfiguration(
         values=used, labels=[readable(m) for m in used], colors=np.array(colors, dtype=np.uint32)
     )
     columns = rr.StateChange.columns(state=[modes[i] for i in changes])
     return Entity("mode", (style,), starts[changes], columns)
+
+
+def _mode_color(mode: str, place: int) -> int:
+    """0xRRGGBBAA: its own, that of the proposer of that name, or one of those for the others, by its place."""
+    part = parts("proposer").get(mode)
+    if mode not in _MODE_COLORS and part is not None and part.colour is not None:
+        return part.colour << 8 | 0xFF
+    return _MODE_COLORS.get(mode, _OTHER_COLORS[place % len(_OTHER_COLORS)])
 
 
 def _token_lanes(chunks: Chunks, starts: NDArray[np.int64], dofs: int) -> list[Entity]:
