@@ -1,4 +1,4 @@
-"""Every proposer, opening and boundary is lossless under strict acceptance; HeiSD's choice and skip as defined."""
+"""Every proposer, in-prefill draft and boundary is lossless under strict acceptance; HeiSD's choice and skip."""
 
 from __future__ import annotations
 
@@ -21,26 +21,22 @@ from kerv_cli.decoding.proposers import (
     MergedProposer,
     PredictionProposer,
     RetrievalProposer,
+    Stateless,
 )
 from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
-from kerv_cli.drafting.datastore import Datastore, prompt_key
+from kerv_cli.drafting.datastore import Datastore, Manifest, prompt_key
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
+from kerv_cli.drafting.tree import TokenTree
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import (
-    AcceptanceSettings,
-    BoundarySettings,
-    DrafterSettings,
-    MethodSettings,
-    OpeningSettings,
-    ProposerSettings,
-    SkipSettings,
-)
-from kerv_cli.spaces import bins_of
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.parts import SimilaritySkipSettings
+from kerv_cli.settings import DrafterSettings
+from kerv_cli.targets.compact.target import CompactTarget
 
-D = 4
-STRICT = AcceptanceSettings("strict")
+SPACE = SPEC.actions
+D = SPACE.dofs
+HELD = SPACE.is_strict
 
 
 class KnownDraft:
@@ -50,18 +46,20 @@ class KnownDraft:
         self.odds = random.random()
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def drafted(self, prompt: torch.Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
+    def drafted(self, features: torch.Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
         return self.tokens, self.odds
 
 
-def stored(target: Target, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
+def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
     """A datastore whose entries lie around this prompt's key; entry i is of episode i."""
     random = np.random.default_rng(0)
-    key = prompt_key(prompt, target.settings, ["scene"])[0]
+    key = prompt_key(prompt, target, ["scene"])[0]
     vectors = key + 0.05 * random.standard_normal((len(chunks), len(key)))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     return Datastore(
-        manifest={"key": ["scene"]},
+        manifest=Manifest(
+            2, "datastore", ("scene",), len(key), len(chunks), target.chunk, SPACE, "t" * 64, "d" * 64, {}, {}
+        ),
         vectors=vectors.astype(np.float32),
         tokens=chunks.astype(np.uint8),
         seeds=np.arange(len(chunks)),
@@ -80,20 +78,20 @@ def situation(random: np.random.Generator, executed: int) -> Situation:
     return Situation("t", history, path, random)
 
 
-def proposers(target: Target, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:
+def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:
     random = np.random.default_rng(seed)
-    horizon = target.settings.chunk
+    horizon = target.chunk
     wrong = np.array([truth] * 4)
     wrong[random.random(wrong.shape) < 0.2] = random.integers(255)
     retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 40)
     drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
-    drafting = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
-    hold = PredictionProposer(Hold(D, minimum=1, horizon=horizon))
-    early = EarlyProposer(KnownDraft(truth, random))  # type: ignore[arg-type]
+    drafting = DrafterProposer(drafter, target, depth=4, top_k=2, nodes=6)
+    hold = PredictionProposer(Hold(HELD, minimum=1, horizon=horizon))
+    early = EarlyProposer(KnownDraft(truth, random), target)  # type: ignore[arg-type]
     return {
         "hold": hold,
-        "linear": PredictionProposer(Linear(D, minimum=2, horizon=horizon)),
-        "kalman": PredictionProposer(Kalman(Noise.uniform(D, 1.0), horizon=horizon)),
+        "linear": PredictionProposer(Linear(HELD, minimum=2, horizon=horizon)),
+        "kalman": PredictionProposer(Kalman(HELD, Noise.uniform(D, 1.0), horizon=horizon)),
         "early": early,
         "retrieval": retrieval,
         "merged": MergedProposer([early, retrieval], int(random.integers(1, 80)), [hold]),
@@ -102,23 +100,22 @@ def proposers(target: Target, prompt: torch.Tensor, truth: list[int], seed: int)
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), depth=st.integers(1, 40), data=st.data())
+@given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), data=st.data())
 @pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "hybrid"])
-def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, depth: int, data: st.DataObject) -> None:
+def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, data: st.DataObject) -> None:
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
     proposer = proposers(target, prompt, truth, seed)[name]
     steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
-    method = MethodSettings("test", ProposerSettings(name, depth, 2, 80), STRICT, chunk=steps)
     boundary = Random(0.5) if name == "hybrid" else None
-    decoder = Decoder(target, method, Parts(proposer=proposer, boundary=boundary))
+    decoder = Decoder(target, Parts(proposer=proposer, boundary=boundary), chunk=steps)
     decoder.situation = situation(np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
     for _ in range(2):  # the second decode finds the parts as the first left them
         result = decoder.decode_prompt(prompt)
         assert result.tokens == truth[: (steps or chunk) * D]
         assert_adds_up(result)
-        assert all(len(r.drafted) <= depth for r in result.rounds)
+        assert all(len(r.drafted) <= 4 for r in result.rounds if r.proposer == "drafter")  # its depth
 
 
 @settings(max_examples=25, deadline=None)
@@ -126,17 +123,15 @@ def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, depth: int
     seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), executed=st.integers(0, 12), carry_on=st.booleans()
 )
 @pytest.mark.parametrize("name", ["hold", "kalman", "early", "retrieval", "merged"])
-def test_every_opening_is_lossless(name: str, seed: int, chunk: int, executed: int, carry_on: bool) -> None:
+def test_every_in_prefill_draft_is_lossless(name: str, seed: int, chunk: int, executed: int, carry_on: bool) -> None:
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
     known = proposers(target, prompt, truth, seed)
-    opening = OpeningSettings([name], 80)
-    method = MethodSettings("test", ProposerSettings("hybrid", 5, 2, 80), STRICT, opening=opening)
-    parts = Parts(opening=known[name])
+    parts = Parts(prefill_draft=known[name])
     if carry_on:
-        parts = Parts(opening=known[name], proposer=known["hybrid"], boundary=Random(0.5))
-    decoder = Decoder(target, method, parts)
+        parts = Parts(prefill_draft=known[name], proposer=known["hybrid"], boundary=Random(0.5))
+    decoder = Decoder(target, parts)
     decoder.situation = situation(np.random.default_rng(seed), executed)
     result = decoder.decode_prompt(prompt)
     assert result.tokens == truth
@@ -145,12 +140,12 @@ def test_every_opening_is_lossless(name: str, seed: int, chunk: int, executed: i
 
 def test_a_prediction_counts_committed_steps_as_executed() -> None:
     target = random_target(1, 1, 1, 4)
-    chunk = Chunk(torch.zeros(1, 1, 16), 16, D, target.trunk.new_cache(1, 4), situation(np.random.default_rng(0), 5))
+    chunk = Chunk(torch.zeros(1, 1, 16), 4, SPACE, target.new_cache(1, 4), situation(np.random.default_rng(0), 5))
     chunk.tokens = [10, 20, 30, 254, 40]
-    proposer = PredictionProposer(Hold(D, minimum=1, horizon=4))
+    proposer = PredictionProposer(Hold(HELD, minimum=1, horizon=4))
     assert proposer.chains(chunk, 7) == [[20, 30, 254, 10, 20, 30, 254]]
     chunk.tokens = []
-    last = bins_of(chunk.situation.history.values()[-1]).tolist()
+    last = SPACE.bins_of(chunk.situation.history.values()[-1]).tolist()
     assert proposer.chains(chunk, 15) == [(last * 4)[:15]]
 
 
@@ -171,11 +166,11 @@ def test_merging_drops_what_is_named_last_and_cuts_the_last_branch() -> None:
     assert MergedProposer([one, two], 7).propose(chunk, 3).tokens == (1, 2, 3, 5, 6)
     assert MergedProposer([two, one], 2).propose(chunk, 3).tokens == (9, 9)
     assert (MergedProposer([one, two], 8).name, MergedProposer([two], 8).name) == ("merged", "two")
-    spared = MergedProposer([two], 8, [one])
-    assert spared.name == "merged"
-    assert spared.propose(chunk, 3).tokens == (9, 9, 9, 1, 2, 3, 5, 6)
+    careful = MergedProposer([two], 8, fallback=[one])
+    assert careful.name == "merged"
+    assert careful.propose(chunk, 3).tokens == (9, 9, 9, 1, 2, 3, 5, 6)
     two.sure = True
-    assert spared.propose(chunk, 3).tokens == (9, 9, 9)
+    assert careful.propose(chunk, 3).tokens == (9, 9, 9)
 
 
 # --- HeiSD: choice and skip
@@ -189,10 +184,8 @@ def skipping(
     tokens = list(range(16))
     store = stored(target, prompt, np.array([tokens] * entries), left)
     retrieval = RetrievalProposer(store, target, 1, 16)
-    skip = VerifySkip(SkipSettings("similarity", **changes), retrieval, SkipLevels(0.4, s_min, 0.9))
-    decoder = Decoder(
-        target, MethodSettings("test", ProposerSettings("retrieval")), Parts(proposer=retrieval, skip=skip)
-    )
+    skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, SkipLevels(0.4, s_min, 0.9))
+    decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
     decoder.situation = situation(np.random.default_rng(0), 3)
     return decoder, prompt, tokens
 
@@ -238,17 +231,17 @@ def test_nothing_is_skipped_on_the_drafters_side() -> None:
     decoder, prompt, _ = skipping()
     retrieval = decoder.parts.proposer
     drafter = Drafter.beside(DrafterSettings(), decoder.target).eval().requires_grad_(False)
-    drafting = DrafterProposer(drafter, decoder.target, ProposerSettings("drafter", 4, 1, 4))
+    drafting = DrafterProposer(drafter, decoder.target, depth=4, top_k=1, nodes=4)
     for p, forwards in ((0.0, True), (1.0, False)):
         parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=Random(p), skip=decoder.parts.skip)  # type: ignore[arg-type]
-        hybrid = Decoder(decoder.target, MethodSettings("test", ProposerSettings("hybrid")), parts)
+        hybrid = Decoder(decoder.target, parts)
         hybrid.situation = decoder.situation
         assert (hybrid.decode_prompt(prompt).forwards > 0) == forwards
 
 
 def test_a_seed_gives_the_random_boundary_its_own_numbers() -> None:
     decoder, _, _ = skipping()
-    decoder.method.boundary = BoundarySettings("random")
+    decoder = Decoder(decoder.target, Parts(boundary=Random(0.5)))
     drawn = []
     for seed in (5, 5, 6):
         decoder.reset("t", "open the drawer", seed)
@@ -258,4 +251,24 @@ def test_a_seed_gives_the_random_boundary_its_own_numbers() -> None:
 
 def test_a_chunk_longer_than_the_target_knows_is_refused() -> None:
     with pytest.raises(UsageError, match="trained for 4 control steps"):
-        Decoder(random_target(0, 1, 1, 4), MethodSettings(chunk=5))
+        Decoder(random_target(0, 1, 1, 4), chunk=5)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_the_cache_has_room_for_the_largest_tree_a_proposer_names(before: bool) -> None:
+    """A proposer that drafts more nodes than a chunk has tokens."""
+    target = random_target(1, 1, 1, 1)
+    prompt = random_prompt(target, 1)
+    truth = plain_greedy(target, prompt)
+
+    class Wide(Stateless):
+        name, nodes = "wide", 200
+
+        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+            right = truth[len(chunk.tokens)]
+            return TokenTree.build([*[(right + 1) % 255] * 199, right], [-1] * 200)
+
+    parts = Parts(prefill_draft=Wide()) if before else Parts(proposer=Wide())
+    result = Decoder(target, parts).decode_prompt(prompt)
+    assert result.tokens == truth
+    assert max(r.tree_size for r in result.rounds) == 200

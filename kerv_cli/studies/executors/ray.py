@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import RayOptions
+from kerv_cli.parts import RayOptions
 from kerv_cli.studies.executors import THREAD_VARIABLES, Executor, WorkerLost
 
 T = TypeVar("T")
