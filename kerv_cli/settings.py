@@ -117,7 +117,7 @@ class SweepSettings:
 
 @dataclass
 class TargetSettings:
-    """Shapes of the target (METHODS §0). `conf/target/*.yaml` are the sizes."""
+    """Shapes of the target (docs/methods.md §0). `conf/target/*.yaml` are the sizes."""
 
     size: str = "small"
     observation: str = "vision"  # vision | state (privileged: the places' positions are given)
@@ -188,8 +188,8 @@ class DemosSettings:
 
 @dataclass
 class DrafterSettings:
-    """Shapes of a drafter. eagle: decoder layers of the target's width, behind its states (METHODS §2.2). early: a
-    residual network from the prompt and the last actions to the whole chunk, before the target runs (METHODS §5)."""
+    """Shapes of a drafter (docs/methods.md). eagle: decoder layers of the target's width, behind its states (§2.2).
+    early: a residual network from the prompt and the last actions to the whole chunk, before the target runs (§5)."""
 
     kind: str = "eagle"  # eagle | early
     layers: int = 1

@@ -145,8 +145,8 @@ def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
     for same in ("train.init=old", f"train.init={results}/artifacts/target/old"):
         with pytest.raises(UsageError, match="would be overwritten"):
             TargetRun(settings(results, "name=old", same))
-    with pytest.raises(UsageError, match=r"unknown key 'train\.init'"):
-        compose("train_drafter", ["train.init=old"], TrainDrafterSettings)
+    with pytest.raises(UsageError, match=r"train\.init=old: only 'kerv train target'"):
+        runs.drafter_run(compose("train_drafter", ["train.init=old"], TrainDrafterSettings))
 
 
 def test_the_plan_names_it(results: Path) -> None:

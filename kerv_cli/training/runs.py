@@ -15,13 +15,13 @@ from torch import nn
 from kerv_cli.artifacts import artifact_folder
 from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
-from kerv_cli.environments import resolve_tasks
+from kerv_cli.environments import resolve_tasks, settled, spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
-from kerv_cli.settings import EVALUATION_SEED, TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import Distillation, distillation_job, teach
@@ -41,8 +41,6 @@ from kerv_cli.training.imitation import (
 from kerv_cli.training.loop import Job, Loop, Metrics
 
 Progress = Callable[[int, int], None]
-VALIDATION_SEED = EVALUATION_SEED // 2
-"""First seed of closed-loop validation: neither a training seed nor an evaluation seed."""
 
 
 def determining(train: TrainSettings) -> dict[str, Any]:
@@ -64,6 +62,8 @@ class TargetRun:
     def __init__(self, settings: TrainTargetSettings) -> None:
         self.settings = settings
         self.tasks = resolve_tasks(settings.task)
+        self.spec = spec_of(self.tasks[0])
+        self.world = settled(settings.world, self.spec)
         if settings.target.observation not in ("vision", "state"):
             raise UsageError(f"target.observation={settings.target.observation}: vision or state")
         if settings.target.image_size != settings.world.camera.size:
@@ -74,9 +74,24 @@ class TargetRun:
         self.folder = artifact(settings.results, "target", settings.name)
         self.init = self.find_init()
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.check_demos()
         self.samples: Samples | None = None
         self.begun: CompactTarget | None = None
         self.origin: dict[str, str] = {}  # hash of the weights that the run begins with, where they are not fresh
+
+    def check_demos(self) -> None:
+        """Refuse demonstrations of another environment, or frames of another camera than the policy will be shown.
+
+        Raises:
+            CheckpointError: they are.
+        """
+        manifest, where = self.dataset.manifest, f"the demonstrations in {self.dataset.path}"
+        manifest.actions.check_same(self.spec.actions, where, f"the tasks' environment {self.spec.name}")
+        if self.settings.target.observation == "vision" and manifest.config["camera"]["name"] != self.world.camera.name:
+            raise CheckpointError(
+                f"{where} show camera {manifest.config['camera']['name']}, the policy would be shown "
+                f"{self.world.camera.name}: set world.camera.name, or record again"
+            )
 
     def find_init(self) -> Path | None:
         """The folder of the target that the run begins with."""
@@ -116,7 +131,7 @@ class TargetRun:
         assert self.samples is not None
         settings = self.settings
         if self.begun is None:
-            camera = settings.world.camera.name
+            camera = self.world.camera.name
             words = vocabulary(self.dataset.manifest.environment)
             target = new_target(settings.target, self.dataset, self.samples, words, camera, settings.train.seed)
         else:
@@ -136,11 +151,11 @@ class TargetRun:
         return loop.run(on_step)
 
     def closed_loop(self, target: CompactTarget) -> float:
-        """Success in [0, 1] of greedy decoding over the tasks, on seeds of their own."""
+        """Success in [0, 1] of greedy decoding over the tasks, on selection seeds."""
         from kerv_cli.rollouts.run import success_of
 
-        seeds = range(VALIDATION_SEED, VALIDATION_SEED + self.settings.train.closed_loop)
-        return success_of(target, self.tasks, seeds, self.settings.world)
+        seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
+        return success_of(target, self.tasks, seeds, self.world)
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Write the weights and what made them."""

@@ -10,6 +10,7 @@ privileged, to separate decoding from perception.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +52,8 @@ class Inputs:
 class CompactTarget(Packable):
     """The policy put together; see `targets/protocol.py`. Parameters in float32.
 
-    cameras: of a vision policy, the one whose images it reads. sha256: of the weights it was loaded with, else empty.
+    cameras: of a vision policy, the one whose images it reads. segments: where the prompt's parts lie, in order.
+    sha256: of the weights it was loaded with, else empty.
     """
 
     centre: Tensor
@@ -69,6 +71,7 @@ class CompactTarget(Packable):
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
         self.cameras = (camera,) if s.observation == "vision" else ()
+        self.segments = _segments(s)
         felt, places = len(observation.proprioception), len(observation.places)
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.embedding = nn.Embedding(actions.tokens, s.width)
@@ -117,16 +120,6 @@ class CompactTarget(Packable):
     def max_prompt(self) -> int:
         """P, the same for every observation and instruction."""
         return self.segments["proprioception"].stop
-
-    @property
-    def segments(self) -> Mapping[str, slice]:
-        """Where the prompt's parts lie, in order."""
-        s = self.settings
-        sizes = {"instruction": s.instruction_tokens, "scene": s.scene_tokens, "proprioception": 1}
-        if self.cameras:
-            sizes = {"vision": s.grid**2, **sizes}
-        stops = np.cumsum(list(sizes.values())).tolist()
-        return {name: slice(stop - size, stop) for (name, size), stop in zip(sizes.items(), stops, strict=True)}
 
     @property
     def pooled_width(self) -> int:
@@ -242,6 +235,14 @@ class CompactTarget(Packable):
         x = torch.cat([prompt, self.embedding(tokens[:, :-1]).to(prompt.dtype)], 1)
         hidden = self(x, torch.arange(x.shape[1], device=x.device))
         return self.head(hidden[:, prompt.shape[1] - 1 :]), places
+
+
+def _segments(settings: TargetSettings) -> Mapping[str, slice]:
+    sizes = {"instruction": settings.instruction_tokens, "scene": settings.scene_tokens, "proprioception": 1}
+    if settings.observation == "vision":
+        sizes = {"vision": settings.grid**2, **sizes}
+    stops = itertools.accumulate(sizes.values())
+    return {name: slice(stop - size, stop) for (name, size), stop in zip(sizes.items(), stops, strict=True)}
 
 
 def _smooth_table(tokens: int, width: int) -> Tensor:

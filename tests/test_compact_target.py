@@ -1,0 +1,226 @@
+"""The compact target reads its spaces: Meta-World's features as ever, other environments' as well; its checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from examples.own_target import SEVEN
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import DrafterProposer, EarlyProposer
+from kerv_cli.drafting.eagle import load_drafter, read_drafter
+from kerv_cli.drafting.early import load_early
+from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry
+from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import CheckpointError, UnknownName
+from kerv_cli.places import shipped_dir
+from kerv_cli.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.spaces import Observation, ObservationSpace, Place
+from kerv_cli.targets.checkpoint import load_target, read_target, save_target
+from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.training import runs
+from kerv_cli.training.imitation import Imitation, imitation_job, load_samples, new_target
+from kerv_cli.training.loop import Loop
+
+ARM = ObservationSpace(
+    proprioception=("x", "y", "z", "qw", "qx", "qy", "qz", "open"),
+    state=14,
+    places=(Place("peg", 8), Place("hole", 11)),
+    centre=(0.3, 0.0, 0.2),
+)
+"""Neither extras nor a step before."""
+
+# what Meta-World's features are, column by column
+
+
+def relative(vector: torch.Tensor) -> list[torch.Tensor]:
+    return [vector / 0.1, torch.tanh(vector / 0.02)]
+
+
+def test_metaworlds_columns_are_what_the_shipped_weights_were_trained_on() -> None:
+    states = torch.randn(5, 39, generator=torch.Generator().manual_seed(0)) * 0.2
+    hand, gripper, thing, second, goal = (states[:, a:b] for a, b in ((0, 3), (3, 4), (4, 7), (11, 14), (36, 39)))
+    centre = torch.tensor([0.0, 0.7, 0.15])
+    absolute = [(hand - centre) / 0.1, gripper, (thing - centre) / 0.1, (goal - centre) / 0.1]
+    vectors = [*relative(thing - hand), *relative(goal - hand), *relative(goal - thing)]
+    velocity = ((states[:, :18] - states[:, 18:36]) / 0.01).clamp(-3, 3)
+    beyond = [states[:, 7:18], velocity, *relative(second - hand), *relative(goal - second)]
+    space = SPEC.observation
+    found = scene_features(states[:, :4], places_of(states, space), torch.tensor(space.centre))
+    assert torch.equal(found, torch.cat([*absolute, *vectors], 1))
+    assert torch.equal(privileged_features(states[:, :4], states, space), torch.cat(beyond, 1))
+    assert found.shape[1] + torch.cat(beyond, 1).shape[1] == 69
+
+
+@given(felt=st.integers(3, 9), places=st.integers(1, 5), seed=st.integers(0, 1000))
+def test_features_of_any_space_depend_on_every_number(felt: int, places: int, seed: int) -> None:
+    space = ObservationSpace(
+        tuple(f"p{i}" for i in range(felt)), 3 * places, tuple(Place(f"o{i}", 3 * i) for i in range(places)), (0, 0, 0)
+    )
+    random = torch.Generator().manual_seed(seed)
+    hand, states = torch.randn(1, felt, generator=random) * 0.05, torch.randn(1, 3 * places, generator=random) * 0.05
+    plain = scene_features(hand, places_of(states, space), torch.zeros(3))
+    assert plain.shape == (1, scene_width(space))
+    for tensor in (hand, states):
+        for column in range(tensor.shape[1]):
+            moved = tensor.clone()
+            moved[0, column] += 0.01
+            other = (moved, states) if tensor is hand else (hand, moved)
+            assert not torch.equal(scene_features(other[0], places_of(other[1], space), torch.zeros(3)), plain)
+
+
+# checkpoints
+
+
+@pytest.mark.parametrize("name", ["mt10-vision", "mt10-state", "mt10-state-h8"])
+def test_the_shipped_targets_load_with_metaworlds_spaces(name: str) -> None:
+    target, description = load_target(shipped_dir() / name / "target")
+    assert isinstance(target, CompactTarget)
+    assert (description.family, description.environment) == ("compact", SPEC.name)
+    target.actions.check_same(SPEC.actions, "the target", "Meta-World")
+    assert target.observation == SPEC.observation
+    assert target.cameras == (("corner4",) if name == "mt10-vision" else ())
+    assert target.max_prompt == (31 if name == "mt10-vision" else 15)
+    drafter, _ = load_drafter(shipped_dir() / name / "drafter", target, target.sha256)
+    early, _ = load_early(shipped_dir() / name / "early", target, description)
+    assert (drafter.width, early.tokens) == (target.width, target.chunk * 4)
+
+
+def nano(space: ObservationSpace = ARM, observation: str = "state") -> CompactTarget:
+    settings = TargetSettings("nano", observation, 16, 1, 2, 24, chunk=2, keypoints=4, channels=8, scene_tokens=2)
+    return CompactTarget(settings, SEVEN, space, WordTokenizer.build(["insert the peg"]), "front")
+
+
+def damaged(folder: Path, **changes: object) -> Path:
+    save_target(folder, nano(), "insertion", {})
+    value = json.loads((folder / "target.json").read_text()) | changes
+    (folder / "target.json").write_text(json.dumps(value))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"actions": {"names": []}}, r"target\.json is damaged: actions"),
+        ({"actions": 3}, "damaged: actions"),
+        ({"observation": None}, "damaged: observation"),
+        ({"settings": {"width": 16, "colour": 1}}, "damaged: colour"),
+        ({"settings": {"chunk": 2, "observation": "state", "width": 32}}, "does not fit its own settings"),
+        ({"words": "insert"}, "damaged: words"),
+        ({"format": 9}, "written by another version"),
+        ({"surplus": 1}, "damaged: surplus"),
+    ],
+)
+def test_a_damaged_description_is_one_line(tmp_path: Path, changes: dict[str, object], says: str) -> None:
+    with pytest.raises(CheckpointError, match=says) as caught:
+        load_target(damaged(tmp_path, **changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_family_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(UnknownName, match="compact"):
+        load_target(damaged(tmp_path, family="compct"))
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    target = nano()
+    target.head.weight.data[0, 0] = torch.nan
+    save_target(tmp_path, target, "insertion", {})
+    with pytest.raises(CheckpointError, match=r"head\.weight that are not finite"):
+        load_target(tmp_path)
+
+
+def test_an_observation_of_another_environment_is_refused() -> None:
+    target, seeing = nano(), nano(observation="vision")
+    with pytest.raises(CheckpointError, match="8 numbers of proprioception and 14 of state, the environment gives 4"):
+        target.encode(Observation(np.zeros(4), np.zeros(39), "insert"))
+    with pytest.raises(CheckpointError, match="camera 'front'"):
+        seeing.encode(Observation(np.zeros(8), np.zeros(14), "insert"))
+
+
+# seven DoFs from demonstrations to decodes
+
+
+class Demos:
+    """Six made-up episodes of a task with seven DoFs."""
+
+    sha256, path = "e" * 64, Path("demos")
+    manifest = SimpleNamespace(config={}, environment="insertion", actions=SEVEN, observation=ARM)
+    episodes = tuple(DemoEntry(seed, bool(seed % 2), 9, 0, "", "insert", Path()) for seed in range(6))
+
+    def load(self, index: int) -> DemoEpisode:
+        random = np.random.default_rng(index)
+        labels = np.tanh(random.normal(size=(20, 7))).astype(np.float32)
+        states = random.normal(0, 0.1, (9, 14)).astype(np.float32)
+        nothing = np.zeros((1, 8, 8, 3), np.uint8), np.zeros(1, np.int64)
+        return DemoEpisode("insert", index, bool(index % 2), 9, *nothing, states, labels, labels[:9], np.zeros(3))
+
+
+@pytest.fixture
+def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A results folder with a trained target, drafter and early drafter of seven DoFs."""
+    monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: Demos()))
+    for module in ("imitation", "early_distillation"):
+        monkeypatch.setattr(f"kerv_cli.training.{module}.instruction_of", lambda name: "insert the peg")
+    train = TrainSettings(steps=4, batch=4, warmup=1, validate_every=2, held_out=0.34, bf16=False)
+    dataset, settings = Demos(), nano().settings
+    words = WordTokenizer.build(["insert the peg"])
+    samples = load_samples(dataset, settings, words, ("insert",))  # type: ignore[arg-type]
+    target = new_target(settings, dataset, samples, words, "front", 0)  # type: ignore[arg-type]
+    folder = tmp_path / "artifacts/target/arm"
+    run = Imitation(target, samples, train, torch.device("cpu"))
+    job = imitation_job(run, lambda module, metrics: save_target(folder, module, "insertion", {}))  # type: ignore
+    metrics = Loop(job, train, folder, "seven").run()
+    assert {f"l1_{name}" for name in SEVEN.names} <= metrics.keys()
+    for drafter in (
+        DrafterSettings(samples=12, unroll=2),
+        DrafterSettings(kind="early", layers=1, width=16, rank=4, history=2, samples=30),
+    ):
+        asked = TrainDrafterSettings(
+            policy=PolicySettings(target="arm"), drafter=drafter, train=train, results=str(tmp_path)
+        )
+        made = runs.drafter_run(asked)
+        made.load(lambda done, total: None)
+        made.train(lambda step, metrics: None)
+    return tmp_path
+
+
+def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(seven: Path) -> None:
+    target, description = load_target(seven / "artifacts/target/arm")
+    target.actions.check_same(SEVEN, "the target", "the arm")
+    drafter, _ = load_drafter(seven / "artifacts/drafter/arm", target, description.sha256)
+    early, _ = load_early(seven / "artifacts/early/arm", target, description)
+    assert early.strict.tolist() == [dof == 6 for dof in range(7)] * 2
+    random = np.random.default_rng(0)
+    shown = Observation(random.normal(0, 0.1, 8), random.normal(0, 0.1, 14), "insert the peg")
+    plain = Decoder(target).decode(shown)
+    assert plain.actions.shape == (2, 7)
+    for parts in (
+        Parts(proposer=DrafterProposer(drafter, target, 5, 3, 12)),
+        Parts(prefill_draft=EarlyProposer(early, target)),
+    ):
+        assert Decoder(target, parts).decode(shown).tokens == plain.tokens
+
+
+def test_a_drafter_of_other_actions_is_refused(seven: Path) -> None:
+    description = read_target(seven / "artifacts/target/arm")
+    folder = seven / "artifacts/drafter/arm"
+    shutil.copytree(folder, seven / "copied")
+    rigid = dataclasses.replace(description.actions, strict=("droll",))
+    with pytest.raises(CheckpointError, match="strict gripper, the target one with droll"):
+        read_drafter(folder, description.sha256, rigid)
+    wider = dataclasses.replace(description.actions, high=tuple(2 * x for x in description.actions.high))
+    with pytest.raises(CheckpointError, match="action space with high"):
+        read_drafter(folder, description.sha256, wider)
