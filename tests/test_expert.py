@@ -71,6 +71,7 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     assert (stored[3]["mode"], stored[3]["tokens"], stored[3]["rounds"]) == ("expert", [], [])
     frame = pd.DataFrame(pq.read_table(io.BytesIO(parquet_bytes([row], EPISODE_SCHEMA))).to_pylist())
     frame = frame.assign(difficulty=task(NAME).difficulty, initial_state=str(row["initial_state"]), **STAMPS)
+    frame["decode_seconds"] = [np.array([decode.seconds for decode in episode.decodes])]
     slow = frame.assign(seconds=frame["seconds"] * 10, success=False)
     for averaging in (MICRO, MACRO):
         found = measure(frame, slow, averaging)
