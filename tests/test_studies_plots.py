@@ -13,7 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 from studies_synthetic import IDENTITY, run_cell, settings_of
 
-from kerv_cli.reporting.drawing import STYLE, new_figure
+from kerv_cli.registry import Part
+from kerv_cli.reporting.drawing import COLOURS, INK, STYLE, new_figure, setting_colours
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.plots import series_of, study_figures
 from kerv_cli.reporting.scatter import place_labels
@@ -116,6 +117,19 @@ def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
     marks = [line for line in panel.get_lines() if line.get_marker() == "|"]
     assert [list(line.get_xdata()) for line in marks] == [list(known)]
     assert panel.get_xlim()[1] > known.max()
+
+
+def test_a_part_gives_its_setting_a_colour_once_and_the_baseline_is_ink(monkeypatch: pytest.MonkeyPatch) -> None:
+    drafter = Part("proposer", "drafter", "nowhere:build", colour=0x123456)
+    monkeypatch.setattr(
+        "kerv_cli.reporting.drawing.parts", lambda kind: {"drafter": drafter} if kind == "proposer" else {}
+    )
+    kinds = {"ar": "none", "spec_vla": "drafter", "hold": "hold", "kerv": "drafter"}
+    rows = [{"label": label, "baseline": "ar", "proposer.kind": kind} for label, kind in kinds.items()]
+    shades = setting_colours(rows)
+    assert shades[:2] == [INK, "#123456"]
+    assert shades[2:] == list(COLOURS[:2])
+    assert len(setting_colours([{"label": str(i), "baseline": "ar"} for i in range(30)])) == 30
 
 
 def test_labels_keep_apart_in_a_crowd() -> None:

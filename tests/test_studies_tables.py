@@ -264,6 +264,9 @@ def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:
 
 def test_another_run_is_compared_and_said(tmp_path: Path) -> None:
     row = write_reach(tmp_path, run="r2")
+    table = study_table(load_study(StudyStore(tmp_path, "hand")))
+    assert summary_frame(table)["speedup"].tolist() == ["1", "2.67 (2.00–6.00)*"]
+    assert "* not all of its pairs were measured in one run" in " ".join(printed(table))
     assert row["speedup"] == pytest.approx(0.4 / 0.15)
     assert row["same_run"] is False
 

@@ -1,4 +1,5 @@
-"""How fast a method could be at best: every chunk accepted whole at once, its drafts for nothing (METHODS §5)."""
+"""How fast a method could be at best: every chunk accepted whole at once, its drafts for nothing
+(docs/methods.md §5)."""
 
 from __future__ import annotations
 

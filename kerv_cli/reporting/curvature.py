@@ -1,5 +1,5 @@
 """Does a measure of curvature tell arcs from lines? Ours and the public code's, on paths whose radius is known
-(METHODS §4.4)."""
+(docs/methods.md §4.4)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MEASURES = (
 
 
 def pseudo_radius(points: np.ndarray) -> float:
-    """What METHODS §4.4 says of the peers' public code: a constant times the mean speed of points (n, 3), metres."""
+    """The public code's measure (docs/methods.md §4.4): a constant times the mean speed of points (n, 3), metres."""
     return 10.0 * path_length(points) / (len(points) - 1)
 
 

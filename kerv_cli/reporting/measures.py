@@ -1,4 +1,4 @@
-"""The quantities of METHODS §7, from episodes."""
+"""The quantities of docs/methods.md §7, from episodes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """How well the Kalman filter predicts the next actions, beside holding the last one and prolonging the last two: the
-errors that `kerv calibrate` measured on held-out demonstrations (METHODS §3.1)."""
+errors that `kerv calibrate` measured on held-out demonstrations (docs/methods.md §3.1)."""
 
 from __future__ import annotations
 

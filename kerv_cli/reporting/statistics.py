@@ -1,4 +1,4 @@
-"""Intervals and tests of METHODS §7. Numbers in, numbers out: no tables here."""
+"""Intervals and tests of docs/methods.md §7. Numbers in, numbers out: no tables here."""
 
 from __future__ import annotations
 

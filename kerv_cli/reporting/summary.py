@@ -14,6 +14,8 @@ from rich.text import Text
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.tables import is_number
 
+APART = "*"
+
 _ALWAYS = {"AL": "AL", "AFEP": "AFEP", "forwards_per_step": "forwards / step"}
 _WHERE_USED = {
     "skip_rate": "skipped",
@@ -29,6 +31,8 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     frame = _narrow(summary_frame(table, averaging))
     title = Text(_title(table, averaging), style="bold")
     caption = f"brackets: 95 % intervals; p: exact McNemar test against {table['baseline'].iloc[0]}"
+    if frame["speedup"].str.endswith(APART).any():
+        caption += f"\n{APART} not all of its pairs were measured in one run"
     if "ceiling" in frame:
         caption += "\nceiling: speedup if every chunk were accepted whole at once"
     printed = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD)
@@ -66,13 +70,18 @@ def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) ->
     return {
         "setting": str(row["label"]),
         "success %": _interval(row, "success", 100.0, 0),
-        "speedup": "1" if reference else _interval(row, "speedup", 1.0, 2),
+        "speedup": "1" if reference else _interval(row, "speedup", 1.0, 2) + _apart(row),
         **({"ceiling": number(row["ceiling"])} if limited else {}),
         "ms / step": number(row["time_per_step_ms"]),
         **{name: _percent(row[key]) if key in _PERCENT else number(row[key]) for key, name in columns.items()},
         "lost/won": "" if reference or not row["pairs"] else f"{row['only_baseline']}/{row['only_method']}",
         "p": "" if reference or not row["pairs"] else _p(row["mcnemar_p"]),
     }
+
+
+def _apart(row: Mapping[str, Any]) -> str:
+    """The mark of a speedup whose two sides were measured at different times."""
+    return APART if is_number(row["speedup"]) and not row["same_run"] else ""
 
 
 def _p(value: float) -> str:
