@@ -182,7 +182,7 @@ def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:
     return list(walk(_composed(command, choices, schema), ""))
 
 
-def _one_line(error: Exception) -> str:
+def _one_line(error: BaseException) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     useful = [line for line in lines if not line.startswith(("object_type", "reference_type", "See https"))]
     keys = [line for line in useful if line.startswith("full_key:")]

@@ -83,9 +83,12 @@ def load(name: str) -> Any:
     """
     module, _, attribute = name.partition(":")
     try:
-        return getattr(importlib.import_module(module), attribute)
-    except AttributeError:
-        raise UsageError(f"{module} has no {attribute}") from None
+        found = importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(f"{module} cannot be imported: {error}") from error
+    if not hasattr(found, attribute):
+        raise UsageError(f"{module} has no {attribute}")
+    return getattr(found, attribute)
 
 
 def find(kind: str, name: str, what: str = "") -> Part:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,19 +16,20 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
 
     from kerv_cli.config import compose
     from kerv_cli.drafting.eagle import Drafter, save_drafter
+    from kerv_cli.environments.metaworld.spec import SPEC
     from kerv_cli.settings import DrafterSettings, TrainTargetSettings
-    from kerv_cli.spaces import ActionTokenizer
     from kerv_cli.targets.checkpoint import save_target
-    from kerv_cli.targets.compact.target import Target
+    from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
 
     torch.manual_seed(seed)
     settings = compose("train_target", ["target=nano", f"target.observation={observation}"], TrainTargetSettings)
-    target = Target(settings.target, ActionTokenizer(-np.ones(4), np.ones(4)), vocabulary())
+    camera = settings.world.camera.name
+    target = CompactTarget(settings.target, SPEC.actions, SPEC.observation, vocabulary(SPEC.name), camera)
     provenance = {"parameters": sum(p.numel() for p in target.parameters())}
-    digest = save_target(results / "artifacts" / "target" / name, target, provenance)
+    digest = save_target(results / "artifacts" / "target" / name, target, "metaworld", provenance)
     drafter = Drafter.beside(DrafterSettings(), target)
-    save_drafter(results / "artifacts" / "drafter" / name, drafter, digest, provenance)
+    save_drafter(results / "artifacts" / "drafter" / name, drafter, target, digest, provenance)
 
 
 @pytest.fixture(scope="session")

@@ -1,19 +1,150 @@
-"""Parts that do not belong together get one line before a policy is loaded, whatever the command."""
+"""What a method is composed of: every preset's parts, what each needs, and one line for what does not fit."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from typing import Any
+
 import pytest
 
+from kerv_cli import parts as p
 from kerv_cli.config import compose, groups
-from kerv_cli.errors import KervError
-from kerv_cli.rollouts.composition import check_composition
-from kerv_cli.rollouts.policy import needs_calibration, needs_datastore, needs_drafter, needs_early
-from kerv_cli.settings import RolloutSettings
+from kerv_cli.decoding.build import check, needs
+from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.rollouts.policy import check as check_rollout
+from kerv_cli.settings import RolloutSettings, as_plain, settings_from
+
+METHODS = groups()["method"]
+AR: dict[str, Any] = {
+    "prefill_draft": p.Nothing(),
+    "proposer": p.Nothing(),
+    "acceptance": p.StrictAcceptanceSettings(),
+    "threshold": p.FixedThresholdSettings(r=9),
+    "rectifier": p.ReinferSettings(),
+    "boundary": p.ConstantBoundarySettings(),
+    "skip": p.Nothing(),
+}
+CHAIN = p.DrafterProposerSettings(depth=15, top_k=1, nodes=15)
+RELAXED = p.RelaxedAcceptanceSettings(strict_dofs=True)
+SKIP = p.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.25, down=0.05)
+K_LEVEL = p.KinematicThresholdSettings(r_min=5, r_max=15, phi=2.0, k_s=None)
+BOUNDARY = p.FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5)
+ONE_PASS = {
+    "prefill_draft": p.MergedProposerSettings(sources=["early"], fallback=["hold"], nodes=48, neighbours=1),
+    "acceptance": RELAXED,
+    "rectifier": p.CompensateSettings(predictor="draft"),
+}
+PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a default that moves is a preset that moves
+    "ar": {},
+    "expert": {},  # a policy, no way of decoding
+    "naive_sd": {"proposer": p.DrafterProposerSettings(depth=5, top_k=1, nodes=5)},
+    "spec_vla": {"proposer": CHAIN, "acceptance": RELAXED},
+    "jacobi": {"proposer": p.JacobiProposerSettings(depth=0)},
+    "hold": {"proposer": p.PredictionProposerSettings("hold"), "acceptance": RELAXED},
+    "kalman_only": {"proposer": p.PredictionProposerSettings("kalman"), "acceptance": RELAXED},
+    "kerv": {
+        "proposer": CHAIN,
+        "acceptance": RELAXED,
+        "threshold": K_LEVEL,
+        "rectifier": p.CompensateSettings("compensate", "damped", 1, True, 1, 0, -1),
+    },
+    "kerv_paper": {
+        "proposer": p.DrafterProposerSettings(depth=5, top_k=8, nodes=50),
+        "acceptance": p.RelaxedAcceptanceSettings(strict_dofs=False),
+        "threshold": K_LEVEL,
+        "rectifier": p.CompensateSettings("compensate", "kalman", 1, False, 1, 4, -1),
+    },
+    "heisd": {
+        "proposer": p.HybridProposerSettings(depth=15, top_k=1, nodes=24, neighbours=3),
+        "acceptance": p.HybridAcceptanceSettings(strict_dofs=True, group_limit=30, token_limit=15),
+        "boundary": dataclasses.replace(BOUNDARY, f_star=0.3),
+        "skip": SKIP,
+    },
+    "heisd_paper": {
+        "proposer": p.HybridProposerSettings(depth=5, top_k=8, nodes=50, neighbours=5),
+        "acceptance": p.HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
+        "boundary": BOUNDARY,
+        "skip": SKIP,
+    },
+    "retrieval_only": {
+        "proposer": p.RetrievalProposerSettings(neighbours=5, nodes=50),
+        "acceptance": p.SequenceAcceptanceSettings(group_limit=30, token_limit=15),
+    },
+    "one_pass": ONE_PASS,
+    "one_pass_skip": {**ONE_PASS, "skip": SKIP},
+    "one_pass_strict": {"prefill_draft": p.EarlyProposerSettings(), "proposer": p.JacobiProposerSettings(depth=0)},
+}
 
 
-@pytest.mark.parametrize("method", groups()["method"])
-def test_every_shipped_method_fits_together(method: str) -> None:
-    check_composition(compose("rollout", [f"method={method}"], RolloutSettings).parts(), 4)
+def composed(*overrides: str) -> RolloutSettings:
+    return compose("rollout", overrides, RolloutSettings)
+
+
+def test_every_method_has_a_row_here() -> None:
+    assert set(METHODS) == set(PRESETS)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
+    asked = composed(f"method={method}")
+    assert asked.method == method
+    assert asked.policy.kind == ("expert" if method == "expert" else "model")
+    assert asked.parts() == {**AR, **PRESETS[method]}
+    assert (asked.chunk, asked.datastore) == (0, p.ExactSearchSettings())
+    check(asked.parts(), asked.chunk, 4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_part_of_a_preset_can_be_replaced(method: str) -> None:
+    words = "prefill_draft=hold proposer=retrieval acceptance=sequence threshold=schedule rectifier=reinfer"
+    asked = composed(f"method={method}", *words.split(), "boundary=random", "skip=none", "threshold.tau=7")
+    replaced = {
+        "prefill_draft": p.PredictionProposerSettings("hold"),
+        "proposer": p.RetrievalProposerSettings(),
+        "acceptance": p.SequenceAcceptanceSettings(),
+        "threshold": p.ScheduleThresholdSettings(tau=7.0),
+        "boundary": p.RandomBoundarySettings(),
+    }
+    assert asked.parts() == {**AR, **replaced}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_settings_survive_a_file(method: str) -> None:
+    asked = composed(f"method={method}", "threshold=change", "datastore=qdrant", "+policy.others={own: mine}")
+    plain = as_plain(asked)
+    assert settings_from(plain) == asked
+    again = settings_from(json.loads(json.dumps(plain)))
+    assert again == asked
+    for kind, part in asked.parts().items():
+        assert type(getattr(again, kind)) is type(part)
+
+
+def damaged(change: Any) -> dict[str, Any]:
+    plain = as_plain(composed("method=spec_vla"))
+    change(plain)
+    return plain
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        (lambda s: s["proposer"].update(depht=3), CheckpointError, "a stored setting's proposer is damaged: depht"),
+        (lambda s: s["proposer"].update(depth="many"), CheckpointError, "proposer is damaged: depth"),
+        (lambda s: s["world"]["camera"].update(size=1.5), CheckpointError, "a stored setting is damaged: world.camera"),
+        (lambda s: s.update(episode=3), CheckpointError, "a stored setting is damaged: episode"),
+        (
+            lambda s: s["proposer"].update(kind="draftr"),
+            UnknownName,
+            "unknown proposer.kind 'draftr': did you mean dra",
+        ),
+    ],
+)
+def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Exception], says: str) -> None:
+    with pytest.raises(error) as refused:
+        settings_from(damaged(change))
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -21,50 +152,104 @@ def test_every_shipped_method_fits_together(method: str) -> None:
     [
         ("method=heisd boundary=always", "proposer=hybrid with boundary=always"),
         ("method=spec_vla boundary=fused", "proposer=drafter with boundary=fused"),
-        ("method=expert skip=similarity", "the expert verifies nothing"),
-        ("opening.sources=[early,nope]", "source of an opening 'nope'"),
-        ("opening.sources=[early] opening.nodes=0", "opening.nodes=0"),
+        ("method=one_pass prefill_draft.sources=[early,nope]", "source of a merged draft 'nope'"),
+        ("method=one_pass prefill_draft.fallback=[drafter]", "source 'drafter' of a merged draft"),
+        ("method=one_pass prefill_draft.sources=[merged]", "source 'merged' of a merged draft"),
+        ("method=one_pass prefill_draft.sources=[]", "name at least one of sources"),
+        ("method=one_pass prefill_draft.nodes=0", "nodes=0"),
+        ("prefill_draft=retrieval prefill_draft.neighbours=0", "neighbours=0"),
+        ("prefill_draft.kind=drafter", "prefill_draft=drafter"),
         ("chunk=5", "trained for 4 control steps"),
+        ("chunk=-1", "trained for 4 control steps"),
         ("proposer.kind=nope", "proposer.kind 'nope'"),
+        ("proposer=drafter proposer.kind=hold", "choose proposer=hold"),
         ("boundary.kind=nope", "boundary.kind 'nope'"),
         ("method=heisd boundary.window=2", "boundary.window=2"),
         ("rectifier.kind=nope", "rectifier.kind 'nope'"),
         ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
         ("skip.kind=nope", "skip.kind 'nope'"),
-        ("method=spec_vla proposer.depth=0", "proposer.depth"),
-        ("method=retrieval_only proposer.neighbours=0", "at least one neighbour"),
-        ("opening=retrieval opening.neighbours=0", "at least one neighbour"),
+        ("method=heisd skip.max_skips=0", "skip.max_skips=0"),
+        ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
+        ("method=jacobi proposer.depth=-1", "proposer.depth=-1"),
+        ("method=retrieval_only proposer.neighbours=0", "proposer.neighbours=0"),
+        ("threshold.r=-1", "threshold.r=-1"),
     ],
 )
 def test_what_does_not_belong_together_is_refused(overrides: str, says: str) -> None:
-    method = compose("rollout", overrides.split(), RolloutSettings).parts()
+    asked = composed(*overrides.split())
     with pytest.raises(KervError) as refused:
-        check_composition(method, 4)
+        check(asked.parts(), asked.chunk, 4)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
+def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
+    before = groups()["prefill_draft"]
+    assert {"none", "early", "hold", "kalman", "retrieval", "merged"} <= set(before)
+    assert not {"drafter", "hybrid", "jacobi"} & set(before)
+    with pytest.raises(UnknownName, match="unknown prefill_draft 'drafter'"):
+        composed("prefill_draft=drafter")
+    # a part from elsewhere can still be named in settings that Hydra did not compose
+    method = {**AR, "prefill_draft": p.HybridProposerSettings()}
+    with pytest.raises(UsageError, match="prefill_draft=hybrid: it reads the target's states"):
+        check(method, 0, 4)
+
+
 @pytest.mark.parametrize(
-    ("overrides", "drafter", "early", "datastore", "calibration"),
+    ("overrides", "says"),
     [
-        ("method=ar", False, False, False, False),
-        ("method=spec_vla", True, False, False, False),
-        ("method=spec_vla threshold=kinematic", True, False, False, True),
-        ("method=kerv", True, False, False, True),
-        ("method=heisd", True, False, True, True),
-        ("method=heisd boundary=always_retrieval skip=none", True, False, True, False),
-        ("method=retrieval_only", False, False, True, False),
-        ("method=kalman_only", False, False, False, True),
-        ("method=one_pass", False, True, False, False),
-        ("method=one_pass opening.sources=[damped]", False, False, False, True),
-        ("method=one_pass opening=retrieval", False, False, True, False),
-        ("method=one_pass_skip", False, True, True, True),
-        ("method=one_pass_skip skip.s_min=0.99", False, True, True, False),
+        ("policy=expert skip=similarity", "policy=expert with skip=similarity: the expert decodes nothing"),
+        ("policy=expert method=spec_vla", "policy=expert with proposer=drafter: the expert decodes nothing"),
+        ("method=expert threshold.r=3", "policy=expert with threshold=fixed: the expert"),
+        ("policy=expert chunk=2", "the expert decodes nothing"),
+        ("policy=expert deviation_every=5", "deviation_every=5: the expert has no AR"),
+        ("policy.kind=exprt", "unknown policy.kind 'exprt': did you mean expert"),
+        ("episodes=0", "episodes=0"),
+        ("seed=7", "seed=7 is a training seed: evaluation begins at 100000"),
+        ("seed=99999 episodes=2", "seed 100000 is for evaluation"),
     ],
 )
-def test_a_method_loads_what_it_needs_and_nothing_else(
-    overrides: str, drafter: bool, early: bool, datastore: bool, calibration: bool
-) -> None:
-    method = compose("rollout", overrides.split(), RolloutSettings).parts()
-    needs = (needs_drafter(method), needs_early(method), needs_datastore(method), needs_calibration(method))
-    assert needs == (drafter, early, datastore, calibration)
+def test_a_rollout_that_cannot_be_is_refused_before_a_policy_is_read(overrides: str, says: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        check_rollout(composed("task=reach", *overrides.split()))
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_expert_needs_nothing_else() -> None:
+    check_rollout(composed("task=reach", "policy=expert"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "wanted"),
+    [
+        ("method=ar", ()),
+        ("method=naive_sd", ("drafter",)),
+        ("method=spec_vla", ("drafter",)),
+        ("method=spec_vla threshold=kinematic", ("drafter", "calibration")),
+        ("method=spec_vla threshold=change threshold.k_s=0.3", ("drafter",)),
+        ("method=spec_vla threshold=schedule", ("drafter",)),
+        ("method=kerv", ("drafter", "calibration")),
+        ("method=kerv threshold.k_s=0.3", ("drafter", "calibration")),
+        ("method=kerv threshold.k_s=0.3 rectifier.predictor=linear", ("drafter",)),
+        ("method=kerv_paper", ("drafter", "calibration")),
+        ("method=heisd", ("drafter", "datastore", "calibration")),
+        ("method=heisd_paper", ("drafter", "datastore", "calibration")),
+        ("method=heisd boundary=always_retrieval skip=none", ("drafter", "datastore")),
+        ("method=heisd boundary=random skip.s_min=0.99", ("drafter", "datastore")),
+        ("method=retrieval_only", ("datastore",)),
+        ("method=jacobi", ()),
+        ("method=hold", ()),
+        ("method=kalman_only", ("calibration",)),
+        ("method=one_pass", ("early",)),
+        ("method=one_pass prefill_draft.sources=[damped]", ("calibration",)),
+        ("method=one_pass prefill_draft.sources=[early] prefill_draft.fallback=[retrieval]", ("early", "datastore")),
+        ("method=one_pass prefill_draft=retrieval", ("datastore",)),
+        ("method=one_pass_skip", ("early", "datastore", "calibration")),
+        ("method=one_pass_skip skip.s_min=0.99", ("early", "datastore")),
+        ("method=one_pass_strict", ("early",)),
+    ],
+)
+def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides: str, wanted: tuple[str, ...]) -> None:
+    assert set(needs(composed(*overrides.split()).parts())) == set(wanted)
+    assert len(needs(composed(*overrides.split()).parts())) == len(wanted)

@@ -18,6 +18,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
 from typer.testing import CliRunner
 
 from kerv_cli.commands import build as command
@@ -29,7 +30,6 @@ from kerv_cli.drafting.datastore import (
     prompt_key,
     segments_of,
 )
-from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge
 from kerv_cli.environments.demos.dataset import dataset_hash, episode_path
 from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, save_episode

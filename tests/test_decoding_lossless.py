@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,52 +18,55 @@ from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.settings import (
-    AcceptanceSettings,
-    DrafterSettings,
-    MethodSettings,
-    OpeningSettings,
-    ProposerSettings,
-    TargetSettings,
-    ThresholdSettings,
-)
-from kerv_cli.spaces import VOCABULARY, ActionTokenizer
-from kerv_cli.targets.compact.layout import lay_out_for_inference
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.files import sha256_of
+from kerv_cli.settings import DrafterSettings, TargetSettings
+from kerv_cli.spaces import ActionSpace, Group, Observation
+from kerv_cli.targets.checkpoint import load_target, save_tensors
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.protocol import Target
 
-STRICT = AcceptanceSettings(kind="strict")
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 
-def random_target(seed: int, layers: int, heads: int, chunk: int) -> Target:
-    """Odd seeds run on the plans that a shipped policy runs on, even ones on the modules' own path."""
+def random_target(seed: int, layers: int, heads: int, chunk: int, fixed: bool = False) -> CompactTarget:
+    """Odd seeds run on the packed weights that a shipped policy runs on, even ones on the modules' own path. fixed:
+    with caches of fixed shapes, as on CUDA."""
     torch.manual_seed(seed)
     settings = TargetSettings(
         observation="state", width=16 * heads, layers=layers, heads=heads, feed_forward=48, chunk=chunk, scene_tokens=2
     )
-    target = Target(settings, ActionTokenizer(-np.ones(4), np.ones(4)), WordTokenizer.build(["open the drawer"]))
+    target = CompactTarget(settings, ACTIONS, OBSERVATION, WordTokenizer.build(["open the drawer"]))
     for parameter in target.trunk.parameters():  # far from initialisation, so that target_tokens depend on the context
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.25)
     torch.nn.init.normal_(target.embedding.weight, std=1.0)
     target = target.eval().requires_grad_(False)
     if seed % 2:
-        lay_out_for_inference(target)
+        target.pack()
+    if fixed:
+        target.new_cache = functools.partial(target.new_cache, fixed=True)  # type: ignore[method-assign]
     return target
 
 
-def random_prompt(target: Target, seed: int) -> torch.Tensor:
+def random_prompt(target: CompactTarget, seed: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn(1, target.prompt_length, target.settings.width, generator=generator)
+    return torch.randn(1, target.max_prompt, target.width, generator=generator)
+
+
+def size_of(target: Target) -> int:
+    """N."""
+    return target.chunk * target.actions.dofs
 
 
 def plain_greedy(target: Target, prompt: torch.Tensor) -> list[int]:
     """An independent reference: no cache, no tree, the whole sequence forwarded anew for every token."""
     x, tokens = prompt, []
-    for _ in range(target.tokens_per_chunk):
-        hidden = target.trunk(x, torch.arange(x.shape[1]))
+    for _ in range(size_of(target)):
+        hidden = target.forward(x, torch.arange(x.shape[1]))
         tokens.append(int(target.head(hidden[0, -1]).argmax()))
-        x = torch.cat([x, target.embedding(torch.tensor([[tokens[-1]]]))], 1)
+        x = torch.cat([x, target.embed(torch.tensor([[tokens[-1]]]))], 1)
     return tokens
 
 
@@ -68,8 +76,8 @@ class RandomTrees:
     name = "random"
     needs_states = False
 
-    def __init__(self, truth: list[int], seed: int, nodes: int) -> None:
-        self.truth, self.nodes = truth, nodes
+    def __init__(self, truth: list[int], seed: int, nodes: int, vocabulary: int = ACTIONS.tokens) -> None:
+        self.truth, self.nodes, self.vocabulary = truth, nodes, vocabulary
         self.random = np.random.default_rng(seed)
 
     def begin(self, chunk: Chunk) -> None:
@@ -88,15 +96,14 @@ class RandomTrees:
             parent = int(self.random.choice(candidates))
             level = 0 if parent == ROOT else depths[parent] + 1
             right = self.random.random() < 0.6
-            tokens.append(ahead[level] if right else int(self.random.integers(VOCABULARY)))
+            tokens.append(ahead[level] if right else int(self.random.integers(self.vocabulary)))
             parents.append(parent)
             depths.append(level)
         return TokenTree.build(tokens, parents)
 
 
-def decode(target: Target, proposer: object, prompt: torch.Tensor, nodes: int) -> Chunk:
-    method = MethodSettings("test", ProposerSettings(nodes=nodes), STRICT, ThresholdSettings(r=0))
-    return Decoder(target, method, Parts(proposer=proposer)).decode_prompt(prompt)  # type: ignore[arg-type]
+def decode(target: Target, proposer: object, prompt: torch.Tensor) -> Chunk:
+    return Decoder(target, Parts(proposer=proposer)).decode_prompt(prompt)  # type: ignore[arg-type]
 
 
 def assert_adds_up(chunk: Chunk) -> None:
@@ -117,12 +124,15 @@ def assert_adds_up(chunk: Chunk) -> None:
     heads=st.integers(1, 3),
     chunk=st.sampled_from([1, 2, 4, 8]),
     nodes=st.integers(0, 24),
+    fixed=st.booleans(),
 )
-def test_strict_decoding_of_random_trees_equals_ar(seed: int, layers: int, heads: int, chunk: int, nodes: int) -> None:
-    target = random_target(seed, layers, heads, chunk)
+def test_strict_decoding_of_random_trees_equals_ar(
+    seed: int, layers: int, heads: int, chunk: int, nodes: int, fixed: bool
+) -> None:
+    target = random_target(seed, layers, heads, chunk, fixed)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
-    result = decode(target, RandomTrees(truth, seed, nodes), prompt, nodes)
+    result = decode(target, RandomTrees(truth, seed, nodes), prompt)
     assert result.tokens == truth
     assert_adds_up(result)
 
@@ -135,15 +145,18 @@ def test_strict_decoding_of_random_trees_equals_ar(seed: int, layers: int, heads
     top_k=st.integers(1, 5),
     nodes=st.integers(1, 20),
     layers=st.integers(1, 2),
+    fixed=st.booleans(),
 )
 def test_strict_decoding_with_a_drafter_equals_ar(
-    seed: int, chunk: int, depth: int, top_k: int, nodes: int, layers: int
+    seed: int, chunk: int, depth: int, top_k: int, nodes: int, layers: int, fixed: bool
 ) -> None:
-    target = random_target(seed, 2, 2, chunk)
+    target = random_target(seed, 2, 2, chunk, fixed)
     drafter = Drafter.beside(DrafterSettings(layers=layers), target).eval().requires_grad_(False)
-    proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", depth, top_k, nodes))
+    if fixed:
+        drafter.new_cache = functools.partial(drafter.new_cache, fixed=True)  # type: ignore[method-assign]
+    proposer = DrafterProposer(drafter, target, depth, top_k, nodes)
     prompt = random_prompt(target, seed)
-    result = decode(target, proposer, prompt, nodes)
+    result = decode(target, proposer, prompt)
     assert result.tokens == plain_greedy(target, prompt)
     assert_adds_up(result)
 
@@ -153,9 +166,9 @@ def test_strict_decoding_with_a_drafter_equals_ar(
 def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None:
     target = random_target(seed, 2, 2, chunk)
     prompt = random_prompt(target, seed)
-    result = decode(target, JacobiProposer(), prompt, 0)
+    result = decode(target, JacobiProposer(), prompt)
     assert result.tokens == plain_greedy(target, prompt)
-    assert result.forwards <= target.tokens_per_chunk
+    assert result.forwards <= size_of(target)
     assert_adds_up(result)
 
 
@@ -163,9 +176,9 @@ def test_the_fixed_point_of_jacobi_decoding_is_ar(seed: int, chunk: int) -> None
 def test_ar_takes_exactly_n_forwards(chunk: int) -> None:
     target = random_target(3, 2, 2, chunk)
     prompt = random_prompt(target, 5)
-    result = Decoder(target, MethodSettings()).decode_prompt(prompt)
+    result = Decoder(target).decode_prompt(prompt)
     assert result.tokens == plain_greedy(target, prompt)
-    assert result.forwards == target.tokens_per_chunk
+    assert result.forwards == size_of(target)
     assert {r.mode for r in result.rounds} == {"prefill", "decode"} if chunk else True
 
 
@@ -178,7 +191,7 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None
         def propose(self, chunk: Chunk, depth: int) -> TokenTree:
             return TokenTree.chain(self.truth[len(chunk.tokens) :][: min(5, depth)])
 
-    result = decode(target, Perfect(truth, 0, 5), prompt, 5)
+    result = decode(target, Perfect(truth, 0, 5), prompt)
     assert result.tokens == truth
     assert [r.committed for r in result.rounds] == [1, 6, 6, 3]
 
@@ -190,28 +203,26 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None
     chunk=st.sampled_from([1, 4, 8]),
     nodes=st.integers(0, 30),
     drafting=st.booleans(),
+    fixed=st.booleans(),
 )
 def test_drafts_verified_inside_the_prefill_are_lossless(
-    seed: int, heads: int, chunk: int, nodes: int, drafting: bool
+    seed: int, heads: int, chunk: int, nodes: int, drafting: bool, fixed: bool
 ) -> None:
-    """METHODS §5: an opening of random trees, then plain decoding or the drafter, still yields AR's tokens."""
-    target = random_target(seed, 2, heads, chunk)
+    """docs/methods.md §5: random trees in the prefill, then plain decoding or the drafter, still yield AR's tokens."""
+    target = random_target(seed, 2, heads, chunk, fixed)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
     proposer = None
     if drafting:
         drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
-        proposer = DrafterProposer(drafter, target, ProposerSettings("drafter", 4, 2, 6))
-    method = MethodSettings(
-        "test", ProposerSettings(nodes=6), STRICT, ThresholdSettings(), opening=OpeningSettings(["random"], nodes)
-    )
-    parts = Parts(opening=RandomTrees(truth, seed, nodes), proposer=proposer)
-    result = Decoder(target, method, parts).decode_prompt(prompt)
+        proposer = DrafterProposer(drafter, target, 4, 2, 6)
+    parts = Parts(prefill_draft=RandomTrees(truth, seed, nodes), proposer=proposer)
+    result = Decoder(target, parts).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
 
 
-def test_a_perfect_opening_takes_one_forward() -> None:
+def test_a_perfect_draft_in_the_prefill_takes_one_forward() -> None:
     target = random_target(5, 2, 2, 4)
     prompt = random_prompt(target, 5)
     truth = plain_greedy(target, prompt)
@@ -220,8 +231,106 @@ def test_a_perfect_opening_takes_one_forward() -> None:
         def propose(self, chunk: Chunk, depth: int) -> TokenTree:
             return TokenTree.chain(self.truth[:depth])
 
-    method = MethodSettings("test", acceptance=STRICT, opening=OpeningSettings(["whole"], 16))
-    result = Decoder(target, method, Parts(opening=Whole(truth, 0, 16))).decode_prompt(prompt)
+    result = Decoder(target, Parts(prefill_draft=Whole(truth, 0, 16))).decode_prompt(prompt)
     assert result.tokens == truth
     assert result.forwards == 1
     assert [r.committed for r in result.rounds] == [16]
+
+
+def test_a_drafter_drafts_the_same_tree_from_a_cache_of_fixed_shapes() -> None:
+    target = random_target(2, 2, 2, 4)
+    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    prompt = random_prompt(target, 2)
+    drafted = []
+    for fixed in (False, True):
+        drafter.new_cache = functools.partial(Drafter.new_cache, drafter, fixed=fixed)  # type: ignore[method-assign]
+        proposer = DrafterProposer(drafter, target, 5, 4, 20)
+        drafted.append([r.drafted for r in decode(target, proposer, prompt).rounds])
+    assert drafted[0] == drafted[1]
+
+
+# on a target that is no transformer: any action space, prompts of any length
+
+
+@st.composite
+def spaces(draw: st.DrawFn) -> ActionSpace:
+    """OpenVLA's, or one of any groups and vocabulary."""
+    if draw(st.booleans()):
+        return SEVEN
+    sizes = draw(st.lists(st.integers(1, 3), min_size=1, max_size=4))
+    names = tuple(f"d{i}" for i in range(sum(sizes)))
+    groups = tuple(Group(f"g{i}", size) for i, size in enumerate(sizes))
+    unit = (1.0,) * len(names)
+    return ActionSpace(names, groups, names[-1:], 20.0, tuple(-x for x in unit), unit, bins=draw(st.integers(3, 40)))
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    actions=spaces(),
+    chunk=st.integers(1, 4),
+    words=st.integers(0, 11),
+    nodes=st.integers(0, 24),
+    inside=st.booleans(),
+)
+def test_any_target_is_decoded_losslessly(
+    seed: int, actions: ActionSpace, chunk: int, words: int, nodes: int, inside: bool
+) -> None:
+    target = MockTarget(actions, chunk, seed=seed)
+    shown = Observation(np.array([0.1 * seed]), np.zeros(0), " ".join("word" * (1 + i % 3) for i in range(words)))
+    prompt = target.encode(shown)
+    assert prompt.shape[1] == words + 1
+    truth = plain_greedy(target, prompt)
+    trees = RandomTrees(truth, seed, nodes, actions.tokens)
+    first = RandomTrees(truth, seed + 1, nodes, actions.tokens) if inside else None
+    result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
+    assert result.tokens == truth
+    assert_adds_up(result)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), actions=spaces(), chunk=st.integers(1, 4))
+def test_jacobi_decoding_of_any_target_ends_at_ar(seed: int, actions: ActionSpace, chunk: int) -> None:
+    target = MockTarget(actions, chunk, seed=seed)
+    prompt = target.encode(Observation(np.array([0.1 * seed]), np.zeros(0), "go"))
+    assert decode(target, JacobiProposer(), prompt).tokens == plain_greedy(target, prompt)
+
+
+def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:
+    """Otherwise it would prove nothing."""
+    target = MockTarget()
+    x, positions = torch.randn(1, 5, 8).double(), torch.arange(5)
+    right = target.head(target.forward(x, positions))[0, -1]
+    blind = np.tri(5, dtype=bool)
+    blind[4, 1] = False
+    cache = target.new_cache(1, 8)
+    target.forward(x[:, :3], positions[:3], cache)
+    cache.compact(1, torch.tensor([2]))
+    for wrong in (
+        target.forward(x, positions, seen=blind),
+        target.forward(x, positions + (positions == 1)),
+        target.forward(x[:, 3:], positions[3:], cache),
+    ):
+        assert not torch.allclose(target.head(wrong)[0, -1], right)
+
+
+def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path: Path) -> None:
+    save_tensors(tmp_path / "model.safetensors", {"nothing": torch.zeros(1)})
+    description = {
+        "format": 1,
+        "kind": "target",
+        "sha256": sha256_of(tmp_path / "model.safetensors"),
+        "family": "mock",
+        "environment": "metaworld",
+        "settings": {"chunk": 3},
+        "actions": SEVEN.as_dict(),
+        "observation": OBSERVATION.as_dict(),
+        "cameras": [],
+        "words": [],
+        "provenance": {},
+    }
+    (tmp_path / "target.json").write_text(json.dumps(description))
+    target, described = load_target(tmp_path)
+    assert isinstance(target, MockTarget)
+    assert target.actions == described.actions == SEVEN
+    assert target.chunk == 3

@@ -9,10 +9,10 @@ from test_decoding_lossless import random_prompt, random_target
 from kerv_cli.drafting.eagle import Drafter, DraftState, grow_tree, observe
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import DrafterSettings
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.target import CompactTarget
 
 
-def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, Target, DraftState, TokenTree]:
+def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, CompactTarget, DraftState, TokenTree]:
     target = random_target(seed, 2, 2, 4)
     torch.manual_seed(seed)
     drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
@@ -21,17 +21,17 @@ def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, Tar
             torch.nn.init.normal_(parameter, std=0.3)
     prompt = random_prompt(target, seed)
     hidden = torch.randn(prompt.shape, generator=torch.Generator().manual_seed(seed))
-    state = DraftState(drafter.new_cache(prompt.shape[1] + 64), torch.empty(0))
-    following = torch.cat([prompt[:, 1:], target.embedding(torch.tensor([[7]]))], 1)
+    state = DraftState(drafter.new_cache(1, prompt.shape[1] + 64), torch.empty(0))
+    following = torch.cat([prompt[:, 1:], target.embed(torch.tensor([[7]]))], 1)
     observe(drafter, state, following, hidden, 0)
     return drafter, target, state, grow_tree(drafter, target, state, depth, top_k, nodes)
 
 
-def along(drafter: Drafter, target: Target, state: DraftState, tokens: list[int]) -> torch.Tensor:
+def along(drafter: Drafter, target: CompactTarget, state: DraftState, tokens: list[int]) -> torch.Tensor:
     """Log-probabilities (V,) behind a path that is walked token by token, without tree or mask."""
     base, hidden = state.cache.length, state.hidden[None, None]
     for i, token in enumerate(tokens):
-        following = target.embedding(torch.tensor([[token]]))
+        following = target.embed(torch.tensor([[token]]))
         hidden = drafter(following, hidden, torch.tensor([base + i]), state.cache)
     state.cache.length = base
     return torch.log_softmax(target.head(hidden[0, 0]), -1)

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file
 
+from kerv_cli.artifacts import artifact_folder
 from kerv_cli.config import compose
 from kerv_cli.drafting.early import (
     EarlyDrafter,
@@ -21,8 +22,6 @@ from kerv_cli.drafting.early import (
     choose,
     load_early,
     padded,
-    pool,
-    pooled_width,
     read_early,
     save_early,
 )
@@ -31,11 +30,12 @@ from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.demos.recording import DemoConfig, record
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.places import early_folder
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.early_distillation import (
     EarlyDistillation,
     EarlySamples,
@@ -47,13 +47,23 @@ from kerv_cli.training.early_distillation import (
 from kerv_cli.training.imitation import load_samples, split
 from kerv_cli.training.runs import EarlyRun, drafter_run
 
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
+
 SMALL = DrafterSettings(kind="early", layers=2, width=32, rank=8, history=2, samples=1000)
 SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10
+STRICT = torch.from_numpy(ACTIONS.strict_tokens(8))
 
 
-def drafter(settings: DrafterSettings = SMALL, shape: TargetSettings = SHAPE) -> EarlyDrafter:
+def shaped(settings: TargetSettings = SHAPE) -> CompactTarget:
+    return CompactTarget(settings, ACTIONS, OBSERVATION, WordTokenizer.build(["open"]), "corner4")
+
+
+FEATURES = shaped().pooled_width
+
+
+def drafter(settings: DrafterSettings = SMALL, target: CompactTarget | None = None) -> EarlyDrafter:
     torch.manual_seed(0)
-    early = EarlyDrafter(settings, shape).eval()
+    early = EarlyDrafter.beside(settings, target or shaped()).eval()
     for parameter in early.parameters():
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.3)
@@ -63,12 +73,13 @@ def drafter(settings: DrafterSettings = SMALL, shape: TargetSettings = SHAPE) ->
 def test_pooling_takes_every_part_of_the_prompt_once() -> None:
     """Token i of the prompt is i everywhere, so the pooled vector shows what was taken from where."""
     prompt = torch.arange(10.0)[None, :, None].expand(1, 10, 16)
-    pooled = pool(prompt, SHAPE)
-    assert pooled.shape == (1, pooled_width(SHAPE))
+    target = shaped()
+    pooled = target.pooled(prompt)
+    assert pooled.shape == (1, target.pooled_width)
     assert pooled[0].unflatten(0, (-1, 16))[:, 0].tolist() == [7, 8, 9, 5, 1.5]  # scene ×2, hand, words, vision
-    state = dataclasses.replace(SHAPE, observation="state")
-    assert pool(prompt[:, :6], state)[0].unflatten(0, (-1, 16))[:, 0].tolist() == [3, 4, 5, 1]
-    assert pooled_width(state) == 4 * 16
+    state = shaped(dataclasses.replace(SHAPE, observation="state"))
+    assert state.pooled(prompt[:, :6])[0].unflatten(0, (-1, 16))[:, 0].tolist() == [3, 4, 5, 1]
+    assert state.pooled_width == 4 * 16
 
 
 def test_history_is_the_newest_actions_and_says_what_is_missing() -> None:
@@ -82,41 +93,44 @@ def test_history_is_the_newest_actions_and_says_what_is_missing() -> None:
     assert padded(past.values(), 0, 4)[0].shape == (0, 4)
 
 
-def test_a_proposal_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -> None:
-    early = drafter()
+def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -> None:
+    early, target = drafter(), shaped()
     prompt, history = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1)), np.full((5, 4), 0.5)
-    drafted = early.propose(prompt, history)
-    logits = early(prompt, torch.full((1, 2, 4), 0.5), torch.ones(1, 2))
+
+    def drafted(prompt: torch.Tensor, history: np.ndarray, radius: int = 0) -> list[int]:
+        return early.drafted(target.pooled(prompt), history, radius)[0]
+
+    logits = early(target.pooled(prompt), torch.full((1, 2, 4), 0.5), torch.ones(1, 2))
     assert logits.shape == (1, 8, 255)
-    assert drafted == logits[0].argmax(-1).tolist()
-    assert early.propose(prompt, history, 3) == drafted[:3]
-    assert early.propose(prompt, history, radius=9) == choose(logits, 9, 4)[0].tolist()
-    assert early.propose(prompt, -history) != drafted
+    plain = drafted(prompt, history)
+    assert plain == logits[0].argmax(-1).tolist()
+    assert drafted(prompt, history, 9) == choose(logits, 9, STRICT)[0].tolist()
+    assert drafted(prompt, -history) != plain
     zeros = torch.zeros(1, 2, 4)
-    unknown, zero = (early(prompt, zeros, known) for known in (torch.zeros(1, 2), torch.ones(1, 2)))
+    unknown, zero = (early(target.pooled(prompt), zeros, known) for known in (torch.zeros(1, 2), torch.ones(1, 2)))
     assert not torch.allclose(unknown, zero)
-    assert early.propose(prompt, np.zeros((0, 4))) == unknown[0].argmax(-1).tolist()
+    assert drafted(prompt, np.zeros((0, 4))) == unknown[0].argmax(-1).tolist()
     for token in range(10):
         moved = prompt.clone()
         moved[:, token] += 3.0
-        assert early.propose(moved, history) != drafted
+        assert drafted(moved, history) != plain
 
 
 def test_features_are_standardised_and_constants_survive() -> None:
     early = drafter(dataclasses.replace(SMALL, history=0))
-    features = torch.randn(50, pooled_width(SHAPE), generator=torch.Generator().manual_seed(0)) * 30 + 7
+    features = torch.randn(50, FEATURES, generator=torch.Generator().manual_seed(0)) * 30 + 7
     features[:, 3] = 1.25
     early.standardise(features)
     plain = drafter(dataclasses.replace(SMALL, history=0))
     empty = torch.zeros(50, 0, 4), torch.zeros(50, 0)
     expected = (features - features.mean(0)) / features.std(0).clamp_min(1e-3)
-    assert torch.allclose(early.draft(features, *empty), plain.draft(expected, *empty), atol=1e-3)
+    assert torch.allclose(early(features, *empty), plain(expected, *empty), atol=1e-3)
 
 
 @pytest.mark.parametrize("wrong", [{"width": 0}, {"rank": 0}, {"layers": -1}, {"history": -1}])
 def test_impossible_shapes_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(UsageError, match="drafter:"):
-        EarlyDrafter(dataclasses.replace(SMALL, **wrong), SHAPE)
+        EarlyDrafter(dataclasses.replace(SMALL, **wrong), ACTIONS, 2, FEATURES)
 
 
 def test_accepted_tokens_count_the_prefix_and_keep_the_gripper_strict() -> None:
@@ -126,7 +140,7 @@ def test_accepted_tokens_count_the_prefix_and_keep_the_gripper_strict() -> None:
         draft = teacher.clone()
         for position, by in moved.items():
             draft[0, int(position[1:])] += by
-        return int(accepted_tokens(draft, teacher, r, 4)[0])
+        return int(accepted_tokens(draft, teacher, r, STRICT)[0])
 
     assert accepted(0) == accepted(9) == 8
     assert accepted(9, _2=9) == accepted(9, _2=-9, _6=9) == 8
@@ -142,30 +156,30 @@ def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted() -> None:
     generator = torch.Generator().manual_seed(3)
     logits = torch.randn(2, 8, 255, generator=generator) * 2
     logits[0, 0, 17], logits[0, 0, 100:104] = 9.0, 8.5  # one likely bin against four neighbours
-    assert choose(logits, 0, 4)[0, 0] == 17
-    assert 100 <= choose(logits, 3, 4)[0, 0] <= 103
+    assert choose(logits, 0, STRICT)[0, 0] == 17
+    assert 100 <= choose(logits, 3, STRICT)[0, 0] <= 103
     probability = logits.softmax(-1)
     for radius in (1, 4, 9):
-        tokens = choose(logits, radius, 4)
+        tokens = choose(logits, radius, STRICT)
         assert torch.equal(tokens[:, 3::4], logits.argmax(-1)[:, 3::4])
         for b in range(2):
             for j in (0, 1, 2, 4, 5, 6):
                 sums = [probability[b, j, max(0, t - radius) : t + radius + 1].sum() for t in range(255)]
                 assert sums[int(tokens[b, j])] > max(sums) - 0.15 * max(sums) - 1e-6
-    assert choose(torch.eye(255)[None, [254] * 4] * 30, 9, 4).tolist() == [[254] * 4]  # not nine bins inside
+    assert choose(torch.eye(255)[None, [254] * 4] * 30, 9, STRICT[:4]).tolist() == [[254] * 4]  # not nine bins inside
 
 
 @given(st.integers(0, 10_000), st.integers(0, 20))
 def test_the_odds_are_those_of_independent_tokens(seed: int, radius: int) -> None:
     logits = 3 * torch.randn(2, 8, 255, generator=torch.Generator().manual_seed(seed))
-    tokens = choose(logits, radius, 4)
+    tokens = choose(logits, radius, STRICT)
     for row in range(2):
         odds = 1.0
         for i, token in enumerate(tokens[row].tolist()):
             r = 0 if i % 4 == 3 else radius
             window = slice(max(0, token - r), token + r + 1)
             odds *= float(logits[row, i].double().softmax(-1)[window].sum())
-        assert float(acceptance_odds(logits, tokens, radius, 4)[row]) == pytest.approx(odds, rel=1e-3)
+        assert float(acceptance_odds(logits, tokens, radius, STRICT)[row]) == pytest.approx(odds, rel=1e-3)
 
 
 def test_plain_and_perturbed_episodes_count_alike() -> None:
@@ -178,23 +192,23 @@ def test_plain_and_perturbed_episodes_count_alike() -> None:
     drafts = tokens.clone()
     drafts[:3, 0] += 20
     logits = 20.0 * torch.nn.functional.one_hot(drafts, 255)
-    metrics = measure(logits, samples, 4)
+    metrics = measure(logits, samples, STRICT)
     assert metrics["accepted_r9"] == metrics["accepted_strict"] == 4.0
     assert metrics["whole_r9"] == 0.5
-    only = measure(logits[:3], samples.where(perturbed), 4)
+    only = measure(logits[:3], samples.where(perturbed), STRICT)
     assert only["accepted_r9"] == 0.0
 
 
 def test_the_network_learns_what_the_teacher_says() -> None:
     """Tokens that are a function of features and history are learned, and the score shows it."""
     generator = torch.Generator().manual_seed(0)
-    features = torch.randn(256, pooled_width(SHAPE), generator=generator).sign()
+    features = torch.randn(256, FEATURES, generator=generator).sign()
     history = torch.randn(256, 2, 4, generator=generator).sign()
     tokens = torch.where(history[:, 1, 0] > 0, 200, 40)[:, None].repeat(1, 8)
     tokens[:, 1] = torch.where(features[:, 0] > 0, 90, 170)
     samples = EarlySamples(features, history, torch.ones(256, 2), tokens, torch.arange(256), torch.arange(256) % 2 == 0)
     torch.manual_seed(0)
-    early = EarlyDrafter(SMALL, SHAPE)
+    early = EarlyDrafter(SMALL, ACTIONS, 2, FEATURES)
     run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
     before = run.validate(early)["score"]
     optimiser = torch.optim.AdamW(early.parameters(), lr=5e-3)
@@ -229,11 +243,11 @@ def episode(steps: int) -> DemoEpisode:
 
 
 @pytest.fixture(scope="module")
-def nano(policies: Path) -> Target:
+def nano(policies: Path) -> CompactTarget:
     return load_target(policies / "artifacts/target/nano-state")[0]
 
 
-def test_observations_come_with_what_was_executed_before_them(nano: Target) -> None:
+def test_observations_come_with_what_was_executed_before_them(nano: CompactTarget) -> None:
     demo = episode(10)
     some = observations(nano, demo, 3, 1.0, 2)
     assert len(some) == 10
@@ -246,7 +260,7 @@ def test_observations_come_with_what_was_executed_before_them(nano: Target) -> N
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.5, 5), (0.1, 1), (0.34, 4), (1.0, 10)])
-def test_a_share_of_the_observations_is_spread_evenly(nano: Target, share: float, count: int) -> None:
+def test_a_share_of_the_observations_is_spread_evenly(nano: CompactTarget, share: float, count: int) -> None:
     demo = episode(10)
     some = observations(nano, demo, 0, share, 0)
     where = [int(np.flatnonzero((demo.states == s).all(1))[0]) for s in some.inputs.states.numpy()]
@@ -259,7 +273,6 @@ def test_a_share_of_the_observations_is_spread_evenly(nano: Target, share: float
 def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
     """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
     from kerv_cli.decoding.decoder import Decoder
-    from kerv_cli.settings import MethodSettings
 
     target = load_target(results / "artifacts/target" / name)[0]
     dataset = DemoDataset.open(results / "artifacts/demos/few")
@@ -267,11 +280,11 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
     samples = load_samples(dataset, target.settings, target.words, ("drawer-close-v3",))
     assert torch.equal(taught.episodes, samples.episodes)
     assert [bool(x) for x in taught.perturbed] == [dataset.episodes[e].perturbed for e in taught.episodes]
-    decoder = Decoder(target, MethodSettings())
+    decoder = Decoder(target)
     for i in range(0, len(samples), 7):
-        prompt, _ = target.encode(samples.inputs(torch.tensor([i]), target.device))
+        prompt, _ = target.encode_batch(samples.inputs(torch.tensor([i]), target.device))
         assert taught.tokens[i].tolist() == decoder.decode_prompt(prompt).tokens
-        assert torch.allclose(taught.features[i].float(), pool(prompt, target.settings)[0], atol=1e-2)
+        assert torch.allclose(taught.features[i].float(), target.pooled(prompt)[0], atol=1e-2)
     held = taught.split(0.34)[1]
     assert torch.equal(held.episodes, split(samples, 0.34)[1].episodes)
     few = teach_early(target, dataset, dataclasses.replace(SMALL, samples=12))
@@ -296,21 +309,23 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert "accepted_r9" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     early, own = load_early(results / "artifacts/early/whole", target, description)
-    assert own["target"] == description["sha256"]
-    assert own["chunk"] == target.settings.chunk
-    assert own["provenance"]["settings"]["drafter"]["width"] == early.settings.width == 32
+    assert own.target == description.sha256
+    assert own.chunk == target.chunk
+    assert own.provenance["settings"]["drafter"]["width"] == early.settings.width == 32
     assert early.scale.min() > 0
     assert not torch.equal(early.scale, torch.ones_like(early.scale))
-    prompt = torch.randn(1, target.prompt_length, target.settings.width)
-    drafted = early.propose(prompt, np.zeros((0, 4)))
-    assert len(drafted) == target.tokens_per_chunk
+    drafted, _ = early.drafted(torch.randn(1, target.pooled_width), np.zeros((0, 4)), 0)
+    assert len(drafted) == target.chunk * 4
     assert all(0 <= token < 255 for token in drafted)
     other = load_target(results / "artifacts/target/nano-state")[1]
     with pytest.raises(CheckpointError, match="was trained for target"):
         read_early(results / "artifacts/early/whole", other)
-    longer = {**description, "settings": {**description["settings"], "chunk": 8}}
+    longer = dataclasses.replace(description, settings={**description.settings, "chunk": 8})
     with pytest.raises(CheckpointError, match="chunks of 4"):
         read_early(results / "artifacts/early/whole", longer)
+    foreign = dataclasses.replace(description, actions=dataclasses.replace(ACTIONS, strict=()))
+    with pytest.raises(CheckpointError, match="action space with strict gripper, the target one with none"):
+        read_early(results / "artifacts/early/whole", foreign)
 
 
 def test_an_interrupted_run_ends_where_the_uninterrupted_one_does(results: Path) -> None:
@@ -339,14 +354,14 @@ def test_an_interrupted_run_ends_where_the_uninterrupted_one_does(results: Path)
 
 def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_path: Path, policies: Path) -> None:
     target, description = load_target(policies / "artifacts/target/nano-state")
-    early = drafter(SMALL, target.settings)
-    early.standardise(torch.randn(20, pooled_width(target.settings)))
+    early = drafter(SMALL, target)
+    early.standardise(torch.randn(20, target.pooled_width))
     with pytest.raises(CheckpointError, match="kerv train drafter drafter=early"):
         load_early(tmp_path, target, description)
-    save_early(tmp_path, early, description["sha256"], {})
+    save_early(tmp_path, early, description.sha256, {})
     loaded, _ = load_early(tmp_path, target, description)
-    prompt = torch.randn(1, target.prompt_length, target.settings.width)
-    assert loaded.propose(prompt, np.zeros((1, 4))) == early.propose(prompt, np.zeros((1, 4)))
+    features, history = torch.randn(1, target.pooled_width), np.zeros((1, 4))
+    assert loaded.drafted(features, history, 0)[0] == early.drafted(features, history, 0)[0]
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     with pytest.raises(CheckpointError, match="does not match"):
@@ -354,9 +369,10 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
 
 
 def test_the_folder_is_beside_the_target(policies: Path) -> None:
-    assert early_folder("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
-    assert early_folder("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
-    assert early_folder("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")
+    place = artifact_folder("early")
+    assert place("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
+    assert place("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
+    assert place("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")
 
 
 def test_the_config_brings_its_own_optimisation_and_yields_to_the_command_line() -> None:

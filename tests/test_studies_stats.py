@@ -127,6 +127,54 @@ def test_interval_covers_the_truth_as_often_as_it_says() -> None:
     assert 0.90 <= np.mean(inside) <= 0.985
 
 
+def slow_two_levels(baseline: np.ndarray, method: np.ndarray, blocks: list[str], draws: int) -> tuple[float, float]:
+    """One stratum, as loops: blocks first, then the pairs of every drawn block."""
+    rng = np.random.default_rng(99)
+    names = sorted(set(blocks))
+    ratios = []
+    for _ in range(draws):
+        picked: list[int] = []
+        for name in rng.choice(names, len(names)):
+            members = [i for i, block in enumerate(blocks) if block == name]
+            picked += list(rng.choice(members, len(members)))
+        ratios.append(baseline[picked].sum() / method[picked].sum())
+    return tuple(np.quantile(ratios, [0.025, 0.975]))
+
+
+def blocked_times(rng: np.random.Generator, sizes: list[int]) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Pairs whose ratio depends on their block: 1.6 on average."""
+    blocks = [f"b{i}" for i, size in enumerate(sizes) for _ in range(size)]
+    drift = np.repeat(rng.lognormal(0.0, 0.2, len(sizes)), sizes)
+    method = rng.lognormal(0.0, 0.1, len(blocks))
+    return 1.6 * drift * method * rng.lognormal(0.0, 0.05, len(blocks)), method, blocks
+
+
+def test_two_level_interval_agrees_with_loops_for_blocks_of_any_size() -> None:
+    baseline, method, blocks = blocked_times(np.random.default_rng(8), [5, 2, 4, 5, 1, 3])
+    found = speedup(baseline, method, ["a"] * 20, blocks=blocks)
+    assert (found.low, found.high) == pytest.approx(slow_two_levels(baseline, method, blocks, 3000), rel=0.02)
+
+
+def test_what_drifts_from_block_to_block_widens_the_interval() -> None:
+    baseline, method, blocks = blocked_times(np.random.default_rng(2), [5] * 8)
+    known, unknown = speedup(baseline, method, ["a"] * 40, blocks=blocks), speedup(baseline, method, ["a"] * 40)
+    assert known.value == unknown.value
+    assert known.high - known.low > 1.5 * (unknown.high - unknown.low)
+
+
+def test_two_level_interval_covers_the_truth_where_pairs_alone_would_not() -> None:
+    rng = np.random.default_rng(21)
+    truth = 1.6 * np.exp(0.2**2 / 2 + 0.05**2 / 2)
+    inside = np.zeros(2)
+    for _ in range(200):
+        baseline, method, blocks = blocked_times(rng, [5] * 12)
+        for i, known in enumerate((blocks, None)):
+            found = speedup(baseline, method, ["a"] * 60, blocks=known, resamples=500)
+            inside[i] += found.low <= truth <= found.high
+    assert 0.86 <= inside[0] / 200 <= 0.99
+    assert inside[1] / 200 < 0.75
+
+
 def test_same_numbers_every_time() -> None:
     rng = np.random.default_rng(1)
     baseline, method = rng.uniform(1, 2, 9), rng.uniform(1, 2, 9)

@@ -16,6 +16,7 @@ from rich.console import Console
 from studies_synthetic import (
     IDENTITY,
     prepare,
+    run_cell,
     settings_of,
     still_episode,
     threshold_settings,
@@ -31,6 +32,7 @@ from kerv_cli.reporting.tables import StudyData, csv_text, load_study, per_task_
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies.execute import execute
 from kerv_cli.studies.plan import Cell, plan
+from kerv_cli.studies.rows import Circumstances
 from kerv_cli.studies.store import StudyStore
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
@@ -107,6 +109,11 @@ def test_one_task_by_hand(data: StudyData) -> None:
         "successes": 2,
         "success": 1.0,
         "time_per_step_ms": 1000 * ((0.2 + 0.3) / 2 + 0.05) / 2,  # 150
+        "time_per_episode_ms": 1000 * ((0.2 + 0.3) + 0.05) / 2,
+        "episode_speedup": (0.4 + 0.6 + 0.3) / (0.2 + 0.3 + 0.05),
+        "latency_p50_ms": 200.0,
+        "latency_p95_ms": 290.0,  # between the 200 and the 300 of three decodes
+        "latency_worst_ms": 300.0,
         "speedup": ((0.4 + 0.6) / 2 + 0.3) / ((0.2 + 0.3) / 2 + 0.05),  # 0.4 s over 0.15 s
         "AL": (3 + 2 + 1) / 3,
         "accepted_per_round": (3 + 1 + 1) / 3,
@@ -215,6 +222,37 @@ def test_other_devices_are_not_compared(tmp_path: Path) -> None:
     assert math.isnan(row["speedup"])
     assert math.isnan(row["mcnemar_p"])
     assert row["success"] == 1.0
+
+
+def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
+    """Two blocks of two pairs; of the second, the setting ran alone, later."""
+    store = StudyStore(tmp_path, "hand")
+    settings = {"ar": settings_of("ar"), "kerv": settings_of("kerv", 9)}
+    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar", block=2, repeats=1)
+    for cell in cells:
+        first = cell.seeds[0] == 100_000
+        block = "one" if first else f"two, {cell.label}"
+        at = [Circumstances(block, i, "2026-01-01", 0.005 if first else 0.007) for i in range(2)]
+        store.write_cell(cell, run_cell(cell), STATUS, at)
+    store.write_plan(StudySettings("hand", "", "ar"), cells)
+    row = row_of(per_task_table(load_study(store)), label="kerv")
+    assert (row["pairs"], row["same_run"], row["same_block"]) == (4, True, 0.5)
+    assert row["gauge_ms"] == pytest.approx(6.0)
+
+
+def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
+    """The machine was ten times slower in the second repeat: for both sides."""
+    store = StudyStore(tmp_path, "hand")
+    settings = {"ar": settings_of("ar", episodes=2), "kerv": settings_of("kerv", 9, episodes=2)}
+    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar", repeats=2)
+    for cell in cells:
+        one = ar(0.4) if cell.label == "ar" else ALL_ACCEPTED
+        slower = replace(one, seconds=one.seconds * (10 if cell.repeat else 1))
+        store.write_cell(cell, [still_episode(cell.task, seed, True, [slower]) for seed in cell.seeds], STATUS)
+    store.write_plan(StudySettings("hand", "", "ar"), cells)
+    row = row_of(per_task_table(load_study(store)), label="kerv")
+    assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (4, 4, 2, "100000-100001")
+    assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
 def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:

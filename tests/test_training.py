@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,20 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from kerv_cli import files
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.recording import DemoConfig, record
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
+from kerv_cli.files import sha256_of
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainSettings
-from kerv_cli.spaces import ActionTokenizer
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.checkpoint import load_target, save_target, save_tensors
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
-from kerv_cli.training.loop import Job, Loop, Metrics, schedule
+from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 TINY = TrainSettings(steps=12, batch=4, lr=0.01, warmup=2, validate_every=4, ema=0.9)
 
@@ -75,6 +81,84 @@ def test_another_run_is_never_resumed(tmp_path: Path) -> None:
         quadratic(tmp_path, "b").run()
 
 
+def test_a_damaged_or_senseless_resume_file_is_one_line(tmp_path: Path) -> None:
+    quadratic(tmp_path).run()
+    path = tmp_path / "resume.safetensors"
+    whole = path.read_bytes()
+    for at in (len(whole) - 1, len(whole) // 2, 40):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(CheckpointError, match=r"training state at .* damaged") as caught:
+            quadratic(tmp_path).run()
+        assert "\n" not in str(caught.value)
+    path.write_bytes(whole[:-3])
+    with pytest.raises(CheckpointError, match="damaged"):
+        quadratic(tmp_path).run()
+    path.write_bytes(whole)
+    tensors, progress = read_state(path)
+    first = next(name for name in tensors if name.startswith("ema."))
+    write_state(path, {**tensors, first: tensors[first] * torch.nan}, progress)
+    with pytest.raises(CheckpointError, match="not finite"):
+        quadratic(tmp_path).run()
+    save_tensors(path, tensors, {"state": json.dumps({"progress": "{}", "sha256": digest(tensors, "{}")})})
+    with pytest.raises(CheckpointError, match="identity"):
+        quadratic(tmp_path).run()
+
+
+def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cut at every write of a run: the one that goes on saves the best of the uninterrupted run."""
+    writes: list[int] = []
+
+    def saving(folder: Path) -> Loop:
+        loop = quadratic(folder)
+        save = replace(loop.job, save=lambda module, metrics: save_tensors(folder / "best", module.state_dict()))
+        loop.job = save
+        return loop
+
+    saving(tmp_path / "whole").run()
+    best = (tmp_path / "whole/best").read_bytes()
+    real = files.os.replace
+
+    def counted(source: object, target: object) -> None:
+        writes.append(1)
+        if len(writes) == cut:
+            raise KeyboardInterrupt
+        real(source, target)
+
+    monkeypatch.setattr(files.os, "replace", counted)
+    for cut in range(1, 10):
+        folder = tmp_path / str(cut)
+        writes.clear()
+        try:
+            saving(folder).run()
+        except KeyboardInterrupt:
+            saving(folder).run()
+        assert (folder / "best").read_bytes() == best
+        assert (folder / "log.csv").read_bytes() == (tmp_path / "whole/log.csv").read_bytes()
+
+
+def test_weights_can_be_stored_in_half_precision(tmp_path: Path) -> None:
+    settings = TargetSettings(observation="state", width=32, layers=1, heads=2, feed_forward=48, scene_tokens=2)
+    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld"))
+    sizes = {}
+    for half in (False, True):
+        digest = save_target(tmp_path / str(half), target, "metaworld", {}, half)
+        loaded, description = load_target(tmp_path / str(half))
+        assert description.sha256 == digest == sha256_of(tmp_path / str(half) / "model.safetensors")
+        sizes[half] = (tmp_path / str(half) / "model.safetensors").stat().st_size
+        for name, tensor in loaded.state_dict().items():
+            wanted = target.state_dict()[name]
+            assert tensor.dtype == torch.float32
+            assert torch.equal(tensor, wanted.half().float() if half else wanted)
+    assert sizes[True] < 0.6 * sizes[False]
+
+
+def test_training_imports_no_viewer() -> None:
+    code = "import sys, kerv_cli.training.runs, kerv_cli.rollouts.run; sys.exit('rerun' in sys.modules)"
+    assert subprocess.run([sys.executable, "-W", "ignore", "-c", code], timeout=100).returncode == 0
+
+
 def test_the_schedule_warms_up_and_decays_in_both_phases() -> None:
     settings = TrainSettings(steps=100, warmup=10, scene_steps=40)
     rates = [schedule(step, settings) for step in range(100)]
@@ -85,26 +169,25 @@ def test_the_schedule_warms_up_and_decays_in_both_phases() -> None:
 
 
 def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
-    labels = soft_labels(1.5)
+    labels = soft_labels(255, 1.5)
     assert torch.allclose(labels.sum(-1), torch.ones(len(labels)), atol=1e-5)
     assert labels[100, 100] > labels[100, 101] > labels[100, 103]
     assert labels[100, 101] / labels[100, 100] == pytest.approx(np.exp(-1 / (2 * 1.5**2)), rel=1e-4)
     logits, tokens = torch.randn(2, 3, 255), torch.randint(0, 255, (2, 3))
     plain = nn.functional.cross_entropy(logits.flatten(0, 1), tokens.flatten())
-    assert torch.allclose(token_loss(logits, tokens, soft_labels(0.0)), plain)
+    assert torch.allclose(token_loss(logits, tokens, soft_labels(255, 0.0)), plain)
 
 
 def test_batched_greedy_decoding_is_the_decoders() -> None:
     from kerv_cli.decoding.decoder import Decoder
-    from kerv_cli.settings import MethodSettings
 
     torch.manual_seed(0)
     settings = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
-    target = Target(settings, ActionTokenizer(-np.ones(4), np.ones(4)), vocabulary()).eval().requires_grad_(False)
-    prompts = torch.randn(3, target.prompt_length, 32)
+    target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld")).eval().requires_grad_(False)
+    prompts = torch.randn(3, target.max_prompt, 32)
     tokens, hidden = greedy(target, prompts)
-    assert hidden.shape == (3, target.prompt_length + target.tokens_per_chunk - 1, 32)
-    decoder = Decoder(target, MethodSettings())
+    assert hidden.shape == (3, target.max_prompt + target.chunk * 4 - 1, 32)
+    decoder = Decoder(target)
     for prompt, expected in zip(prompts.split(1), tokens, strict=True):
         assert decoder.decode_prompt(prompt).tokens == expected.tolist()
 
@@ -137,11 +220,11 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     killed = subprocess.Popen([*command, "name=cut"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = results / "artifacts/target/cut"
     deadline = time.monotonic() + 100
-    while not (folder / "progress.json").exists() and time.monotonic() < deadline:
+    while not (folder / "resume.safetensors").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
-    assert json.loads((folder / "progress.json").read_text())["step"] <= 25
+    assert 5 <= read_state(folder / "resume.safetensors")[1].step <= 25
     resumed = subprocess.run([*command, "name=cut"], capture_output=True, text=True, timeout=200)
     assert resumed.returncode == 0, resumed.stderr
     a, b = (load_file(results / f"artifacts/target/{n}/model.safetensors") for n in ("whole", "cut"))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,25 +15,28 @@ from safetensors.torch import load_file
 from kerv_cli.config import compose
 from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TrainDrafterSettings, TrainTargetSettings
-from kerv_cli.spaces import ActionTokenizer
-from kerv_cli.targets.checkpoint import load_target, read_description, save_target
-from kerv_cli.targets.compact.target import Target
+from kerv_cli.targets.checkpoint import load_target, read_target, save_target
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training import runs
+from kerv_cli.training.loop import read_state
 from kerv_cli.training.runs import TargetRun
 
-LOW, HIGH = np.array([-0.5, -1.0, -1.0, -1.0]), np.array([0.5, 1.0, 2.0, 1.0])
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
+
+OLD = dataclasses.replace(ACTIONS, low=(-0.5, -1.0, -1.0, -1.0), high=(0.5, 1.0, 2.0, 1.0))
 WORDS = WordTokenizer.build(["pull the drawer open", "jump"])
 
 
 class Demos:
     """Four made-up episodes of a task."""
 
-    sha256 = "d" * 64
-    manifest = {"config": {}}  # noqa: RUF012
-    episodes = tuple(DemoEntry("drawer-open-v3", seed, False, 6, Path(), 0, "") for seed in range(4))
+    sha256, path = "d" * 64, Path("demos")
+    manifest = SimpleNamespace(config={}, environment=SPEC.name, actions=ACTIONS, observation=OBSERVATION)
+    episodes = tuple(DemoEntry(seed, False, 6, 0, "", "drawer-open-v3", Path()) for seed in range(4))
 
     def load(self, index: int) -> DemoEpisode:
         rng = np.random.default_rng(index)
@@ -54,7 +57,7 @@ def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def save_old(results: Path, seed: int) -> None:
     torch.manual_seed(seed)
     shapes = compose("train_target", ["target=nano", "target.observation=state"], TrainTargetSettings).target
-    save_target(results / "artifacts/target/old", Target(shapes, ActionTokenizer(LOW, HIGH), WORDS), {})
+    save_target(results / "artifacts/target/old", CompactTarget(shapes, OLD, OBSERVATION, WORDS), "metaworld", {})
 
 
 def settings(results: Path, *overrides: str) -> TrainTargetSettings:
@@ -79,12 +82,11 @@ def test_a_run_begins_with_the_weights_statistics_and_words(results: Path) -> No
     old, _ = load_target(results / "artifacts/target/old")
     new, description = load_target(folder)
     assert all(torch.equal(new.state_dict()[k], v) for k, v in old.state_dict().items())
-    assert (new.settings.chunk, new.tokens_per_chunk) == (8, 32)
+    assert new.chunk == 8
     assert dataclasses.replace(new.settings, chunk=old.settings.chunk) == old.settings
-    assert (new.actions.low == LOW).all()
-    assert (new.actions.high == HIGH).all()
+    assert new.actions == OLD
     assert new.words == WORDS
-    assert description["provenance"]["init"] == read_description(results / "artifacts/target/old", "target")["sha256"]
+    assert description.provenance["init"] == read_target(results / "artifacts/target/old").sha256
 
 
 def test_training_changes_the_new_target_and_not_the_old_one(results: Path) -> None:
@@ -105,7 +107,7 @@ def test_an_interrupted_run_goes_on_where_it_was(results: Path) -> None:
     whole = trained(results, "name=whole")
     with pytest.raises(KeyboardInterrupt):
         trained(results, "name=cut", stop=3)
-    assert json.loads((results / "artifacts/target/cut/progress.json").read_text())["step"] == 2
+    assert read_state(results / "artifacts/target/cut/resume.safetensors")[1].step == 2
     cut = trained(results, "name=cut")
     a, b = (load_file(folder / "resume.safetensors") for folder in (whole, cut))
     assert all(torch.equal(a[name], b[name]) for name in a)
@@ -132,7 +134,7 @@ def test_a_run_without_it_is_the_same_run_as_before_there_was_init(results: Path
     [("target.width=64", "width"), ("target.observation=vision", "observation"), ("target.layers=1", "layers")],
 )
 def test_another_shape_is_refused_by_its_name(results: Path, override: str, shape: str) -> None:
-    old = read_description(results / "artifacts/target/old", "target")["settings"][shape]
+    old = read_target(results / "artifacts/target/old").settings[shape]
     with pytest.raises(UsageError, match=rf"train\.init: .* {shape}={old}, the run {override}: set both alike"):
         TargetRun(settings(results, override))
 

@@ -126,7 +126,7 @@ def with_spaces(value: dict[str, Any]) -> dict[str, Any]:
         settings = {k: v for k, v in value["settings"].items() if k != "dofs"}
         cameras = ["corner4"] if settings.get("observation") == "vision" else []
         of_target = {"settings": settings, "observation": SPEC.observation.as_dict(), "cameras": cameras}
-        value |= {"family": "compact", "environment": "metaworld", **of_target}
+        value |= {"family": "compact", "environment": SPEC.name, **of_target}
     return value
 
 

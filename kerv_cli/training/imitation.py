@@ -17,10 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.environments import spec_of
+from kerv_cli.environments import spec_of, specs
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.tasks import TASKS
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
 from kerv_cli.spaces import ObservationSpace
@@ -279,9 +278,9 @@ def check_spaces(target: CompactTarget, dataset: DemoDataset) -> None:
         )
 
 
-def vocabulary() -> WordTokenizer:
+def vocabulary(environment: str) -> WordTokenizer:
     """All words of the environment's instructions."""
-    return WordTokenizer.build(t.instruction for t in TASKS.values())
+    return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())
 
 
 def imitation_job(

@@ -122,14 +122,18 @@ class Loop:
 
     def store(self) -> None:
         """Write the resume file, then the log."""
-        import pandas as pd
-
         tensors = {f"model.{k}": v for k, v in self.job.module.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
         progress = Progress(self.identity, self.step, self.best, self.history)
         write_state(self.folder / "resume.safetensors", tensors, progress)
+        self.log()
+
+    def log(self) -> None:
+        """Write `log.csv`, a row per validation."""
+        import pandas as pd
+
         with atomic_path(self.folder / "log.csv") as temporary:
             pd.DataFrame(self.history).to_csv(temporary, index=False, float_format="%.6g")
 
@@ -157,12 +161,14 @@ class Loop:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.best, self.history = progress.step, progress.best, progress.history
+        self.log()  # the run may have been cut before it could
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
     """Tensors and progress in one file, so that no kill can leave them of different steps."""
     text = json.dumps(asdict(progress), allow_nan=False)
-    save_tensors(path, tensors, {"progress": text, "sha256": digest(tensors, text)})
+    # one key, because safetensors writes several in any order: equal states are equal bytes
+    save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
 
 
 def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
@@ -174,12 +180,10 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
     again = f"delete {path.parent} to begin again"
     try:
         with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-        tensors = load_tensors(path, "training state")
-        text = metadata["progress"]
-        intact = metadata["sha256"] == digest(tensors, text)
-        value = json.loads(text)
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+            state = json.loads((file.metadata() or {})["state"])
+        tensors, text = load_tensors(path, "training state"), state["progress"]
+        intact, value = state["sha256"] == digest(tensors, text), json.loads(text)
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"training state at {path} is damaged ({error}): {again}") from error
     if not intact:
         raise CheckpointError(f"training state at {path} is damaged, its hash does not fit: {again}")

@@ -108,7 +108,7 @@ class TargetRun:
             assert self.begun is not None
             self.origin = {"init": described.sha256}
             check_spaces(self.begun, self.dataset)
-        words = self.begun.words if self.begun else vocabulary()
+        words = self.begun.words if self.begun else vocabulary(self.dataset.manifest.environment)
         self.samples = load_samples(self.dataset, self.settings.target, words, self.tasks, progress)
 
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
@@ -117,7 +117,8 @@ class TargetRun:
         settings = self.settings
         if self.begun is None:
             camera = settings.world.camera.name
-            target = new_target(settings.target, self.dataset, self.samples, vocabulary(), camera, settings.train.seed)
+            words = vocabulary(self.dataset.manifest.environment)
+            target = new_target(settings.target, self.dataset, self.samples, words, camera, settings.train.seed)
         else:
             target = continued_target(settings.target, self.begun)
         target = target.to(self.device)

@@ -5,7 +5,7 @@ The results folder must be one that the nodes share.
 
 from __future__ import annotations
 
-import logging
+import socket
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -17,6 +17,8 @@ from kerv_cli.studies.executors import THREAD_VARIABLES, Executor, WorkerLost
 
 T = TypeVar("T")
 
+_CONNECT_SECONDS = 5.0
+
 
 def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Executor:
     """Connects to the cluster, or starts a Ray with as many processors as the slots need.
@@ -26,13 +28,29 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
     """
     import ray
 
+    _check_reachable(options.address)
     started: dict[str, Any] = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
     try:
-        ray.init(address=options.address or "local", log_to_driver=False, logging_level=logging.ERROR, **started)
+        ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
         why = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise UsageError(f"the Ray cluster {options.address or 'of this machine'} cannot be reached: {why}") from None
     return Tasks(slots, threads, options.gpus)
+
+
+def _check_reachable(address: str) -> None:
+    """Ray itself tries for many minutes.
+
+    Raises:
+        UsageError: nothing listens at `host:port` or `ray://host:port`.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
+    except OSError as error:
+        raise UsageError(f"the Ray cluster {address} cannot be reached: {error.strerror or error}") from None
 
 
 class Tasks:
@@ -44,7 +62,7 @@ class Tasks:
         self.slots = slots
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
-        self._call: Any = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
+        self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
         self._open: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:

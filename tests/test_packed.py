@@ -1,4 +1,4 @@
-"""The plans of a frozen CPU policy compute what its plain modules do; training and other devices never meet them."""
+"""The packed weights of a frozen CPU policy compute what its modules do; training and other devices never meet them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.tree import ROOT, TokenTree, prefill_mask, verify_mask
+from kerv_cli.drafting.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import DrafterSettings, TargetSettings
-from kerv_cli.spaces import VOCABULARY, ActionTokenizer
-from kerv_cli.targets.compact.inference import FastLinear, has_blocked_layouts
-from kerv_cli.targets.compact.layout import lay_out_for_inference
-from kerv_cli.targets.compact.target import Inputs, Target
+from kerv_cli.spaces import Observation, ObservationSpace, Place
+from kerv_cli.targets.compact.packed import FastLinear, has_blocked_layouts, pack
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
+
+ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
+
+ALONE = ObservationSpace(("x", "y", "z"), 3, (Place("hole", 0),), (0.1, 0.2, 0.3))  # the least there can be
+THREE = ObservationSpace(
+    ("x", "y", "z", "roll", "open"), 20, tuple(Place(n, 3 * i) for i, n in enumerate("abc")), (0.0, 0.0, 0.1)
+)
 
 
 def shaken(module: torch.nn.Module, seed: int) -> torch.nn.Module:
@@ -39,27 +46,29 @@ def both_trunks(seed: int, layers: int, heads: int, channels: int) -> tuple[Trun
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.1)
     shaken(plain, seed)
-    planned = copy.deepcopy(plain)
-    lay_out_for_inference(planned)
-    assert all(layer.plan is not None for layer in planned.layers)
-    return plain, planned
+    packed = copy.deepcopy(plain)
+    pack(packed)
+    assert packed.packed is not None
+    return plain, packed
 
 
-def both_targets(observation: str, seed: int, **changes: int) -> tuple[Target, Target]:
+def both_targets(
+    observation: str, seed: int, space: ObservationSpace = OBSERVATION, **changes: int
+) -> tuple[CompactTarget, CompactTarget]:
     torch.manual_seed(seed)
     small = {"image_size": 48, "grid": 2, "keypoints": 5, "channels": 16, "scene_tokens": 3, **changes}
     shape = TargetSettings(observation=observation, width=32, layers=2, heads=2, feed_forward=48, **small)
     words = WordTokenizer.build(["open the drawer"])
-    plain = Target(shape, ActionTokenizer(-np.ones(4), np.ones(4)), words)
+    plain = CompactTarget(shape, ACTIONS, space, words, "corner4")
     shaken(plain, seed)
-    planned = copy.deepcopy(plain)
-    lay_out_for_inference(planned)
-    return plain, planned
+    packed = copy.deepcopy(plain)
+    pack(packed)
+    return plain, packed
 
 
 def random_tree(random: np.random.Generator, nodes: int) -> TokenTree:
     parents = [int(random.integers(ROOT, i)) for i in range(nodes)]
-    return TokenTree.build(random.integers(0, VOCABULARY, nodes).tolist(), parents)
+    return TokenTree.build(random.integers(0, ACTIONS.tokens, nodes).tolist(), parents)
 
 
 def close(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -75,42 +84,42 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
     prompt=st.integers(1, 40),
     nodes=st.integers(0, 40),
 )
-def test_the_planned_trunk_is_the_trunk(
+def test_the_packed_trunk_is_the_trunk(
     seed: int, layers: int, heads: int, channels: int, prompt: int, nodes: int
 ) -> None:
     """A prefill, a tree behind it, its commit, single tokens behind that; and the tree inside the prefill."""
-    plain, planned = both_trunks(seed, layers, heads, channels)
+    plain, packed = both_trunks(seed, layers, heads, channels)
     random = np.random.default_rng(seed)
     tree = random_tree(random, nodes)
     x = torch.randn(1, prompt + nodes + 3, heads * channels)
     outputs = []
     with torch.inference_mode():
-        for trunk in (plain, planned):
+        for trunk in (plain, packed):
             cache = trunk.new_cache(1, prompt + nodes + 3)
             seen = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
             drafted = x[:, prompt : prompt + 1 + nodes]
             positions = torch.tensor([prompt, *(prompt + 1 + d for d in tree.depths)])
-            seen.append(trunk(drafted, positions, cache, verify_mask(tree, prompt, x)))
+            seen.append(trunk(drafted, positions, cache, visible_in_verification(tree)))
             path = tree.path_to(nodes - 1) if nodes else []
-            cache.keep(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
+            cache.compact(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
             for i in range(2):
                 at = prompt + 1 + len(path) + i
                 seen.append(trunk(x[:, -1 - i][:, None], torch.tensor([at]), cache))
             whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
             cache.length = 0
-            seen.append(trunk(x[:, : prompt + nodes], whole, cache, prefill_mask(tree, prompt, x)))
+            seen.append(trunk(x[:, : prompt + nodes], whole, cache, visible_in_prefill(tree, prompt)))
             seen.append(trunk(x[:, :prompt], torch.arange(prompt)))
             outputs.append(seen)
     assert all(close(a, b) for a, b in zip(*outputs, strict=True))
 
 
 @pytest.mark.parametrize("tokens", [1, 5, 30])
-def test_the_planned_trunk_takes_batches(tokens: int) -> None:
-    plain, planned = both_trunks(7, 2, 2, 16)
+def test_the_packed_trunk_takes_batches(tokens: int) -> None:
+    plain, packed = both_trunks(7, 2, 2, 16)
     x = torch.randn(3, tokens + 1, 32)
     outputs = []
     with torch.inference_mode():
-        for trunk in (plain, planned):
+        for trunk in (plain, packed):
             cache = trunk.new_cache(3, tokens + 1)
             first = trunk(x[:, :tokens], torch.arange(tokens), cache)
             outputs.append(torch.cat([first, trunk(x[:, tokens:], torch.tensor([tokens]), cache)], 1))
@@ -134,88 +143,93 @@ def test_both_layouts_of_a_weight_give_its_product(rows: int) -> None:
     grid=st.sampled_from([1, 2, 3]),
     keypoints=st.integers(1, 9),
     channels=st.sampled_from([8, 24]),
+    space=st.sampled_from([OBSERVATION, ALONE, THREE]),
 )
-def test_the_planned_prompt_is_the_prompt(seed: int, grid: int, keypoints: int, channels: int) -> None:
-    plain, planned = both_targets("vision", seed, grid=grid, keypoints=keypoints, channels=channels)
-    assert (planned.vision.plan is not None) == has_blocked_layouts()
+def test_the_packed_prompt_is_the_prompt(
+    seed: int, grid: int, keypoints: int, channels: int, space: ObservationSpace
+) -> None:
+    plain, packed = both_targets("vision", seed, space, grid=grid, keypoints=keypoints, channels=channels)
+    assert (packed.vision.packed is not None) == has_blocked_layouts()
     random = np.random.default_rng(seed)
     frame = random.integers(0, 256, (48, 48, 3), dtype=np.uint8)
-    state = random.normal(0, 0.2, 39)
+    felt = random.normal(0, 0.2, len(space.proprioception))
+    shown = Observation(felt, np.zeros(space.state), "open the drawer", {"corner4": frame})
     with torch.inference_mode():
-        a, b = (t.encode(t.inputs(frame, state, t.words_of("open the drawer"))) for t in (plain, planned))
+        a, b = (t.encode_batch(t.inputs(shown)) for t in (plain, packed))
     assert close(a[0], b[0])
     assert close(a[1], b[1])
 
 
 def test_a_sharp_temperature_does_not_overflow() -> None:
-    plain, planned = both_targets("vision", 3)
-    for target in (plain, planned):
+    plain, packed = both_targets("vision", 3)
+    for target in (plain, packed):
         target.vision.temperature.data.fill_(1e4)
-    lay_out_for_inference(planned)
+    pack(packed)
     images = torch.randint(0, 256, (1, 3, 48, 48), dtype=torch.uint8)
     with torch.inference_mode():
-        points = planned.vision(images)[1]
+        points = packed.vision(images)[1]
         assert torch.isfinite(points).all()
         assert torch.allclose(points, plain.vision(images)[1], atol=1e-2)
 
 
 @pytest.mark.parametrize("observation", ["vision", "state"])
 def test_batches_and_teacher_forcing_agree(observation: str) -> None:
-    plain, planned = both_targets(observation, 5)
+    plain, packed = both_targets(observation, 5)
     images = torch.randint(0, 256, (3, 3, 48, 48), dtype=torch.uint8) if observation == "vision" else None
-    inputs = Inputs(images, torch.randn(3, 39) * 0.1, torch.ones(3, plain.settings.instruction_tokens).long())
-    tokens = torch.randint(0, VOCABULARY, (3, plain.tokens_per_chunk))
+    words = torch.ones(3, plain.settings.instruction_tokens).long()
+    inputs = Inputs(images, torch.randn(3, 4) * 0.1, torch.randn(3, 39) * 0.1, words)
+    tokens = torch.randint(0, ACTIONS.tokens, (3, plain.chunk * ACTIONS.dofs))
     with torch.inference_mode():
-        assert close(plain(inputs, tokens)[0], planned(inputs, tokens)[0])
+        assert close(plain.teacher_forced(inputs, tokens)[0], packed.teacher_forced(inputs, tokens)[0])
 
 
-def test_the_drafter_has_a_plan_too() -> None:
+def test_the_drafter_is_packed_too() -> None:
     target, _ = both_targets("state", 1)
     plain = shaken(Drafter.beside(DrafterSettings(), target), 1)
-    planned = copy.deepcopy(plain)
-    lay_out_for_inference(planned)
-    assert planned.layers[0].plan is not None
+    packed = copy.deepcopy(plain)
+    pack(packed)
+    assert packed.packed is not None
     following, hidden = torch.randn(1, 9, 32), torch.randn(1, 9, 32)
     with torch.inference_mode():
         outputs = []
-        for drafter in (plain, planned):
-            cache = drafter.new_cache(9)
+        for drafter in (plain, packed):
+            cache = drafter.new_cache(1, 9)
             first = drafter(following[:, :8], hidden[:, :8], torch.arange(8), cache)
             outputs.append(torch.cat([first, drafter(following[:, 8:], hidden[:, 8:], torch.tensor([8]), cache)], 1))
     assert close(*outputs)
 
 
 def test_the_callers_tensor_is_left_alone() -> None:
-    _, planned = both_trunks(2, 2, 2, 8)
+    _, packed = both_trunks(2, 2, 2, 8)
     with torch.inference_mode():
         for tokens in (1, 30):
             x = torch.randn(1, tokens, 16)
             before = x.clone()
-            planned(x, torch.arange(tokens), planned.new_cache(1, tokens))
+            packed(x, torch.arange(tokens), packed.new_cache(1, tokens))
             assert torch.equal(x, before)
 
 
-def test_a_plan_never_outlives_its_weights() -> None:
+def test_packed_weights_never_outlive_their_weights() -> None:
     for change in (
         lambda m: m.load_state_dict(m.state_dict()),
         lambda m: m.to(torch.float64),
         lambda m: m.train(),
         lambda m: m.requires_grad_(True),
     ):
-        _, planned = both_targets("vision", 4)
-        change(planned)
-        assert all(getattr(part, "plan", None) is None for part in planned.modules())
-    plain, planned = both_targets("vision", 4)
-    for twin in (copy.deepcopy(planned), pickle.loads(pickle.dumps(planned.trunk))):
-        assert all(getattr(part, "plan", None) is None for part in twin.modules())
-    assert planned.state_dict().keys() == plain.state_dict().keys()
+        _, packed = both_targets("vision", 4)
+        change(packed)
+        assert all(getattr(part, "packed", None) is None for part in packed.modules())
+    plain, packed = both_targets("vision", 4)
+    for twin in (copy.deepcopy(packed), pickle.loads(pickle.dumps(packed.trunk))):
+        assert all(getattr(part, "packed", None) is None for part in twin.modules())
+    assert packed.state_dict().keys() == plain.state_dict().keys()
 
 
-def test_what_trains_gets_no_plan_and_its_gradients() -> None:
+def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
     _, frozen = both_trunks(6, 1, 2, 8)
     learning = copy.deepcopy(frozen).requires_grad_(True)
-    lay_out_for_inference(learning)
-    assert learning.layers[0].plan is None
+    pack(learning)
+    assert learning.packed is None
     learning(torch.randn(1, 4, 16), torch.arange(4)).sum().backward()
     assert learning.layers[0].qkv.weight.grad is not None
     x = torch.randn(1, 4, 16, requires_grad=True)

@@ -1,0 +1,39 @@
+"""An executor from outside: threads of this process. Registered by `KERV_PLUGINS=thread_executor`, chosen by
+`runtime.executor=threads`."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kerv_cli.registry import Part, register
+
+
+@dataclass
+class ThreadOptions:
+    """`runtime.executor_options` of threads."""
+
+    name: str = "kerv"  # prefix of the threads' names
+
+
+class Threads:
+    """See `kerv_cli.studies.executors.Executor`."""
+
+    def __init__(self, slots: int, name: str) -> None:
+        self.slots = slots
+        self._pool = ThreadPoolExecutor(slots, thread_name_prefix=name)
+
+    def submit(self, work: Any, /) -> Future[Any]:
+        return self._pool.submit(work)
+
+    def close(self, abandon: bool) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=abandon)
+
+
+def build(options: ThreadOptions, slots: int, threads: int, folder: Path) -> Threads:
+    return Threads(slots, options.name)
+
+
+register(Part("executor", "threads", "thread_executor:build", settings=ThreadOptions, about="threads of this process"))

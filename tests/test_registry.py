@@ -1,0 +1,171 @@
+"""The registry: names, collisions, plugins, and that everything it names is there."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kerv_cli import registry
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.parts import METHOD_KINDS, PREFILL, STATES
+from kerv_cli.registry import Part, find, kinds, load, parts, register
+
+PLUGIN = """
+from dataclasses import dataclass
+
+from kerv_cli.registry import Part, register
+
+
+@dataclass
+class Settings:
+    kind: str = "{name}"
+    width: int = 17
+
+
+register(Part("proposer", "{name}", "{module}:build", Settings, traits={{"when": "prefill"}}))
+
+
+def build(settings, context):
+    raise NotImplementedError
+"""
+
+
+@pytest.fixture
+def shelf(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Part]]:
+    """The registry's own parts; what a test adds is gone after it."""
+    kinds()
+    copy = {kind: dict(named) for kind, named in registry._PARTS.items()}
+    monkeypatch.setattr(registry, "_PARTS", copy)
+    return copy
+
+
+EVERY = [(kind, name) for kind in kinds() for name in parts(kind)]
+
+
+def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) -> None:
+    first = register(Part("proposer", "mine", "one:build"))
+    again = register(Part("proposer", "mine", "one:build", about="reloaded"))
+    assert find("proposer", "mine") is again is not first
+    with pytest.raises(UsageError, match="proposer 'mine' is registered twice: one:build and two:build") as refused:
+        register(Part("proposer", "mine", "two:build"))
+    assert "\n" not in str(refused.value)
+    with pytest.raises(UsageError, match="proposer 'drafter' is registered twice"):
+        register(Part("proposer", "drafter", "elsewhere:build"))
+    assert find("proposer", "drafter").build == "kerv_cli.decoding.build:drafter"
+    register(Part("threshold", "mine", "two:build"))  # another kind: another name
+    assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
+
+
+def test_an_unknown_name_lists_the_near_ones() -> None:
+    with pytest.raises(UnknownName, match="unknown acceptance 'relaxd': did you mean relaxed"):
+        find("acceptance", "relaxd")
+    with pytest.raises(UnknownName, match=r"unknown acceptance\.kind 'x': known: strict, relaxed, sequence, hybrid"):
+        find("acceptance", "x", "acceptance.kind")
+    assert parts("nothing of the kind") == {}
+
+
+@pytest.mark.parametrize(("kind", "name"), EVERY)
+def test_what_a_part_names_is_there(kind: str, name: str) -> None:
+    part = find(kind, name)
+    assert (part.kind, part.name) == (kind, name)
+    if part.build:
+        assert load(part.build) is not None
+    if kind in (*METHOD_KINDS, "datastore"):
+        chosen = part.settings(kind=name)
+        assert chosen.kind == name
+        assert isinstance(part.needs(chosen), tuple)
+        assert set(part.needs(chosen)) <= set(parts("artifact"))
+        if part.check is not None:
+            part.check(chosen)  # defaults are in range
+
+
+def test_every_proposer_says_when_it_can_draft() -> None:
+    assert {part.traits["when"] for part in parts("proposer").values()} == {PREFILL, STATES}
+    chains = {name for name, part in parts("proposer").items() if part.traits.get("chains")}
+    assert all(find("proposer", name).traits["when"] == PREFILL for name in chains)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("kerv_cli.parts:nothing_there", "kerv_cli.parts has no nothing_there"),
+        ("kerv_cli.nowhere:build", "kerv_cli.nowhere"),
+    ],
+)
+def test_what_is_not_there_gets_one_line(name: str, says: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        load(name)
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def kerv(*words: str, folder: Path, plugins: str = "") -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": plugins}
+    command = [sys.executable, "-c", "from kerv_cli.app import main; main()", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
+    (tmp_path / "my_parts.py").write_text(PLUGIN.format(name="mine", module="my_parts"))
+    words = ["rollout", "--cfg", "proposer=mine", "prefill_draft=mine"]
+    shown = kerv(*words, "proposer.width=3", folder=tmp_path, plugins="my_parts")
+    assert shown.returncode == 0, shown.stderr
+    assert "proposer:\n  kind: mine\n  width: 3\n" in shown.stdout
+    assert "prefill_draft:\n  kind: mine\n  width: 17\n" in shown.stdout
+    wrong = kerv("rollout", "--cfg", "proposer=mien", folder=tmp_path, plugins="my_parts")
+    assert (wrong.returncode, wrong.stderr) == (2, "kerv: unknown proposer 'mien': did you mean mine?\n")
+    without = kerv(*words, folder=tmp_path)
+    assert without.returncode == 2
+    assert without.stderr.startswith("kerv: unknown proposer 'mine'")
+
+
+@pytest.mark.parametrize(
+    ("plugins", "says"),
+    [
+        ("not_there", "kerv: plugin not_there cannot be imported (No module named 'not_there')"),
+        (
+            "collides",
+            "kerv: proposer 'drafter' is registered twice: kerv_cli.decoding.build:drafter and collides:build",
+        ),
+    ],
+)
+def test_a_plugin_that_does_not_work_gets_one_line(tmp_path: Path, plugins: str, says: str) -> None:
+    (tmp_path / "collides.py").write_text(PLUGIN.format(name="drafter", module="collides"))
+    done = kerv("rollout", "--cfg", folder=tmp_path, plugins=plugins)
+    assert done.returncode == 2
+    assert done.stderr.startswith(says)
+    assert done.stderr.count("\n") == 1
+
+
+def test_an_installed_package_registers_by_an_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shelf: dict[str, dict[str, Part]]
+) -> None:
+    (tmp_path / "installed_parts.py").write_text(PLUGIN.format(name="installed", module="installed_parts"))
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def entry_points(group: str) -> list[EntryPoint]:
+        return [EntryPoint("anything", "installed_parts", group)] if group == "kerv.parts" else []
+
+    monkeypatch.setattr(registry, "entry_points", entry_points)
+    registry.load_plugins.__wrapped__()
+    assert find("proposer", "installed").built.__self__.build == "installed_parts:build"
+
+
+def test_parts_are_known_without_anything_heavy() -> None:
+    heavy = "{'torch', 'mujoco', 'numpy', 'pyarrow', 'hydra', 'pydantic'}"
+    asked = "import sys; from kerv_cli.registry import parts; assert len(parts('proposer')) > 9; "
+    done: Any = subprocess.run(
+        [sys.executable, "-c", f"{asked}print(*({heavy} & set(sys.modules)))"],
+        env={**os.environ, "KERV_PLUGINS": ""},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "\n"
