@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.environments import settled
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import RolloutSettings, StudySettings
 from kerv_cli.studies.block import Prepare, RunEpisode
@@ -23,6 +24,7 @@ IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
 
 def settings_of(method: str, r: int = 0, episodes: int = 4, proposer: str = "drafter") -> RolloutSettings:
     settings = RolloutSettings(method=method, episodes=episodes)
+    settings.world = settled(settings.world, SPEC)
     settings.proposer.kind = "none" if method == "ar" else proposer
     settings.acceptance.kind = "relaxed" if r else "strict"
     settings.threshold.r = r

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from kerv_cli.environments.metaworld.tasks import TASKS
+from kerv_cli.environments import specs
 from kerv_cli.files import atomic_path
 from kerv_cli.provenance import PACKAGES
 from kerv_cli.reporting.ceiling import (
@@ -82,7 +82,7 @@ def _labelled(cell: Cell, stored: StoredCell) -> pd.DataFrame:
 
 def difficulty_of(task: str) -> str:
     """The task's difficulty group; `other` for a task that no environment has."""
-    return TASKS[task].difficulty if task in TASKS else "other"
+    return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
 def per_task_table(data: StudyData) -> pd.DataFrame:
