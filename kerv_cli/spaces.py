@@ -200,8 +200,8 @@ class ObservationSpace:
     proprioception: names of its numbers; the first three are the end effector's position in metres. state: how many
     privileged numbers there are. places: positions in the state that a policy may estimate from images, e.g. object and
     goal; all others are only for a policy that is given the state. extra: further indices of the state that such a
-    policy reads as they are. previous: (numbers, first index of the step before's copy of them), or None; their
-    difference over `step_scale` is a velocity. centre: metres, the middle of the workspace.
+    policy reads as they are. previous: (how many numbers, first index of the step before's copy of them), or None; such
+    a policy reads their differences. centre: metres, the middle of the workspace.
     """
 
     proprioception: tuple[str, ...]
@@ -244,59 +244,3 @@ class Observation:
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
         """The same observation, seen."""
         return replace(self, images=images)
-
-
-# --- until every room reads its ActionSpace: what Meta-World's compact target used to have built in
-EDGES = np.linspace(-1.0, 1.0, 256)
-CENTRES = (EDGES[:-1] + EDGES[1:]) / 2
-VOCABULARY = len(CENTRES)  # 255
-DOF_NAMES = ("dx", "dy", "dz", "gripper")
-GRIPPER = 3
-
-
-@dataclass(frozen=True)
-class ActionTokenizer:
-    """Normalise per DoF with the demonstrations' 1st / 99th percentile, then bin.
-
-    low, high: (D,) in environment units; they map to -1 and 1.
-    """
-
-    low: np.ndarray
-    high: np.ndarray
-
-    @classmethod
-    def fit(cls, actions: np.ndarray) -> ActionTokenizer:
-        """actions (n, D), environment units. A DoF that never moves gets a unit range around its value."""
-        low, high = np.percentile(actions, [1, 99], axis=0)
-        still = high - low < 1e-6
-        return cls(np.where(still, low - 1.0, low), np.where(still, high + 1.0, high))
-
-    @property
-    def dofs(self) -> int:
-        return len(self.low)
-
-    def normalise(self, actions: np.ndarray) -> np.ndarray:
-        """(..., D) environment units -> [-1, 1]."""
-        return np.clip(2.0 * (actions - self.low) / (self.high - self.low) - 1.0, -1.0, 1.0)
-
-    def unnormalise(self, values: np.ndarray) -> np.ndarray:
-        """(..., D) in [-1, 1] -> environment units."""
-        return (values + 1.0) / 2.0 * (self.high - self.low) + self.low
-
-    def encode(self, actions: np.ndarray) -> np.ndarray:
-        """(..., D) environment units -> (..., D) int64 tokens in [0, 254]."""
-        return bins_of(self.normalise(actions))
-
-    def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """(..., D) tokens -> (..., D) environment units; the centre of each bin."""
-        return self.unnormalise(values_of(tokens))
-
-
-def bins_of(values: np.ndarray) -> np.ndarray:
-    """Normalised values -> tokens. Both ends belong to the outermost bins."""
-    return np.clip(np.digitize(values, EDGES) - 1, 0, VOCABULARY - 1).astype(np.int64)
-
-
-def values_of(tokens: np.ndarray) -> np.ndarray:
-    """Tokens -> normalised values, the bins' centres."""
-    return CENTRES[np.asarray(tokens)]

@@ -1,0 +1,112 @@
+"""Action spaces: round trips of tokens, both ends, groups, statistics, and what may be used together."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kerv_cli.environments.insertion.spec import SPEC as INSERTION
+from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.spaces import ActionSpace, Group, ObservationSpace
+from kerv_cli.targets.compact.text import PAD, UNKNOWN, WordTokenizer
+
+WIDTH = 2 / 255  # of a bin
+SPACE = METAWORLD.actions
+
+
+def openvla_bin(value: float) -> int:
+    """OpenVLA's rule in its own terms: digitize over 256 edges, ids counted from one, then clipped to the centres."""
+    return int(np.clip(np.digitize(np.clip(value, -1, 1), np.linspace(-1, 1, 256)) - 1, 0, 254))
+
+
+def test_both_ends_belong_to_the_outermost_bins() -> None:
+    assert len(SPACE.edges) == 256
+    assert SPACE.tokens == len(SPACE.centres) == 255
+    assert SPACE.bins_of(np.array([-1.0, 1.0, -7.0, 7.0])).tolist() == [0, 254, 0, 254]
+    assert SPACE.values_of(np.array([0, 254])) == pytest.approx([-1 + WIDTH / 2, 1 - WIDTH / 2])
+
+
+def test_every_token_survives_the_round_trip() -> None:
+    tokens = np.arange(SPACE.tokens)
+    assert (SPACE.bins_of(SPACE.values_of(tokens)) == tokens).all()
+
+
+@given(st.floats(-1.0, 1.0))
+def test_the_round_trip_is_within_half_a_bin_and_equals_openvla(value: float) -> None:
+    token = SPACE.bins_of(np.array(value))
+    assert token == openvla_bin(value)
+    assert abs(SPACE.values_of(token) - value) <= WIDTH / 2 + 1e-12
+
+
+def test_statistics_are_the_percentiles_and_a_still_dof_stays_finite() -> None:
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-3, 5, (5000, 4))
+    actions[:, 3] = 0.25
+    fitted = SPACE.fitted(actions)
+    assert fitted.low[:3] == pytest.approx(np.quantile(actions[:, :3], 0.01, axis=0))
+    assert fitted.high[:3] == pytest.approx(np.quantile(actions[:, :3], 0.99, axis=0))
+    back = fitted.decode(fitted.encode(actions))
+    inside = (actions > np.array(fitted.low)) & (actions < np.array(fitted.high))
+    assert np.abs(back - actions)[inside].max() <= (8 / 255) / 2 + 1e-9
+    assert back[:, 3] == pytest.approx(0.25, abs=WIDTH)
+
+
+def test_groups_and_strict_dofs_follow_from_the_space() -> None:
+    assert SPACE.bounds == ((0, 3), (0, 3), (0, 3), (3, 4))
+    assert SPACE.is_strict.tolist() == [False, False, False, True]
+    assert list(SPACE.segments(1, 10)) == [(1, 3, False), (3, 4, True), (4, 7, False), (7, 8, True), (8, 10, False)]
+    seven = INSERTION.actions
+    assert seven.dofs == 7
+    assert [seven.names[dof] for dof in np.flatnonzero(seven.is_strict)] == ["gripper"]
+    assert list(seven.segments(2, 9)) == [(2, 3, False), (3, 6, False), (6, 7, True), (7, 9, False)]
+    assert np.flatnonzero(seven.strict_tokens(14)).tolist() == [6, 13]
+
+
+def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
+    for space in (METAWORLD.actions, INSERTION.actions):
+        assert ActionSpace.from_dict(json.loads(json.dumps(space.as_dict()))) == space
+    for space in (METAWORLD.observation, INSERTION.observation):
+        assert ObservationSpace.from_dict(json.loads(json.dumps(space.as_dict()))) == space
+    wrong = (
+        {"names": 1},
+        {**SPACE.as_dict(), "more": 1},
+        {**SPACE.as_dict(), "bins": 2},
+        {**SPACE.as_dict(), "low": [float("nan")] * 4},
+        {**SPACE.as_dict(), "groups": [{"name": "position", "size": 3}]},
+        {**SPACE.as_dict(), "strict": ["thumb"]},
+    )
+    for value in wrong:
+        with pytest.raises(CheckpointError, match="an action space is damaged") as refused:
+            ActionSpace.from_dict(value)
+        assert "\n" not in str(refused.value)
+
+
+def test_what_was_made_for_other_actions_is_refused_by_the_first_difference() -> None:
+    fitted = replace(SPACE, low=(-0.5,) * 4)
+    fitted.check_same(SPACE, "the target", "the environment")
+    with pytest.raises(CheckpointError, match="low -0.5, -0.5, -0.5, -0.5, the target one with -1"):
+        fitted.check_same(SPACE, "the datastore", "the target", statistics=True)
+    with pytest.raises(CheckpointError, match="names dx, dy, dz, gripper, the environment one with dx, dy, dz, droll"):
+        SPACE.check_same(INSERTION.actions, "the target", "the environment")
+    loose = replace(SPACE, strict=())
+    with pytest.raises(CheckpointError, match="strict gripper, the drafter one with none"):
+        SPACE.check_same(loose, "the target", "the drafter")
+    other = replace(SPACE, groups=(Group("all", 4),))
+    with pytest.raises(CheckpointError, match=r"groups position 3\+gripper 1, the drafter one with all 4"):
+        SPACE.check_same(other, "the target", "the drafter")
+
+
+def test_words_keep_their_ids_and_a_long_sentence_is_refused() -> None:
+    words = WordTokenizer.build(["open the drawer", "close the door"])
+    ids = words.encode("Open the window", 5)
+    assert ids[2] == UNKNOWN
+    assert ids[3:] == [PAD, PAD]
+    assert len({*words.encode("open the drawer close door", 5)}) == 5
+    with pytest.raises(UsageError, match="5 words, the policy takes 4"):
+        words.encode("open the drawer close door", 4)
