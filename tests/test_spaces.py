@@ -90,7 +90,7 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
 def test_what_was_made_for_other_actions_is_refused_by_the_first_difference() -> None:
     fitted = replace(SPACE, low=(-0.5,) * 4)
     fitted.check_same(SPACE, "the target", "the environment")
-    with pytest.raises(CheckpointError, match="low -0.5, -0.5, -0.5, -0.5, the target one with -1"):
+    with pytest.raises(CheckpointError, match=r"low -0\.5, -0\.5, -0\.5, -0\.5, the target one with -1"):
         fitted.check_same(SPACE, "the datastore", "the target", statistics=True)
     with pytest.raises(CheckpointError, match="names dx, dy, dz, gripper, the environment one with dx, dy, dz, droll"):
         SPACE.check_same(INSERTION.actions, "the target", "the environment")
