@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import CheckpointError, KervError
 from kerv_cli.files import read_json
 
 T = TypeVar("T")
@@ -47,6 +47,8 @@ def read(kind: type[T], value: Any, what: str) -> T:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
+    except KervError as error:  # what the dataclass itself refuses
+        raise CheckpointError(f"{what} is damaged: {error}") from error
     return checked
 
 

@@ -207,7 +207,10 @@ def read_calibration(path: Path) -> Calibration:
     """
     if not path.is_file():
         raise CheckpointError(f"no calibration at {path}: run 'kerv calibrate'")
-    return read_file(Calibration, path, f"a calibration of format {FORMAT}: {AGAIN}")
+    try:
+        return read_file(Calibration, path, f"a calibration of format {FORMAT}")
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}; {AGAIN}") from error
 
 
 def load_calibration(path: Path, description: TargetDescription) -> Calibration:
