@@ -16,30 +16,27 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples.own_target import SEVEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kerv_cli.drafting.groups import Groups, kinematic_groups, segments
 from typer.testing import CliRunner
 
 from kerv_cli.commands import build as command
-from kerv_cli.drafting.datastore import (
-    Datastore,
-    check_seeds,
-    neighbour_tree,
-    open_datastore,
-    prompt_key,
-    segments_of,
-)
+from kerv_cli.drafting.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge
-from kerv_cli.environments.demos.dataset import dataset_hash, episode_path
-from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, save_episode
+from kerv_cli.environments.demos.dataset import FORMAT, dataset_hash, episode_path
+from kerv_cli.environments.demos.episode_file import DemoEpisode, save_episode
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, DatastoreSettings, PolicySettings
-from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.parts import ExactSearchSettings, QdrantSearchSettings
+from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
+from kerv_cli.spaces import ActionSpace, Observation
+from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
-from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
+from kerv_cli.training.datastore import DatastoreBuild, directions, leave_one_out
 
+SPACE = SPEC.actions
 TASKS = ("drawer-close-v3", "reach-v3")
 LENGTHS = {0: 9, 1: 6, 7: 11}  # seed -> control steps
 TAIL = 8
@@ -60,18 +57,29 @@ def episode(task: str, seed: int, steps: int, tail: int = TAIL, size: int = 96) 
     return DemoEpisode(task, seed, False, steps, frames, frame_steps, states, labels, executed, np.zeros(3))
 
 
-def write_demos(folder: Path, lengths: dict[int, int], tail: int = TAIL, size: int = 96) -> dict[str, Any]:
+def smooth(task: str, seed: int, steps: int, tail: int, size: int) -> DemoEpisode:
+    """What is seen follows the step and the episode: keys near a few directions, as an encoder's are."""
+    time, waves = np.linspace(-0.5, 0.5, steps)[:, None], np.sin(np.outer([1, 2, 3], np.arange(39)))
+    states = time * waves[0] + 0.05 * seed * waves[1] + 0.2 * time**2 * waves[2]
+    return replace(episode(task, seed, steps, tail, size), states=states.astype(np.float32))
+
+
+def write_demos(
+    folder: Path, lengths: dict[int, int], tail: int = TAIL, size: int = 96, make: Callable[..., DemoEpisode] = episode
+) -> dict[str, Any]:
     """A recorded dataset of both tasks, as `kerv demos` leaves it."""
     tasks: dict[str, Any] = {}
     for task in reversed(TASKS):
         tasks[task] = {"episodes": []}
         for seed, steps in lengths.items():
             path = episode_path(folder, task, seed)
-            save_episode(path, episode(task, seed, steps, tail, size))
-            described: dict[str, Any] = {"seed": seed, "perturbed": False, "steps": steps}
-            described |= {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
-            tasks[task]["episodes"].append(described)
-    manifest = {"format": FORMAT, "config": {}, "tasks": tasks, "sha256": dataset_hash(tasks)}
+            save_episode(path, make(task, seed, steps, tail, size))
+            entry: dict[str, Any] = {"seed": seed, "perturbed": False, "steps": steps}
+            entry |= {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+            tasks[task]["episodes"].append(entry)
+    spaces = {"actions": SPACE.as_dict(), "observation": SPEC.observation.as_dict()}
+    described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {}}
+    manifest = {**described, "tasks": tasks, "sha256": dataset_hash(tasks)}
     write_json(folder / "manifest.json", manifest)
     return manifest
 
@@ -94,7 +102,7 @@ def copy(results: Path, tmp_path: Path) -> Path:
 
 
 def asked(results: Path, target: str = "nano-state", **changes: Any) -> BuildDatastoreSettings:
-    chosen = BuildDatastoreSettings(PolicySettings(target), demos="few", task=list(TASKS), results=str(results))
+    chosen = BuildDatastoreSettings(PolicySettings(target=target), demos="few", task=list(TASKS), results=str(results))
     return replace(chosen, **changes)
 
 
@@ -102,15 +110,23 @@ def folder_of(results: Path, name: str = "nano-state") -> Path:
     return results / "artifacts/datastore" / name
 
 
-def opened(results: Path, name: str = "nano-state") -> tuple[Datastore, Any, dict[str, Any]]:
+def opened(results: Path, name: str = "nano-state") -> tuple[Datastore, Any, TargetDescription]:
     target, description = load_target(results / "artifacts/target" / name)
     return Datastore.open(folder_of(results, name), description), target, description
+
+
+FILES = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
+
+
+def any_manifest(vectors: np.ndarray, key: tuple[str, ...] = ("scene",)) -> Manifest:
+    rows, width = vectors.shape
+    return Manifest(2, "datastore", key, width, rows, 4, SPACE, "t" * 64, "d" * 64, FILES, {})
 
 
 def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | None = None) -> Datastore:
     rows = np.arange(len(vectors))
     tokens = np.stack([rows % 251, rows // 251], 1).astype(np.uint8)  # tell the row
-    return Datastore({}, vectors, tokens, rows if seeds is None else seeds, rows, rows, shards)
+    return Datastore(any_manifest(vectors), vectors, tokens, rows if seeds is None else seeds, rows, rows, shards)
 
 
 @settings(deadline=None)
@@ -179,11 +195,11 @@ def test_few_rows_are_read_whole() -> None:
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
 def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
     store, _, description = opened(results, name)
-    backends = [DatastoreSettings()]
+    backends: list[Any] = [ExactSearchSettings()]
     if find_spec("qdrant_edge") is not None:
-        backends.append(DatastoreSettings("qdrant"))
+        backends.append(QdrantSearchSettings())
     for chosen in backends:
-        other = open_datastore(folder_of(results, name), description, chosen)
+        other = Datastore.open(folder_of(results, name), description, chosen)
         assert other.manifest == store.manifest
         for task, shard in store.shards.items():
             for row in range(shard.start, shard.stop):
@@ -224,17 +240,13 @@ def test_a_chunk_is_what_follows_in_its_own_episode(results: Path) -> None:
 
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
 def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> None:
-    from kerv_cli.environments.metaworld.tasks import task as task_of
-
     store, target, _ = opened(results, name)
-    shown = episode("reach-v3", 1, LENGTHS[1])
+    shown, instruction = episode("reach-v3", 1, LENGTHS[1]), SPEC.task("reach").instruction
     with torch.inference_mode():
         for step in (0, 4):
-            inputs = target.inputs(
-                shown.frames[step // 2], shown.states[step], target.words_of(task_of("reach").instruction)
-            )
-            prompt, _ = target.encode(inputs)
-            found = store.query(store.key(prompt, target.settings), "reach-v3", 3)
+            state, images = shown.states[step], {"corner4": shown.frames[step // 2]}
+            prompt = target.encode(Observation(state[:4], state, instruction, images))
+            found = store.query(store.key(prompt, target), "reach-v3", 3)
             assert (found.seeds[0], found.steps[0], found.left[0]) == (1, step, LENGTHS[1] - step)
             assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
             assert (np.diff(found.similarity) <= 0).all()
@@ -243,16 +255,18 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
 
 def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
     _, target, _ = opened(results, "nano-vision")
-    shape = target.settings
-    prompt = torch.randn(2, target.prompt_length, shape.width)
+    prompt = torch.randn(2, target.max_prompt, target.width)
     vision, scene, hand = prompt[:, :4].mean(1), prompt[:, 14:16].mean(1), prompt[:, 16]
     unit = [x / x.norm(dim=-1, keepdim=True) for x in (vision, scene, hand)]
-    assert np.allclose(prompt_key(prompt, shape, ["scene"]), unit[1], atol=1e-6)
-    whole = prompt_key(prompt, shape, ["vision", "scene", "proprioception"])
+    assert np.allclose(prompt_key(prompt, target, ["scene"]), unit[1], atol=1e-6)
+    whole = prompt_key(prompt, target, ["vision", "scene", "proprioception"])
     assert np.allclose(whole, torch.cat(unit, -1) / 3**0.5, atol=1e-6)
     assert whole.dtype == np.float32
-    assert list(segments_of(replace(shape, observation="state"))) == ["scene", "proprioception"]
-    assert segments_of(shape)["proprioception"].stop == target.prompt_length
+    assert target.segments["proprioception"].stop == target.max_prompt
+    state = opened(results)[1]
+    assert "vision" not in state.segments
+    with pytest.raises(UnknownName, match="unknown part of the prompt 'vision'"):
+        prompt_key(prompt, state, ["vision"])
 
 
 def test_fewer_entries_than_asked_for_are_all_given(results: Path) -> None:
@@ -265,7 +279,7 @@ def test_fewer_entries_than_asked_for_are_all_given(results: Path) -> None:
 def test_the_first_episodes_and_tasks_can_be_asked_for(copy: Path) -> None:
     store = DatastoreBuild(asked(copy, task=["reach"], episodes=2, name="small", key=["proprioception"])).build()
     assert set(entries(store)) == {("reach-v3", s, t) for s in (0, 1) for t in range(LENGTHS[s])}
-    assert store.manifest["tasks"] == {"reach-v3": {"rows": [0, 15], "seeds": [0, 1]}}
+    assert store.manifest.tasks == {"reach-v3": Shard((0, 15), (0, 1))}
     figures = leave_one_out(store)
     assert 0 < figures["token_agreement"] <= figures["within_9"] <= 1
 
@@ -284,25 +298,74 @@ def test_a_thinned_datastore_of_half_the_bytes_holds_every_so_many_entry(copy: P
     assert np.load(folder_of(copy, name) / "vectors.npy").dtype == np.float16
 
 
+def test_the_directions_hold_the_keys_squared_length() -> None:
+    """Against the singular vectors of the keys."""
+    rng = np.random.default_rng(0)
+    keys = (rng.normal(size=(400, 6)) * [9, 7, 5, 0.2, 0.1, 0.1]) @ np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    found = directions(keys.astype(np.float32), 3)
+    assert (found.shape, found.dtype) == ((6, 3), np.float32)
+    wanted = np.linalg.svd(keys, full_matrices=False)[2][:3].T
+    assert np.abs((found * wanted).sum(0)) == pytest.approx(np.ones(3), abs=1e-5)
+    assert found.T @ found == pytest.approx(np.eye(3), abs=1e-6)
+
+
+def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(copy: Path) -> None:
+    write_demos(copy / "artifacts/demos/few", LENGTHS, make=smooth)
+    DatastoreBuild(asked(copy)).build()
+    whole, target, _ = opened(copy)
+    size = (folder_of(copy) / "vectors.npy").stat().st_size
+    DatastoreBuild(asked(copy, components=8)).build()
+    short, _, _ = opened(copy)
+    assert (whole.vectors.shape[1], short.vectors.shape[1], short.manifest.width) == (target.width, 8, 8)
+    assert (folder_of(copy) / "vectors.npy").stat().st_size < size / 2
+    assert sorted(short.manifest.files) == ["payload.parquet", "projection.npy", "vectors.npy"]
+    assert np.linalg.norm(short.vectors, axis=1) == pytest.approx(1.0, abs=1e-5)
+    assert np.array_equal(short.tokens, whole.tokens)
+    assert short.content != whole.content
+    same = []
+    for task, shard in whole.shards.items():
+        for row in range(shard.start, shard.stop):
+            without = int(whole.seeds[row])
+            one, other = (store.query(store.vectors[row], task, 1, without) for store in (whole, short))
+            same.append((one.steps[0], one.seeds[0]) == (other.steps[0], other.seeds[0]))
+            assert other.similarity[0] == pytest.approx(one.similarity[0], abs=0.02)
+    assert np.mean(same) > 0.9
+    shown, instruction = smooth("reach-v3", 1, LENGTHS[1], TAIL, 96), SPEC.task("reach").instruction
+    with torch.inference_mode():  # what is looked up while decoding is projected, too
+        prompt = target.encode(Observation(shown.states[2][:4], shown.states[2], instruction))
+    found = short.query(short.key(prompt, target), "reach-v3", 1)
+    assert (found.seeds[0], found.steps[0]) == (1, 2)
+    assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_projection_that_was_changed_is_refused(copy: Path) -> None:
+    DatastoreBuild(asked(copy, components=8)).build()
+    cut(folder_of(copy) / "projection.npy")
+    with pytest.raises(CheckpointError, match=r"projection\.npy does not match its manifest"):
+        opened(copy)
+
+
 def test_the_manifest_says_where_everything_comes_from(results: Path) -> None:
     store, _, description = opened(results)
     demos = read_json(results / "artifacts/demos/few/manifest.json")
     manifest = store.manifest
-    assert (manifest["target"], manifest["demos"]) == (description["sha256"], demos["sha256"])
-    assert (manifest["chunk"], manifest["dofs"], manifest["rows"]) == (4, 4, 52)
-    assert {tuple(shard["seeds"]) for shard in manifest["tasks"].values()} == {tuple(LENGTHS)}
-    assert manifest["first_evaluation_seed"] == EVALUATION_SEED
-    assert {"versions", "git_commit", "settings"} <= set(manifest["provenance"])
+    assert (manifest.target, manifest.demos) == (description.sha256, demos["sha256"])
+    assert (manifest.chunk, manifest.actions, manifest.rows) == (4, description.actions, 52)
+    assert {shard.seeds for shard in manifest.tasks.values()} == {tuple(LENGTHS)}
+    assert {"versions", "git_commit", "settings"} <= set(manifest.provenance)
     assert sorted(p.name for p in folder_of(results).iterdir()) == ["manifest.json", "payload.parquet", "vectors.npy"]
 
 
 def test_training_and_evaluation_seeds_are_proved_disjoint(results: Path, tmp_path: Path) -> None:
-    check_seeds({"reach-v3": [0, EVALUATION_SEED - 1]}, "here")
+    last = SPEC.seeds.training.stop - 1
+    check_seeds({"reach-v3": [0, last]}, "here")
+    with pytest.raises(CheckpointError, match="here holds seed 50000 of reach-v3"):  # of selection
+        check_seeds({"reach-v3": [0, last, last + 1]}, "here")
     with pytest.raises(CheckpointError, match="here holds seed 100000 of reach-v3"):
         check_seeds({"push-v3": [1], "reach-v3": [0, EVALUATION_SEED]}, "here")
     shutil.copytree(results / "artifacts/target", tmp_path / "artifacts/target")
     write_demos(tmp_path / "artifacts/demos/few", {0: 5, EVALUATION_SEED + 3: 5})
-    with pytest.raises(CheckpointError, match="seed 100003 of drawer-close-v3: seeds from 100000 on"):
+    with pytest.raises(CheckpointError, match="seed 100003 of drawer-close-v3: seeds from 50000 on"):
         DatastoreBuild(asked(tmp_path))
 
 
@@ -323,18 +386,34 @@ def cut(path: Path) -> None:
     ("change", "says"),
     [
         (lambda m: m.update(target="f" * 64), "was built for target ffffffffffff, not for"),
-        (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "other action statistics"),
-        (lambda m: m.update(chunk=8), "holds chunks of 8 steps of 4 DoFs, the target decodes 4 of 4"),
-        (lambda m: m.update(dofs=7), "4 steps of 7 DoFs"),
+        (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "an action space with low -2, -1, -1, -1"),
+        (lambda m: m["actions"].update(names=["dx", "dy", "yaw", "gripper"]), "with names dx, dy, yaw, gripper"),
+        (lambda m: m["actions"].update(strict=[]), "with strict none"),
+        (lambda m: m.update(chunk=8), "holds chunks of 8 steps, the target decodes 4"),
         (lambda m: m["tasks"]["reach-v3"]["seeds"].append(EVALUATION_SEED), "holds seed 100000 of reach-v3"),
-        (lambda m: m.update(format=99), "is not a datastore of format 1"),
-        (lambda m: m.update(kind="drafter"), "is not a datastore of format 1"),
-        (lambda m: m.update(rows=3), "files differ in length"),
-        (lambda m: m.pop("files"), "is damaged, it has no files"),
-        (lambda m: m.pop("tasks"), "it has no tasks"),
-        (lambda m: m.update(tasks=[]), "is damaged ("),
-        (lambda m: m["tasks"]["reach-v3"].pop("rows"), "is damaged ('rows')"),
-        (lambda m: m.pop("actions"), "it has no actions"),
+        (lambda m: m.update(format=1), "manifest.json is damaged: format"),
+        (lambda m: m.update(kind="drafter"), "manifest.json is damaged: kind"),
+        (lambda m: m.update(rows=3), "the rows of drawer-close-v3 are not among 3"),
+        (lambda m: m.update(rows=60), "its files do not fit its manifest"),
+        (lambda m: m.update(width=3), "its files do not fit its manifest"),
+        (lambda m: m.pop("files"), "manifest.json is damaged: files"),
+        (
+            lambda m: m["files"].pop("vectors.npy"),
+            "manifest.json is damaged: the whole: value error, a file has no hash",
+        ),
+        (lambda m: m.pop("tasks"), "manifest.json is damaged: tasks"),
+        (lambda m: m.update(tasks=[]), "manifest.json is damaged: tasks"),
+        (lambda m: m["tasks"]["reach-v3"].pop("rows"), "manifest.json is damaged: tasks.reach-v3.rows"),
+        (
+            lambda m: m["tasks"]["reach-v3"].update(rows=[0, 9999]),
+            "manifest.json is damaged: the whole: value error, the rows of",
+        ),
+        (
+            lambda m: m["tasks"]["reach-v3"].update(rows=[9, 3]),
+            "manifest.json is damaged: the whole: value error, the rows of",
+        ),
+        (lambda m: m.pop("actions"), "manifest.json is damaged: actions"),
+        (lambda m: m["actions"].update(high=[-9] * 4), "manifest.json is damaged: actions"),
     ],
 )
 def test_a_datastore_that_does_not_belong_here_is_refused(copy: Path, change: Change, says: str) -> None:
@@ -352,7 +431,7 @@ def test_a_datastore_that_does_not_belong_here_is_refused(copy: Path, change: Ch
         (lambda f: cut(f / "payload.parquet"), "payload.parquet does not match its manifest"),
         (lambda f: (f / "payload.parquet").unlink(), "payload.parquet cannot be read"),
         (lambda f: cut(f / "manifest.json"), "cannot be read as JSON"),
-        (lambda f: (f / "manifest.json").write_text("[]"), "is not a datastore of format 1"),
+        (lambda f: (f / "manifest.json").write_text("[]"), "is not a datastore's manifest"),
         (lambda f: shutil.rmtree(f), "no datastore in"),
     ],
 )
@@ -370,10 +449,12 @@ def test_a_damaged_datastore_is_refused(copy: Path, damage: Callable[[Path], Non
         ({"key": ["scen"]}, UnknownName, "unknown key 'scen': did you mean scene"),
         ({"key": ["vision"]}, UnknownName, "unknown key 'vision'"),  # a state policy has none
         ({"key": []}, UsageError, "name a key"),
-        ({"episodes": -1}, UsageError, "episodes from 0 on"),
+        ({"episodes": -1}, UsageError, "episodes=-1"),
+        ({"stride": 0}, UsageError, "stride=0"),
+        ({"components": -1}, UsageError, "components=-1"),
         ({"task": ["push"]}, CheckpointError, "hold no episode of push-v3"),
         ({"demos": "none"}, CheckpointError, "no demonstrations in"),
-        ({"policy": PolicySettings("none")}, CheckpointError, "no target 'none'"),
+        ({"policy": PolicySettings(target="none")}, CheckpointError, "no target 'none'"),
     ],
 )
 def test_what_cannot_be_built_is_refused_at_once(
@@ -391,7 +472,7 @@ def test_demonstrations_that_do_not_fit_the_target_are_refused(copy: Path) -> No
     write_demos(copy / "artifacts/demos/few", LENGTHS, size=32)
     with pytest.raises(CheckpointError, match="frames have 32 pixels, the policy takes 96"):
         DatastoreBuild(asked(copy, "nano-vision")).build()
-    assert opened(copy)[0].manifest["rows"] == 52  # what was there still is
+    assert opened(copy)[0].manifest.rows == 52  # what was there still is
 
 
 def test_only_a_datastore_is_ever_replaced(copy: Path) -> None:
@@ -405,8 +486,8 @@ def test_only_a_datastore_is_ever_replaced(copy: Path) -> None:
         DatastoreBuild(asked(copy, name=str(copy / "artifacts/target/nano-state")))
 
 
-def refuse_second(stage: str) -> Callable[..., Any]:
-    real = getattr(datastore_build, stage)
+def refusing(real: Callable[..., Any]) -> Callable[..., Any]:
+    """Does its work, then finds the disk full."""
 
     def failing(*arguments: Any, **options: Any) -> Any:
         real(*arguments, **options)
@@ -424,12 +505,13 @@ def test_a_build_that_fails_leaves_what_was_there(
         shutil.rmtree(folder_of(copy))
     parent = folder_of(copy).parent
     names = sorted(p.name for p in parent.iterdir())
-    monkeypatch.setattr(datastore_build, stage, refuse_second(stage))
+    owner = DatastoreBuild if stage == "_write" else datastore_build
+    monkeypatch.setattr(owner, stage, refusing(getattr(owner, stage)))
     with pytest.raises(StorageError, match="the disk is full"):
         DatastoreBuild(asked(copy, episodes=1)).build()
     assert sorted(p.name for p in parent.iterdir()) == names
     if before:
-        assert opened(copy)[0].manifest["rows"] == 52
+        assert opened(copy)[0].manifest.rows == 52
 
 
 def test_a_failed_exchange_puts_the_old_one_back(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -443,14 +525,14 @@ def test_a_failed_exchange_puts_the_old_one_back(copy: Path, monkeypatch: pytest
     monkeypatch.setattr(Path, "rename", rename)
     with pytest.raises(StorageError, match="permission denied"):
         DatastoreBuild(asked(copy, episodes=1)).build()
-    assert opened(copy)[0].manifest["rows"] == 52
+    assert opened(copy)[0].manifest.rows == 52
     assert sorted(p.name for p in folder_of(copy).parent.iterdir()) == ["nano-state", "nano-vision"]
 
 
 def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:
     first = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
     DatastoreBuild(asked(copy, episodes=1)).build()
-    assert opened(copy)[0].manifest["rows"] == 2 * LENGTHS[0]
+    assert opened(copy)[0].manifest.rows == 2 * LENGTHS[0]
     DatastoreBuild(asked(copy)).build()
     again = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
     assert again["vectors.npy"] == first["vectors.npy"]
@@ -468,19 +550,18 @@ def test_the_command_builds_and_reports(copy: Path) -> None:
     run = CliRunner().invoke(command.app, words)
     assert run.exit_code == 0, run.output
     assert "token_agreement" in run.output
-    assert opened(copy)[0].manifest["rows"] == 52
+    assert opened(copy)[0].manifest.rows == 52
     run = CliRunner().invoke(command.app, [*words, "key=[smell]"])
     assert run.exit_code == 2
     assert run.output.startswith("kerv: unknown key 'smell'")
 
 
 @st.composite
-def neighbours(draw: st.DrawFn) -> tuple[np.ndarray, Groups]:
-    groups = draw(st.sampled_from([kinematic_groups(4), kinematic_groups(7)]))
-    dofs = sum(map(len, groups))
+def neighbours(draw: st.DrawFn) -> tuple[np.ndarray, ActionSpace]:
+    space = draw(st.sampled_from([SPACE, SEVEN]))
     k, steps = draw(st.integers(1, 4)), draw(st.integers(1, 2))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    return rng.integers(0, draw(st.integers(1, 3)), (k, steps * dofs)), groups
+    return rng.integers(0, draw(st.integers(1, 3)), (k, steps * space.dofs)), space
 
 
 def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
@@ -489,7 +570,7 @@ def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
 
 
 def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[tuple[int, ...]]:
-    """METHODS §4.2 read aloud: one neighbour per group; a gripper's group from one that gave the group before it."""
+    """METHODS §4.2 read aloud: one neighbour per group; a strict group from one that gave the group before it."""
     found = set()
     for owners in product(range(len(chunks)), repeat=len(cuts)):
         parts = [tuple(chunks[i, a:b].tolist()) for i, (a, b, _) in zip(owners, cuts, strict=True)]
@@ -504,25 +585,25 @@ def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[t
 @settings(deadline=None)
 @given(neighbours(), st.integers(0, 13), st.integers(1, 14))
 def test_with_room_the_tree_holds_every_combination_of_groups(
-    given_: tuple[np.ndarray, Groups], start: int, depth: int
+    given_: tuple[np.ndarray, ActionSpace], start: int, depth: int
 ) -> None:
-    chunks, groups = given_
-    cuts = list(segments(start, min(chunks.shape[1], start + depth), groups))
-    tree = neighbour_tree(chunks, start, groups, nodes=100_000, depth=depth)
+    chunks, space = given_
+    cuts = list(space.segments(start, min(chunks.shape[1], start + depth)))
+    tree = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth)
     assert set(leaves(tree)) == (combinations(chunks, cuts) if cuts else set())
     assert len(set(zip(tree.parents, tree.tokens, strict=True))) == len(tree)  # no twins
-    own = neighbour_tree(chunks, start, groups, nodes=100_000, depth=depth, cross=0.0)
+    own = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth, cross=0.0)
     assert set(leaves(own)) == set(leaves(merge(chunks[:, start : start + depth].tolist())))
 
 
 @settings(deadline=None)
 @given(neighbours(), st.integers(0, 7), st.integers(0, 30), st.sampled_from([0.0, 0.1, 1.0]))
 def test_under_the_cap_every_path_is_made_of_whole_groups_of_the_neighbours(
-    given_: tuple[np.ndarray, Groups], start: int, nodes: int, cross: float
+    given_: tuple[np.ndarray, ActionSpace], start: int, nodes: int, cross: float
 ) -> None:
-    chunks, groups = given_
-    cuts = list(segments(start, chunks.shape[1], groups))
-    tree = neighbour_tree(chunks, start, groups, nodes=nodes, cross=cross)
+    chunks, space = given_
+    cuts = list(space.segments(start, chunks.shape[1]))
+    tree = neighbour_tree(chunks, start, space, nodes=nodes, cross=cross)
     assert len(tree) <= nodes
     whole = {last - start: n + 1 for n, (_, last, _) in enumerate(cuts)}
     for path in leaves(tree):
@@ -531,19 +612,19 @@ def test_under_the_cap_every_path_is_made_of_whole_groups_of_the_neighbours(
 
 def test_the_nearest_neighbours_chunk_comes_first() -> None:
     chunks = np.random.default_rng(0).integers(0, 255, (5, 16))
-    assert leaves(neighbour_tree(chunks, 1, kinematic_groups(4), nodes=15)) == [tuple(chunks[0, 1:])]
-    more = leaves(neighbour_tree(chunks, 1, kinematic_groups(4), nodes=30))
+    assert leaves(neighbour_tree(chunks, 1, SPACE, nodes=15)) == [tuple(chunks[0, 1:])]
+    more = leaves(neighbour_tree(chunks, 1, SPACE, nodes=30))
     assert {tuple(chunks[0, 1:]), tuple(chunks[1, 1:])} <= set(more)
-    assert len(neighbour_tree(chunks, 16, kinematic_groups(4))) == 0
-    assert len(neighbour_tree(chunks[:0], 0, kinematic_groups(4))) == 0
+    assert len(neighbour_tree(chunks, 16, SPACE)) == 0
+    assert len(neighbour_tree(chunks[:0], 0, SPACE)) == 0
 
 
 def plain_tree(
-    chunks: np.ndarray, start: int, groups: Groups, nodes: int, depth: int | None, cross: float
+    chunks: np.ndarray, start: int, space: ActionSpace, nodes: int, depth: int | None, cross: float
 ) -> tuple[list[int], list[int]]:
     """The tree of METHODS §4.2 without a thought for speed -> tokens, parents."""
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
-    cuts = list(segments(start, stop, groups))
+    cuts = list(space.segments(start, stop))
     rows, order = chunks.tolist(), count()
     tokens: list[int] = []
     parents: list[int] = []
@@ -590,7 +671,7 @@ def plain_tree(
 @settings(deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
-    st.sampled_from([4, 7]),
+    st.sampled_from([SPACE, SEVEN]),
     st.integers(1, 9),
     st.sampled_from([1, 2, 3, 255]),
     st.integers(0, 9),
@@ -599,12 +680,11 @@ def plain_tree(
     st.sampled_from([0.0, 0.1, 0.5, 1.0]),
 )
 def test_the_tree_is_node_for_node_that_of_the_plain_algorithm(
-    seed: int, dofs: int, k: int, span: int, start: int, nodes: int, depth: int | None, cross: float
+    seed: int, space: ActionSpace, k: int, span: int, start: int, nodes: int, depth: int | None, cross: float
 ) -> None:
-    chunks = np.random.default_rng(seed).integers(0, span, (k, 3 * dofs))
-    groups = kinematic_groups(dofs)
-    tree = neighbour_tree(chunks, start, groups, nodes, depth, cross)
-    tokens, parents = plain_tree(chunks, start, groups, nodes, depth, cross)
+    chunks = np.random.default_rng(seed).integers(0, span, (k, 3 * space.dofs))
+    tree = neighbour_tree(chunks, start, space, nodes, depth, cross)
+    tokens, parents = plain_tree(chunks, start, space, nodes, depth, cross)
     assert (list(tree.tokens), list(tree.parents)) == (tokens, parents)
 
 
@@ -613,6 +693,6 @@ def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
     went another way, gave the 8 before."""
     grippers = [8, 9, 8, 8, 8, 8]
     chunks = np.array([[i in (1, 2, 5)] * 3 + [gripper] for i, gripper in enumerate(grippers)], dtype=np.int64)
-    tree = neighbour_tree(chunks, 0, kinematic_groups(4), cross=0.0)
+    tree = neighbour_tree(chunks, 0, SPACE, cross=0.0)
     assert [path[-1] for path in leaves(tree) if path[0] == 1] == [9, 8]
-    assert (list(tree.tokens), list(tree.parents)) == plain_tree(chunks, 0, kinematic_groups(4), 50, None, 0.0)
+    assert (list(tree.tokens), list(tree.parents)) == plain_tree(chunks, 0, SPACE, 50, None, 0.0)

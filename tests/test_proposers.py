@@ -37,6 +37,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 SPACE = SPEC.actions
 D = SPACE.dofs
 HELD = SPACE.is_strict
+FILES = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
 
 
 class KnownDraft:
@@ -58,7 +59,7 @@ def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     return Datastore(
         manifest=Manifest(
-            2, "datastore", ("scene",), len(key), len(chunks), target.chunk, SPACE, "t" * 64, "d" * 64, {}, {}
+            2, "datastore", ("scene",), len(key), len(chunks), target.chunk, SPACE, "t" * 64, "d" * 64, FILES, {}
         ),
         vectors=vectors.astype(np.float32),
         tokens=chunks.astype(np.uint8),
