@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kerv_cli.drafting import datastore as module
-from kerv_cli.drafting.datastore import Datastore, check_backend, open_datastore
+from kerv_cli.drafting import qdrant as module
+from kerv_cli.drafting.datastore import Datastore, Manifest
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import StorageError, UnknownName, UsageError
-from kerv_cli.settings import DatastoreSettings
+from kerv_cli.parts import QdrantSearchSettings
+from kerv_cli.registry import find as find_part
 
 pytestmark = pytest.mark.filterwarnings("ignore:Local mode performs exact:UserWarning")
 BACKENDS = ("engine", "server")
@@ -53,7 +55,10 @@ def searched(request: pytest.FixtureRequest) -> Open:
 def store(vectors: np.ndarray, seeds: np.ndarray, index: Any = None) -> Datastore:
     rows = np.arange(len(vectors))
     tokens = np.stack([rows % 251, rows // 251], 1).astype(np.uint8)
-    return Datastore({}, vectors, tokens, seeds, rows, rows, ROWS, index)
+    files = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
+    shape = (*vectors.shape[::-1], 4, SPEC.actions)
+    manifest = Manifest(2, "datastore", ("scene",), *shape, "t" * 64, "d" * 64, files, {})
+    return Datastore(manifest, vectors, tokens, seeds, rows, rows, ROWS, index=index)
 
 
 def vectors_of(kind: str, width: int) -> np.ndarray:
@@ -139,22 +144,20 @@ def test_a_server_that_does_not_answer_gets_one_line() -> None:
             assert "\n" not in str(caught.value)
 
 
-def test_a_backend_that_cannot_work_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    check_backend(DatastoreSettings())
-    with pytest.raises(UnknownName, match=r"unknown datastore\.backend 'qdrnt': did you mean qdrant"):
-        open_datastore(tmp_path, {}, DatastoreSettings("qdrnt"))
-    with pytest.raises(UsageError, match=r"datastore\.url=http://here: exact search is in this process"):
-        check_backend(DatastoreSettings(url="http://here"))
-    for missing, settings in (
-        ("qdrant_edge", DatastoreSettings("qdrant")),
-        ("qdrant_client", DatastoreSettings("qdrant", "http://here")),
+def test_a_backend_that_cannot_work_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UnknownName, match=r"unknown datastore 'qdrnt': did you mean qdrant"):
+        find_part("datastore", "qdrnt")
+    vectors, seeds = vectors_of("random", 3), np.arange(300)
+    for missing, chosen in (
+        ("qdrant_edge", QdrantSearchSettings()),
+        ("qdrant_client", QdrantSearchSettings(url="http://here")),
     ):
         with monkeypatch.context() as without:
             without.delitem(sys.modules, missing, raising=False)
             without.setattr(module, "find_spec", lambda name, gone=missing: None if name == gone else find(name))
             with pytest.raises(UsageError) as caught:
-                open_datastore(tmp_path, {}, settings)
-        assert str(caught.value) == "datastore.backend=qdrant needs the extra: pip install 'kerv[qdrant]'"
+                find_part("datastore", "qdrant").built(vectors, seeds, ROWS, "d" * 64, chosen)
+        assert str(caught.value) == "datastore=qdrant needs the extra: pip install 'kerv[qdrant]'"
 
 
 find = importlib.util.find_spec
