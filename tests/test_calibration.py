@@ -12,34 +12,53 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import typer
 from typer.testing import CliRunner
 
 from kerv_cli.commands.calibrate import calibrate
 from kerv_cli.config import compose
-from kerv_cli.decoding.calibration_file import Calibration, calibration_beside, load_calibration, save_calibration
-from kerv_cli.decoding.thresholds import build_threshold
-from kerv_cli.drafting.kinematics import PREDICTORS, Noise
-from kerv_cli.environments.demos.dataset import DemoDataset, dataset_hash, episode_path
-from kerv_cli.environments.demos.episode_file import FORMAT, DemoEpisode, save_episode
+from kerv_cli.decoding.boundary import BoundaryRanges
+from kerv_cli.decoding.build import Context
+from kerv_cli.decoding.calibration_file import (
+    BoundarySection,
+    CalibratedTarget,
+    Calibration,
+    Demonstrations,
+    SkipLevel,
+    SkipSection,
+    Variability,
+    calibration_place,
+    load_calibration,
+    save_calibration,
+)
+from kerv_cli.decoding.chunk import Chunk, Situation
+from kerv_cli.decoding.record import Round
+from kerv_cli.drafting.kinematics import PREDICTORS, ActionHistory, Noise
+from kerv_cli.environments.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
+from kerv_cli.environments.demos.episode_file import DemoEpisode, save_episode
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
+from kerv_cli.parts import FixedThresholdSettings, KinematicThresholdSettings
 from kerv_cli.places import find_target
-from kerv_cli.settings import CalibrateSettings, ThresholdSettings
-from kerv_cli.spaces import CENTRES, ActionTokenizer
-from kerv_cli.targets.checkpoint import read_description
-from kerv_cli.training.calibration import CalibrationRun, kinematic_variability, reference_level
+from kerv_cli.registry import find
+from kerv_cli.settings import CalibrateSettings
+from kerv_cli.spaces import Observation
+from kerv_cli.targets.checkpoint import TargetDescription, read_target
+from kerv_cli.training.calibration import CalibrationRun, reference_level
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
     episode_windows,
     fit_noise,
-    position_errors,
+    moving_errors,
     prediction_errors,
 )
 
 TASKS = ("reach-v3", "drawer-close-v3")
-UNIT = ActionTokenizer(-np.ones(4), np.ones(4))
+SPACE = SPEC.actions
+BIN = 2 / SPACE.tokens
 STEPS = 24
 
 
@@ -85,7 +104,9 @@ def write_dataset(folder: Path, episodes: int = 6, make: Callable[[str, int], De
                 }
             )
         tasks[task] = {"mean_steps": float(STEPS), "failed_seeds": [], "episodes": entries}
-    write_json(folder / "manifest.json", {"format": FORMAT, "sha256": dataset_hash(tasks), "tasks": tasks})
+    spaces = {"actions": SPACE.as_dict(), "observation": SPEC.observation.as_dict()}
+    described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {}}
+    write_json(folder / "manifest.json", {**described, "sha256": dataset_hash(tasks), "tasks": tasks})
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +125,7 @@ def settings(results: Path, *overrides: str, target: str = "nano-state") -> Cali
 
 def test_windows_lie_where_they_should() -> None:
     episode = made_up_episode("reach-v3", 0)
-    past, future = episode_windows(episode, UNIT, "labels", 10, 4)
+    past, future = episode_windows(episode, SPACE, "labels", 10, 4)
     assert past.shape == (STEPS - 10, 10, 4)
     assert future.shape == (STEPS - 10, 4, 4)
     for i in (0, 7, STEPS - 11):
@@ -114,25 +135,25 @@ def test_windows_lie_where_they_should() -> None:
 
 def test_windows_of_what_was_executed_look_forward_to_the_labels() -> None:
     episode = made_up_episode("reach-v3", 1)
-    past, future = episode_windows(episode, UNIT, "executed", 10, 2)
+    past, future = episode_windows(episode, SPACE, "executed", 10, 2)
     np.testing.assert_allclose(past[3], episode.executed[3:13], atol=1e-6)
     np.testing.assert_allclose(future[3], episode.labels[13:15], atol=1e-6)
 
 
 def test_windows_are_normalised_as_the_target_does() -> None:
     episode = made_up_episode("reach-v3", 0)
-    narrow = ActionTokenizer(-0.5 * np.ones(4), 0.5 * np.ones(4))
+    narrow = dataclasses.replace(SPACE, low=(-0.5,) * 4, high=(0.5,) * 4)
     past, _ = episode_windows(episode, narrow, "labels", 10, 4)
     np.testing.assert_allclose(past[0], np.clip(2 * episode.labels[:10], -1, 1), atol=1e-6)
 
 
 def test_short_episodes_have_no_window_and_short_tails_are_refused() -> None:
     episode = made_up_episode("reach-v3", 0)
-    past, future = episode_windows(episode, UNIT, "labels", STEPS, 4)
+    past, future = episode_windows(episode, SPACE, "labels", STEPS, 4)
     assert past.shape == (0, STEPS, 4)
     assert future.shape == (0, 4, 4)
     with pytest.raises(CheckpointError, match="8 labels behind an episode's end, predictions of 10 steps need 9"):
-        episode_windows(episode, UNIT, "labels", 10, 10)
+        episode_windows(episode, SPACE, "labels", 10, 10)
 
 
 @pytest.mark.parametrize("ratio", [0.01, 1.0])
@@ -159,10 +180,10 @@ def line_windows(slope: float) -> Windows:
 
 def test_errors_of_hold_and_linear_have_closed_forms() -> None:
     noise = {kind: Noise.uniform(4, 1.0) for kind in PREDICTORS}
-    errors = prediction_errors(line_windows(0.02), noise)
+    errors = prediction_errors(line_windows(0.02), noise, SPACE)
     assert set(errors) == set(PREDICTORS)
-    np.testing.assert_allclose(position_errors(errors, "hold"), [[0] * 4, 0.02 * np.arange(1, 5)], atol=1e-12)
-    np.testing.assert_allclose(position_errors(errors, "linear"), np.zeros((2, 4)), atol=1e-12)
+    np.testing.assert_allclose(moving_errors(errors, "hold", SPACE), [[0] * 4, 0.02 * np.arange(1, 5)], atol=1e-12)
+    np.testing.assert_allclose(moving_errors(errors, "linear", SPACE), np.zeros((2, 4)), atol=1e-12)
     for kind in PREDICTORS:  # the gripper is held by all of them
         np.testing.assert_allclose(errors[kind][TASKS[1]]["gripper"], 0.01 * np.arange(1, 5), atol=1e-12)
 
@@ -179,19 +200,26 @@ def test_both_kinds_of_episodes_are_held_out(results: Path) -> None:
 
 
 def test_variability_is_the_summed_difference_of_the_actions() -> None:
-    drafted, target_tokens = np.array([[10, 20, 30], [0, 0, 254]]), np.array([[10, 22, 27], [0, 0, 0]])
-    bin_width = 2 / 255
-    np.testing.assert_allclose(kinematic_variability(drafted, target_tokens), [5 * bin_width, 254 * bin_width])
-    assert kinematic_variability(np.array([], dtype=int), np.array([], dtype=int)) == 0
-    with pytest.raises(ValueError, match="cannot be compared"):
-        kinematic_variability(drafted, target_tokens[:1])
+    """K by hand: over all judged tokens, in normalised action units; what is not judged does not count."""
+    chunk = Chunk(torch.zeros(1, 1, 8), 4, SPACE, None, Situation("t", ActionHistory(4)))  # type: ignore[arg-type]
+
+    def play(drafted: tuple[int, ...], target_tokens: tuple[int, ...]) -> float:
+        played = Round("verify", "x", 0, drafted, target_tokens, 0, 1, len(drafted), ())
+        chunk.commit(played, [0])
+        return chunk.difference / BIN
+
+    assert play((), (100,)) == 0
+    assert not chunk.compared
+    assert play((10, 20, 30), (10, 22, 27, 99)) == pytest.approx(5)  # the bonus was not drafted
+    assert play((0, 0, 254), (0, 0, 0)) == pytest.approx(259)
+    assert chunk.compared
 
 
 def test_the_reference_level_is_the_median_and_can_divide() -> None:
-    assert reference_level([0.1, 5.0, 0.3]) == 0.3
-    assert reference_level([0.0, 0.0]) == pytest.approx(CENTRES[1] - CENTRES[0])
+    assert reference_level([0.1, 5.0, 0.3], BIN) == 0.3
+    assert reference_level([0.0, 0.0], BIN) == BIN == pytest.approx(SPACE.centres[1] - SPACE.centres[0])
     with pytest.raises(ValueError, match="no decode"):
-        reference_level([])
+        reference_level([], BIN)
 
 
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
@@ -200,17 +228,18 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     assert "8 demonstrations of 2 tasks, tested on 4; 4 decodes per task with drafter drafts" in run.plan()
     run.load(lambda done, total: None)
     variability = run.presample(lambda done, total: None)
-    assert {row["decodes"] for row in variability.values()} == {4}
+    assert {row.decodes for row in variability.values()} == {4}
     made = run.finish(variability, run.boundary(lambda done, total: None), run.skip(lambda done, total: None))
     folder = find_target(str(results), target)
-    assert run.path == calibration_beside(folder) == results / f"artifacts/calibration/{target}/calibration.json"
-    described = read_description(folder, "target")
-    loaded = load_calibration(run.path, described["sha256"], 4)
+    assert run.path == calibration_place(str(results), None, folder)
+    assert run.path == results / f"artifacts/calibration/{target}/calibration.json"
+    loaded = load_calibration(run.path, read_target(folder))
     assert loaded == made
-    assert loaded.demos["sha256"] == run.dataset.sha256
+    assert loaded.demos.sha256 == run.dataset.sha256
     assert loaded.provenance["versions"]["numpy"] == np.__version__
-    assert loaded.boundary["episodes"] == 8
-    assert loaded.skip == {}
+    assert loaded.boundary is not None
+    assert loaded.boundary.episodes == 8
+    assert loaded.skip is None
     assert "kept" not in loaded.provenance
     assert [line.split(":")[0] for line in run.notes] == ["skip levels"]
     for kind in PREDICTORS:
@@ -221,64 +250,76 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
 def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
     """The decoder's K is the function of the tokens it records."""
     run = CalibrationRun(settings(results))
-    decoder, _ = run.decoder()
+    decoder = run.decoder()
     episode = run.dataset.load(0)
     decoder.reset(episode.task, "reach")
-    record = decoder.decode(None, episode.states[0])
+    record = decoder.decode(Observation(episode.states[0][:4], episode.states[0], "reach"))
     pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.target_tokens, strict=False)]
-    drafted, target_tokens = np.array(pairs).T
-    assert record.variability == pytest.approx(float(kinematic_variability(drafted, target_tokens)))
+    assert record.variability == pytest.approx(BIN * sum(abs(d - v) for d, v in pairs))
+    assert len(pairs) > 3
 
 
-def test_the_tasks_reference_level_reaches_the_threshold(results: Path) -> None:
+def test_the_tasks_reference_level_reaches_the_threshold() -> None:
     made = calibration({"reach-v3": 0.7})
-    wanted = ThresholdSettings("kinematic")
-    assert made.threshold(wanted, "reach-v3").k_s == 0.7
-    build_threshold(made.threshold(wanted, "reach-v3"))
-    assert made.threshold(dataclasses.replace(wanted, k_s=0.2), "push-v3").k_s == 0.2
-    assert made.threshold(ThresholdSettings(), "push-v3") == ThresholdSettings()
+
+    def built(chosen: Any, task: str) -> Any:
+        target: Any = dataclasses.make_dataclass("T", ["actions"])(SPACE)
+        return find("threshold", chosen.kind).built(chosen, Context(target, lambda kind: made, task))
+
+    wanted = KinematicThresholdSettings("kinematic")
+    assert built(wanted, "reach-v3").k_s == 0.7
+    assert built(dataclasses.replace(wanted, k_s=0.2), "push-v3").k_s == 0.2
+    assert built(FixedThresholdSettings(), "push-v3").r == 9
     with pytest.raises(CheckpointError, match="no reference level K_S for push-v3, only for reach-v3"):
-        made.threshold(wanted, "push-v3")
+        built(wanted, "push-v3")
 
 
 def calibration(levels: dict[str, float]) -> Calibration:
     return Calibration(
-        target={"sha256": "a" * 64, "chunk": 4, "dofs": 4},
-        demos={"sha256": "b" * 64, "tasks": {}},
+        target=CalibratedTarget("a" * 64, 4, SPACE),
+        demos=Demonstrations("b" * 64, {}),
         window=10,
         noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped", "acceleration")},
         errors={},
-        variability={task: {"k_s": level, "decodes": 5} for task, level in levels.items()},
-        boundary={"windows": {"15": {"radius_low": 0.01, "radius_high": 2.0, "length_low": 0.0, "length_high": 0.2}}},
-        skip={"datastore": "d" * 64, "tasks": {task: {"low": 0.8, "s_min": 0.9, "high": 0.99} for task in levels}},
+        variability={task: Variability(level, 5, level, level, level) for task, level in levels.items()},
+        boundary=BoundarySection(8, {"15": BoundaryRanges(0.01, 2.0, 0.0, 0.2)}),
+        skip=SkipSection("d" * 64, 0.1, 0.9, {task: SkipLevel(0.9, 0.8, 0.99, 0.5, 40, 0.9, 0.1) for task in levels}),
     )
+
+
+def description(**changes: Any) -> TargetDescription:
+    settings = {"chunk": changes.pop("chunk", 4)}
+    whole = {"sha256": "a" * 64, "family": "compact", "environment": SPEC.name, "settings": settings}
+    spaces = {"actions": SPACE, "observation": SPEC.observation, "cameras": (), "words": (), "provenance": {}}
+    return TargetDescription(1, "target", **{**whole, **spaces, **changes})
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda v: v.pop("noise"), "damaged"),
+        (lambda v: v.pop("noise"), "damaged: noise: field required"),
         (lambda v: v["noise"].pop("damped"), "the noise of a filter is missing"),
         (lambda v: v["noise"]["kalman"].update(q=[1.0]), "one number per DoF"),
+        (lambda v: [v["noise"]["kalman"].update({k: [1.0]}) for k in ("q", "r", "damping")], "not that of the action"),
         (lambda v: v["noise"]["kalman"].update(r=[0.0] * 4), "r above 0"),
-        (lambda v: v["noise"]["kalman"].update(r=["x"] * 4), "damaged"),
+        (lambda v: v["noise"]["kalman"].update(r=["x"] * 4), "damaged: noise.kalman.r"),
         (lambda v: v["variability"]["reach-v3"].update(k_s=0.0), "above 0"),
-        (lambda v: v["variability"]["reach-v3"].pop("k_s"), "damaged"),
-        (lambda v: v["target"].pop("sha256"), "does not name its target"),
-        (lambda v: v.update(window="ten"), "window ten"),
-        (lambda v: v.update(boundary=[]), "must be sections"),
-        (lambda v: v["boundary"]["windows"]["15"].pop("length_low"), "damaged"),
-        (lambda v: v["boundary"]["windows"].update({"2": {}}), "boundary window 2"),
+        (lambda v: v["variability"]["reach-v3"].pop("k_s"), "damaged: variability.reach-v3.k_s"),
+        (lambda v: v["target"].pop("sha256"), "damaged: target.sha256"),
+        (lambda v: v.update(window="ten"), "damaged: window"),
+        (lambda v: v.update(window=3), "window 3"),
+        (lambda v: v.update(boundary=[]), "damaged: boundary"),
+        (lambda v: v["boundary"]["windows"]["15"].pop("length_low"), "damaged: boundary.windows.15.length_low"),
+        (lambda v: v["boundary"]["windows"].update({"2": v["boundary"]["windows"]["15"]}), "boundary window 2"),
         (lambda v: v["boundary"]["windows"]["15"].update(radius_high=0.001), "is no range"),
-        (lambda v: v["boundary"]["windows"]["15"].update(radius_high=float("nan")), "is no range"),
-        (lambda v: v["skip"].pop("datastore"), "damaged"),
-        (lambda v: v["skip"].update(tasks={}), "has no task"),
-        (lambda v: v["skip"]["tasks"]["reach-v3"].update(low=0.95), "levels of reach-v3 are not in order"),
-        (lambda v: v["skip"]["tasks"]["reach-v3"].update(s_min=float("nan")), "are not in order"),
-        (lambda v: v["skip"]["tasks"]["reach-v3"].pop("high"), "damaged"),
-        (lambda v: v.update(extra=1), "damaged"),
-        (lambda v: v.update(format=99), "not a calibration of format 1"),
-        (lambda v: v.update(kind="target"), "not a calibration of format 1"),
+        (lambda v: v["boundary"]["windows"]["15"].update(radius_high=float("nan")), "damaged: boundary.windows.15"),
+        (lambda v: v["skip"].pop("datastore"), "damaged: skip.datastore"),
+        (lambda v: v["skip"]["tasks"]["reach-v3"].update(low=0.95), "the skip levels are not in order"),
+        (lambda v: v["skip"]["tasks"]["reach-v3"].update(s_min=float("nan")), "damaged: skip.tasks.reach-v3.s_min"),
+        (lambda v: v["skip"]["tasks"]["reach-v3"].pop("high"), "damaged: skip.tasks.reach-v3.high"),
+        (lambda v: v.update(extra=1), "damaged: extra"),
+        (lambda v: v.update(format=1), "damaged: format"),
+        (lambda v: v.update(kind="target"), "damaged: kind"),
         (lambda v: v["target"].update(sha256="c" * 64), "was made for target cccccccccccc, not for aaaaaaaaaaaa"),
         (lambda v: v["target"].update(chunk=8), "was made for chunks of 8 steps, not of 4"),
     ],
@@ -288,22 +329,32 @@ def test_what_does_not_fit_is_refused_in_one_line(
 ) -> None:
     path = tmp_path / "calibration.json"
     save_calibration(path, calibration({"reach-v3": 0.7}))
-    assert load_calibration(path, "a" * 64, 4) == calibration({"reach-v3": 0.7})
+    assert load_calibration(path, description()) == calibration({"reach-v3": 0.7})
     value = copy.deepcopy(read_json(path))
     change(value)
     path.write_text(json.dumps(value))
     with pytest.raises(CheckpointError, match=says) as caught:
-        load_calibration(path, "a" * 64, 4)
+        load_calibration(path, description())
     assert "\n" not in str(caught.value)
     assert "kerv calibrate" in str(caught.value)
 
 
+@pytest.mark.parametrize("change", [{"low": (-2.0,) * 4}, {"strict": ()}, {"control_hz": 5.0}])
+def test_a_calibration_of_another_action_space_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration({}))
+    other = description(actions=dataclasses.replace(SPACE, **change))
+    with pytest.raises(CheckpointError, match="they were made for different actions") as caught:
+        load_calibration(path, other)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="run 'kerv calibrate'"):
-        load_calibration(tmp_path / "calibration.json", "a", 4)
+        load_calibration(tmp_path / "calibration.json", description())
     (tmp_path / "list.json").write_text("[1]")
     with pytest.raises(CheckpointError, match="not a calibration"):
-        load_calibration(tmp_path / "list.json", "a", 4)
+        load_calibration(tmp_path / "list.json", description())
 
 
 @pytest.mark.parametrize(
