@@ -224,14 +224,21 @@ class RandomBoundarySettings:
 
 
 @dataclass
+class AlwaysSkipSettings:
+    """What `prefill_draft` drafts is executed, never verified: the baseline without which no speedup means anything."""
+
+    kind: str = "always"
+
+
+@dataclass
 class SimilaritySkipSettings:
     """HeiSD: a retrieved chunk whose similarity reaches s_min is executed without a forward of the target's trunk."""
 
     kind: str = "similarity"
     s_min: float | None = None  # None: the task's, from the calibration
     max_skips: int = 2  # decodes in a row without a verification
-    up: float = 0.25  # share of the calibrated range that s_min rises after a failed episode
-    down: float = 0.05  # and falls after a successful one
+    up: float = 0.0  # share of the calibrated range that s_min rises after a failed episode (HeiSD's feedback: 0.25)
+    down: float = 0.0  # and falls after a successful one (0.05); above 0 results depend on the order of episodes
 
 
 # --- who searches the datastore (§4.1): every backend gives the same neighbours
@@ -543,6 +550,7 @@ register(
 )
 
 register(Part("skip", "none", _BUILD + "nothing", Nothing))
+register(Part("skip", "always", _BUILD + "always_skip", AlwaysSkipSettings, traits={"takes_draft": True}))
 register(
     Part(
         "skip",

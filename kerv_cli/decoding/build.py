@@ -25,7 +25,7 @@ from kerv_cli.decoding.proposers import (
     RetrievalProposer,
 )
 from kerv_cli.decoding.rectify import DRAFT, Compensation
-from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
+from kerv_cli.decoding.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
 from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import METHOD_KINDS, PREFILL, PredictionProposerSettings, RetrievalProposerSettings
@@ -76,6 +76,11 @@ def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
         raise UsageError(
             f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
             f"proposer={draft.name}"
+        )
+    if chosen["skip"].traits.get("takes_draft") and not draft.traits.get("chains"):
+        raise UsageError(
+            f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before the "
+            "prefill, e.g. prefill_draft=early"
         )
 
 
@@ -217,6 +222,11 @@ def boundary(settings: Any, context: Context) -> boundaries.Boundary:
         ranges = context.calibration.ranges(settings.window)
         return boundaries.Fused(ranges, settings.alpha, settings.window, settings.f_star)
     return boundaries.Always("retrieval" if settings.kind == "always_retrieval" else "drafter")
+
+
+def always_skip(settings: Any, context: Context) -> AlwaysSkip:
+    """skip=always."""
+    return AlwaysSkip(context.built["prefill_draft"])
 
 
 def similarity_skip(settings: Any, context: Context) -> VerifySkip:

@@ -101,7 +101,7 @@ class Chunk:
         self.rejection = Rejection()
         self.hidden = torch.empty(0)
         self.forwards = 0
-        self.difference = 0.0  # summed over judged tokens, |draft − target token| in normalised action units
+        self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
         self.similarity: float | None = None  # of the best stored chunk, where one was looked up
         self.closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
@@ -126,9 +126,10 @@ class Chunk:
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
     @property
-    def compared(self) -> bool:
-        """Whether any draft was judged."""
-        return any(r.drafted and r.mode != "skip" for r in self.rounds)
+    def variability(self) -> float | None:
+        """K: mean difference of draft and target over the judged tokens, normalised action units; strict DoFs left out,
+        of which one flip would outweigh all others. None where none was judged (§3.2)."""
+        return float(np.mean(self._differences)) if self._differences else None
 
     def encoded(self, hidden: Tensor) -> None:
         """The prompt, and what of a draft behind it was accepted, has the states hidden (1, P + c − 1, E)."""
@@ -143,7 +144,8 @@ class Chunk:
         if played.drafted:
             judged = np.array(played.drafted), np.array(played.target_tokens[: len(played.drafted)])
             drafted, wanted = map(self.space.values_of, judged)
-            self.difference += float(np.abs(drafted - wanted).sum())
+            moving = ~self.space.strict_tokens(self.size)[played.start : played.start + len(drafted)]
+            self._differences += np.abs(drafted - wanted)[moving].tolist()
 
     def skip(self, tokens: Sequence[int], proposer: str) -> None:
         """All N tokens are `proposer`'s, without a verification."""

@@ -16,7 +16,7 @@ from kerv_cli.decoding.proposers import EMPTY
 from kerv_cli.decoding.record import DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.decoding.thresholds import Fixed, Threshold
-from kerv_cli.decoding.verify_skip import VerifySkip
+from kerv_cli.decoding.verify_skip import Skip
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
 from kerv_cli.errors import UsageError
@@ -39,7 +39,7 @@ class Parts:
     proposer: Proposer | None = None
     rectifier: Compensation | None = None
     boundary: Boundary | None = None
-    skip: VerifySkip | None = None
+    skip: Skip | None = None
 
 
 class Decoder:
@@ -67,11 +67,12 @@ class Decoder:
         """Names of the images that an observation must hold."""
         return self.target.cameras
 
-    def reset(self, task: str, instruction: str = "", seed: int = 0) -> None:
-        """A new episode begins."""
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """A new episode begins, with the end effector at (3,) metres."""
         boundary = self.parts.boundary
         random = boundary.numbers(task, seed) if boundary is not None else np.random.default_rng(seed)
-        self.situation = Situation(task, ActionHistory(self.target.actions.dofs), random=random)
+        history = ActionHistory(self.target.actions.dofs)
+        self.situation = Situation(task, history, [np.asarray(end_effector)], random)
         self.threshold.reset()
         for part in (self.parts.rectifier, self.parts.skip):
             if part is not None:
@@ -95,8 +96,7 @@ class Decoder:
         clock.lap("vision")
         chunk = self.decode_prompt(prompt, clock)
         actions, predicted = self.actions_of(chunk)
-        variability = chunk.difference if chunk.compared else None
-        self.threshold.update(variability)
+        self.threshold.update(chunk.variability)
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
         seconds = clock.stop()
@@ -110,7 +110,7 @@ class Decoder:
             seconds=seconds,
             phases=clock.phases,
             compensated=predicted,
-            variability=variability,
+            variability=chunk.variability,
             skipped=any(r.mode == "skip" for r in chunk.rounds),
             similarity=chunk.similarity,
             metric=chunk.choice.metric if chunk.choice is not None else None,

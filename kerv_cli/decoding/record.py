@@ -60,6 +60,12 @@ class DecodeRecord:
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
 
     @property
+    def unverified(self) -> int:
+        """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's,
+        else what a prediction or a rejected draft filled."""
+        return len(self.tokens) if self.skipped else self.compensated
+
+    @property
     def verifications(self) -> int:
         """Rounds in which a tree was judged by the target."""
         return sum(1 for r in self.rounds if r.tree_size > 0 and r.mode != "skip")

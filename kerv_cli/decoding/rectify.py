@@ -69,6 +69,7 @@ def assemble(
     values = chunk.space.values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
     flat = np.full(steps * dofs, np.nan)
     flat[: len(values)] = values
+    flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan  # held, whoever drafted
     actions: np.ndarray = flat.reshape(steps, dofs)
     if np.isnan(actions).any():
         predicted = predictor.predict(chunk.situation.history.values(actions[:whole]), steps - whole)

@@ -1,10 +1,11 @@
-"""When a retrieved chunk is executed without a verification (METHODS §4.3; HeiSD's verify-skip)."""
+"""When a draft is executed without a verification (METHODS §4.3; HeiSD's verify-skip)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
-from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.decoding.chunk import Chunk, DraftsChunks
 from kerv_cli.decoding.proposers import RetrievalProposer
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import SimilaritySkipSettings
@@ -23,12 +24,48 @@ class SkipLevels:
             raise UsageError(f"verify-skip: s_min {self.s_min} does not lie in {self.low}…{self.high}")
 
 
+class Skip(Protocol):
+    """Decides, before the target's trunk runs, whether a draft is executed as it is."""
+
+    def reset(self) -> None:
+        """A new episode begins."""
+
+    def finish(self, success: bool) -> None:
+        """An episode ended."""
+
+    def take(self, chunk: Chunk) -> bool:
+        """Complete the chunk with a draft's tokens, if it may be executed unverified."""
+
+
+class AlwaysSkip:
+    """Every draft is executed unverified: what a method costs and loses without verification (§6). Where the source has
+    no whole chunk yet, the target decodes."""
+
+    def __init__(self, source: DraftsChunks) -> None:
+        self.source = source
+
+    def reset(self) -> None:
+        """Nothing is kept between decodes."""
+
+    def finish(self, success: bool) -> None:
+        """Nothing is kept between episodes."""
+
+    def take(self, chunk: Chunk) -> bool:
+        """As `Skip.take`."""
+        chains = self.source.chains(chunk, chunk.size)
+        if not chains or len(chains[0]) < chunk.size:
+            return False
+        chunk.skip(chains[0], self.source.name)
+        return True
+
+
 class VerifySkip:
     """Similarity of the best neighbour ≥ s_min: its chunk is the decode.
 
     At most `max_skips` decodes in a row; where a boundary decides, only on retrieval's side; and once a stored
-    episode's end was reached, nothing more of that episode is executed unverified. s_min outlives the episode: it
-    rises by `up` of the calibrated range after a failure and falls by `down` after a success.
+    episode's end was reached, nothing more of that episode is executed unverified. With `up` or `down` above 0 s_min
+    outlives the episode: it rises by `up` of the calibrated range after a failure and falls by `down` after a success,
+    so that results depend on the order of episodes and on the evaluator's flag.
     """
 
     def __init__(self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:

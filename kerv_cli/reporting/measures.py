@@ -14,6 +14,7 @@ from kerv_cli.reporting import statistics as stats
 from kerv_cli.reporting.statistics import Estimate
 
 MICRO = "micro over tasks"
+MARGIN = 0.03  # of success: a method is non-inferior where the difference's lower bound lies above -MARGIN
 MACRO = "macro over difficulty groups"
 
 COMPARABLE = ("device", "device_name", "dtype", "threads")  # what times must agree in to be compared
@@ -25,6 +26,7 @@ _RATIOS = {
     "AFEP": ("first_rejected_sum", "first_rejected_count"),
     "forwards_per_step": ("forwards", "steps"),
     "skip_rate": ("skipped_decodes", "decodes"),
+    "unverified_share": ("unverified_tokens", "executed_tokens"),
     "compensation_rate": ("compensated_decodes", "decodes"),
     "retrieval_share": ("retrieval_decodes", "decodes"),
     "deviation": ("deviation_sum", "deviation_count"),
@@ -42,6 +44,8 @@ class Measured:
     episode_speedup: Estimate  # of time per episode, likewise: methods also change how long episodes are
     counts: stats.PairedCounts
     mcnemar_p: float  # NaN without pairs
+    difference: Estimate  # of success, method minus baseline, over all pairs
+    pairs_to_settle: float  # about how many pairs would show non-inferiority at MARGIN
     same_run: bool  # all pairs were measured in one run
     same_block: float  # share of the pairs that were measured in one block, in turn; NaN without pairs
 
@@ -58,15 +62,18 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> M
     """
     pairs = paired(episodes, baseline)
     macro = averaging == MACRO
-    counts = stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
+    once = pairs[pairs["repeat"] == 0]  # a repeat of an episode is another time, not another world
+    counts = stats.paired_counts(once["success_baseline"].to_numpy(), once["success_method"].to_numpy())
     decodes = _decodes(episodes)
     return Measured(
         values=_by_group(episodes, _means) if macro else _means(episodes),
-        success=_success(episodes, macro),
+        success=_success(episodes[episodes["repeat"] == 0], macro),
         speedup=_speedup(pairs, "time", macro) if decodes else stats.NO_ESTIMATE,
         episode_speedup=_speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE,
         counts=counts,
         mcnemar_p=stats.mcnemar(counts) if len(pairs) else math.nan,
+        difference=stats.paired_difference(counts),
+        pairs_to_settle=stats.pairs_to_settle(counts, MARGIN),
         same_run=bool(len(pairs) and pairs["same_run"].all()),
         same_block=float(pairs["same_block"].mean()) if len(pairs) else math.nan,
     )

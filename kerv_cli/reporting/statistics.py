@@ -70,6 +70,48 @@ def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
     return PairedCounts(int((a & b).sum()), int((a & ~b).sum()), int((~a & b).sum()), int((~a & ~b).sum()))
 
 
+def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimate:
+    """Success rate of the method minus the baseline's from the same initial states, with its interval.
+
+    Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method 10): the two Wilson
+    intervals, combined with the pairs' correlation. NaN without pairs.
+    """
+    pairs = sum(counts)
+    if not pairs:
+        return NO_ESTIMATE
+    both, only_baseline, only_method, neither = counts
+    first, second = both + only_method, both + only_baseline  # successes of the method, of the baseline
+    rates = first / pairs, second / pairs
+    bounds = wilson(first, pairs, confidence), wilson(second, pairs, confidence)
+    product = first * (pairs - first) * second * (pairs - second)
+    surplus = both * neither - only_method * only_baseline
+    if surplus > 0:
+        surplus = max(surplus - pairs / 2, 0)
+    phi = surplus / math.sqrt(product) if product else 0.0
+
+    def reach(a: float, b: float) -> float:
+        return math.sqrt(max(0.0, a**2 - 2 * phi * a * b + b**2))
+
+    difference = rates[0] - rates[1]
+    low = difference - reach(rates[0] - bounds[0].low, bounds[1].high - rates[1])
+    high = difference + reach(bounds[0].high - rates[0], rates[1] - bounds[1].low)
+    return Estimate(difference, low, high)
+
+
+def pairs_to_settle(counts: PairedCounts, margin: float, z: float = 1.96) -> float:
+    """About how many pairs would show non-inferiority at `margin`, if the rates of the four outcomes stayed as they are:
+    the lower bound of the normal interval of the difference then lies at -margin. Infinite where the difference itself
+    lies there or below; NaN without pairs."""
+    pairs = sum(counts)
+    if not pairs:
+        return math.nan
+    difference = (counts.only_method - counts.only_baseline) / pairs
+    # one discordant pair at least: none so far does not prove that there are none
+    discordant = max(1, counts.only_method + counts.only_baseline) / pairs
+    room = margin + difference
+    return math.ceil(z**2 * (discordant - difference**2) / room**2) if room > 0 else math.inf
+
+
 def mcnemar(counts: PairedCounts) -> float:
     """Exact two-sided p of McNemar's test: are the discordant pairs a fair coin? 1 without discordant pairs."""
     discordant = counts.only_baseline + counts.only_method

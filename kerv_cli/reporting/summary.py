@@ -19,11 +19,12 @@ APART = "*"
 _ALWAYS = {"AL": "AL", "AFEP": "AFEP", "forwards_per_step": "forwards / step"}
 _WHERE_USED = {
     "skip_rate": "skipped",
+    "unverified_share": "unverified",
     "compensation_rate": "compensated",
     "retrieval_share": "retrieved",
     "deviation": "deviation",
 }
-_PERCENT = frozenset({"skip_rate", "compensation_rate", "retrieval_share"})
+_PERCENT = frozenset({"skip_rate", "unverified_share", "compensation_rate", "retrieval_share"})
 
 
 def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:

@@ -21,7 +21,7 @@ from kerv_cli.reporting.ceiling import (
     is_autoregressive,
     verifies_in_prefill,
 )
-from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, Measured, measure
+from kerv_cli.reporting.measures import COMPARABLE, MACRO, MARGIN, MICRO, Measured, measure
 from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
@@ -158,7 +158,7 @@ def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[st
     rest = {name: value for name, value in found.values.items() if name not in phases}
     limit = best.columns()
     return {
-        "successes": int(episodes["success"].sum()),
+        "successes": int(episodes.loc[episodes["repeat"] == 0, "success"].sum()),
         "success": found.success.value,
         "success_low": found.success.low,
         "success_high": found.success.high,
@@ -173,6 +173,12 @@ def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[st
         "pairs": sum(found.counts),
         **found.counts._asdict(),
         "mcnemar_p": found.mcnemar_p,
+        "difference": found.difference.value,
+        "difference_low": found.difference.low,
+        "difference_high": found.difference.high,
+        "margin": MARGIN,
+        "non_inferior": bool(found.difference.low > -MARGIN),
+        "pairs_to_settle": found.pairs_to_settle,
         "same_run": found.same_run,
         "same_block": found.same_block,
         "steps": int(episodes["steps"].sum()),

@@ -21,8 +21,8 @@ class ActionDecoder(Protocol):
     def cameras(self) -> tuple[str, ...]:
         """Names of the images that decode() reads; no others are drawn for it."""
 
-    def reset(self, task: str, instruction: str, seed: int) -> None:
-        """A new episode begins: histories are cleared."""
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """A new episode begins, with the end effector at (3,) metres: histories are cleared."""
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """What is known now, with the images of `cameras` -> the actions to execute and all that happened."""
@@ -73,7 +73,7 @@ def run_episode(world: World, decoder: ActionDecoder, seed: int, recording: Reco
     """
     began = time.perf_counter()
     world.reset(seed)
-    decoder.reset(world.task, world.instruction, seed)
+    decoder.reset(world.task, seed, world.end_effector)
     trace = _Trace(world, recording.camera if recording else None)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []

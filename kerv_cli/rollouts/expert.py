@@ -30,7 +30,7 @@ class ExpertDecoder:
         self.expert: Expert | None = None
         self.dofs = 0
 
-    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Raises UnknownName for a task that no environment has."""
         if self.expert is None or task != self.task:
             spec = spec_of(task)

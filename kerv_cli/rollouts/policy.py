@@ -117,11 +117,11 @@ class Sampled:
         """As the decoder's."""
         return self.decoder.cameras
 
-    def reset(self, task: str, instruction: str, seed: int = 0) -> None:
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """A new episode begins."""
         self.count = 0
-        self.decoder.reset(task, instruction, seed)
-        self.reference.reset(task, instruction, seed)
+        self.decoder.reset(task, seed, end_effector)
+        self.reference.reset(task, seed, end_effector)
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """The decoder's record; every `every`-th with its deviation from AR, in normalised action units."""
@@ -164,7 +164,7 @@ def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: in
     images = {name: np.zeros((pixels, pixels, 3), dtype=np.uint8) for name in decoder.cameras}
     space = spec.observation
     still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
-    decoder.reset(task, "", 0)
+    decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
     for i in range(WARM_UP_DECODES):
         for action in decoder.decode(still).actions:
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

@@ -37,6 +37,8 @@ EPISODE_SCHEMA = pa.schema(
         ("compensated_tokens", pa.int64()),
         ("compensated_decodes", pa.int64()),
         ("skipped_decodes", pa.int64()),
+        ("unverified_tokens", pa.int64()),  # executed without a target token on their accepted path
+        ("executed_tokens", pa.int64()),  # numbers handed over for execution: steps times DoFs
         ("retrieval_decodes", pa.int64()),
         ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
         ("deviation_count", pa.int64()),
@@ -128,6 +130,8 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         "compensated_tokens": sum(d.compensated for d in decodes),
         "compensated_decodes": sum(d.compensated > 0 for d in decodes),
         "skipped_decodes": sum(d.skipped for d in decodes),
+        "unverified_tokens": sum(d.unverified for d in decodes),
+        "executed_tokens": sum(int(d.actions.size) for d in decodes),
         "retrieval_decodes": sum(any(r.proposer == "retrieval" for r in d.rounds) for d in decodes),
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),

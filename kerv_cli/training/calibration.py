@@ -68,7 +68,7 @@ def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, d
     instruction, felt = spec_of(episode.task).tasks[episode.task].instruction, len(space.proprioception)
     chosen = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
     levels, seen = [], 0
-    decoder.reset(episode.task, instruction, episode.seed)
+    decoder.reset(episode.task, episode.seed, episode.end_effector[0])
     for index in chosen:
         step = int(episode.frame_steps[index])
         for t in range(seen, step):
