@@ -144,34 +144,52 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_target_token: bool) ->
     known = wrong + use_target_token
     assert chunk.tokens == truth[:known]
     assert sum(r.committed for r in chunk.rounds) == known
-    if wrong == N - 1 and use_target_token:
-        assert chunk.closed is None
-        return
+    # where the target's own token was the last one nothing is missing, and nothing was predicted
+    assert (chunk.closed is None) == (known == N)
     steps = max(1, -(-known // D))
-    assert chunk.closed is not None
-    assert chunk.closed.shape == (steps, D)
     actions, predicted = decoder.actions_of(chunk)
+    assert actions.shape == (steps, D)
     assert predicted == steps * D - known
     assert actions.reshape(-1)[:known] == pytest.approx(SPACE.values_of(np.array(truth[:known], dtype=int)), abs=1e-6)
 
 
 @pytest.mark.parametrize("wrong", range(N - 1))
 def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> None:
-    """predictor=draft: behind the target's token the step is filled with the draft's own values, at the first decode
-    too."""
+    """predictor=draft: behind the target's token the step is filled with the draft's own values; the gripper is held."""
     prompt = prompt_of(3)
     truth = plain_greedy(TARGET, prompt)
     drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
     decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted[:-1]), rectifier=compensation(predictor="draft")))
+    decoder.situation = Situation("t", PAST)
     chunk = decoder.decode_prompt(prompt)
     assert chunk.forwards == 1
     end = -(-(wrong + 1) // D) * D
-    expected = [*truth[: wrong + 1], *drafted[wrong + 1 : min(end, N - 1)]]
-    if end == N:  # the last token of all was not drafted, the bonus would have filled it: it is predicted
-        expected.append(truth[N - D - 1])
+    expected = SPACE.values_of(np.array([*truth[: wrong + 1], *drafted[wrong + 1 : end]]))
+    if end > wrong + 1:
+        # whatever was drafted for the gripper, and whether or not it was: as in the step before
+        expected[end - 1] = expected[end - 1 - D] if end > D else PAST.values()[-1][D - 1]
     assert chunk.closed is not None
-    assert chunk.closed.reshape(-1) == pytest.approx(SPACE.values_of(np.array(expected)))
+    assert chunk.closed.reshape(-1) == pytest.approx(expected)
     assert decoder.actions_of(chunk)[1] == end - wrong - 1
+
+
+@pytest.mark.parametrize("wrong", range(2 * D - 1))
+def test_without_a_gripper_to_hold_the_target_decodes_on(wrong: int) -> None:
+    """predictor=draft at an episode's first decode: the draft's gripper is not executed in its place."""
+    prompt = prompt_of(3)
+    truth = plain_greedy(TARGET, prompt)
+    drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
+    draft = Known(drafted[:-1])
+    decoder = Decoder(TARGET, Parts(prefill_draft=draft, rectifier=compensation(predictor="draft")))
+    chunk = decoder.decode_prompt(prompt)
+    if wrong < D - 1:  # the first gripper is neither known nor held
+        assert chunk.closed is None
+        assert chunk.tokens == truth
+        assert chunk.forwards == 1 + N - (wrong + 1)
+    else:
+        assert chunk.forwards == 1
+        assert chunk.closed is not None
+        assert chunk.closed[-1, D - 1] == pytest.approx(SPACE.values_of(np.array(truth[D - 1])))
 
 
 @pytest.mark.parametrize(
