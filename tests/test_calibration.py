@@ -199,20 +199,19 @@ def test_both_kinds_of_episodes_are_held_out(results: Path) -> None:
         choose_episodes(dataset, ("push-v3",), 0, 0.3)
 
 
-def test_variability_is_the_summed_difference_of_the_actions() -> None:
-    """K by hand: over all judged tokens, in normalised action units; what is not judged does not count."""
+def test_variability_is_the_mean_difference_of_the_judged_tokens() -> None:
+    """K by hand, in normalised action units; what is not judged does not count, nor does a strict DoF."""
     chunk = Chunk(torch.zeros(1, 1, 8), 4, SPACE, None, Situation("t", ActionHistory(4)))  # type: ignore[arg-type]
 
-    def play(drafted: tuple[int, ...], target_tokens: tuple[int, ...]) -> float:
-        played = Round("verify", "x", 0, drafted, target_tokens, 0, 1, len(drafted), ())
+    def play(start: int, drafted: tuple[int, ...], target_tokens: tuple[int, ...]) -> float | None:
+        played = Round("verify", "x", start, drafted, target_tokens, 0, 1, len(drafted), ())
         chunk.commit(played, [0])
-        return chunk.difference / BIN
+        return None if chunk.variability is None else chunk.variability / BIN
 
-    assert play((), (100,)) == 0
-    assert not chunk.compared
-    assert play((10, 20, 30), (10, 22, 27, 99)) == pytest.approx(5)  # the bonus was not drafted
-    assert play((0, 0, 254), (0, 0, 0)) == pytest.approx(259)
-    assert chunk.compared
+    assert play(0, (), (100,)) is None
+    assert play(3, (254,), (0,)) is None  # the gripper alone: nothing that moves was judged
+    assert play(0, (10, 20, 30), (10, 22, 27, 99)) == pytest.approx(5 / 3)  # the bonus was not drafted
+    assert play(1, (0, 0, 254, 7), (0, 4, 0, 0)) == pytest.approx((5 + 0 + 4 + 7) / 6)
 
 
 def test_the_reference_level_is_the_median_and_can_divide() -> None:
@@ -252,11 +251,16 @@ def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
     run = CalibrationRun(settings(results))
     decoder = run.decoder()
     episode = run.dataset.load(0)
-    decoder.reset(episode.task, "reach")
+    decoder.reset(episode.task, 0, episode.end_effector[0])
     record = decoder.decode(Observation(episode.states[0][:4], episode.states[0], "reach"))
-    pairs = [(d, v) for r in record.rounds for d, v in zip(r.drafted, r.target_tokens, strict=False)]
-    assert record.variability == pytest.approx(BIN * sum(abs(d - v) for d, v in pairs))
-    assert len(pairs) > 3
+    judged = [
+        abs(d - v)
+        for r in record.rounds
+        for i, (d, v) in enumerate(zip(r.drafted, r.target_tokens, strict=False))
+        if (r.start + i) % 4 != 3  # the gripper is strict
+    ]
+    assert record.variability == pytest.approx(BIN * sum(judged) / len(judged))
+    assert len(judged) > 3
 
 
 def test_the_tasks_reference_level_reaches_the_threshold() -> None:
