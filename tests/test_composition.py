@@ -27,7 +27,7 @@ AR: dict[str, Any] = {
 }
 CHAIN = p.DrafterProposerSettings(depth=15, top_k=1, nodes=15)
 RELAXED = p.RelaxedAcceptanceSettings(strict_dofs=True)
-SKIP = p.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.25, down=0.05)
+SKIP = p.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0)
 K_LEVEL = p.KinematicThresholdSettings(r_min=5, r_max=15, phi=2.0, k_s=None)
 BOUNDARY = p.FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5)
 ONE_PASS = {
@@ -70,6 +70,20 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
     "retrieval_only": {
         "proposer": p.RetrievalProposerSettings(neighbours=5, nodes=50),
         "acceptance": p.SequenceAcceptanceSettings(group_limit=30, token_limit=15),
+    },
+    "spec_vla_paper": {
+        "proposer": p.DrafterProposerSettings(depth=5, top_k=8, nodes=50),
+        "acceptance": p.RelaxedAcceptanceSettings(strict_dofs=False),
+    },
+    "early_unverified": {
+        "prefill_draft": p.EarlyProposerSettings(),
+        "acceptance": RELAXED,
+        "skip": p.AlwaysSkipSettings(),
+    },
+    "retrieval_unverified": {
+        "prefill_draft": p.RetrievalProposerSettings(),
+        "acceptance": RELAXED,
+        "skip": p.AlwaysSkipSettings(),
     },
     "one_pass": ONE_PASS,
     "one_pass_skip": {**ONE_PASS, "skip": SKIP},
@@ -169,6 +183,8 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
         ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
         ("skip.kind=nope", "skip.kind 'nope'"),
         ("method=heisd skip.max_skips=0", "skip.max_skips=0"),
+        ("skip=always", "skip=always with prefill_draft=none: it executes what one source drafts before the prefill"),
+        ("skip=always prefill_draft=merged", "skip=always with prefill_draft=merged"),
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
         ("method=jacobi proposer.depth=-1", "proposer.depth=-1"),
         ("method=retrieval_only proposer.neighbours=0", "proposer.neighbours=0"),
@@ -248,6 +264,9 @@ def test_an_expert_needs_nothing_else() -> None:
         ("method=one_pass_skip", ("early", "datastore", "calibration")),
         ("method=one_pass_skip skip.s_min=0.99", ("early", "datastore")),
         ("method=one_pass_strict", ("early",)),
+        ("method=early_unverified", ("early",)),
+        ("method=retrieval_unverified", ("datastore",)),
+        ("method=spec_vla_paper", ("drafter",)),
     ],
 )
 def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides: str, wanted: tuple[str, ...]) -> None:
