@@ -106,12 +106,12 @@ def test_it_follows_the_task_and_refuses_what_it_cannot_answer() -> None:
     decoder = ExpertDecoder()
     with pytest.raises(KervError, match="reset it before decoding"):
         decoder.decode(seen(np.zeros(39)))
-    decoder.reset(NAME, "")
+    decoder.reset(NAME, 0, np.zeros(3))
     state = np.random.default_rng(0).uniform(0, 0.3, 39)
     first = decoder.decode(seen(state)).actions
-    decoder.reset("drawer-open-v3", "")
+    decoder.reset("drawer-open-v3", 0, np.zeros(3))
     assert (decoder.decode(seen(state)).actions != first).any()
     with pytest.raises(KervError, match="a state it cannot read"):
         decoder.decode(seen(np.full(39, np.nan)))
     with pytest.raises(UnknownName, match="window-close"):
-        decoder.reset("window-clos", "")
+        decoder.reset("window-clos", 0, np.zeros(3))
