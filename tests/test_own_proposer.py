@@ -135,7 +135,7 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     plain = Decoder(files.target)
     state = np.random.default_rng(1).uniform(0, 0.5, 39)
     for chosen in (decoder, plain):
-        chosen.reset("reach-v3")
+        chosen.reset("reach-v3", 0, np.zeros(3))
         chosen.observe(np.zeros(4), np.zeros(3))
     observation = Observation(state[:4], state, "reach the goal")
     record = decoder.decode(observation)
