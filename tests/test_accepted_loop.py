@@ -112,7 +112,7 @@ class Oracle:
         return sum(abs(t - self.greedy.behind(self.tokens + path[:i])) for i, t in enumerate(path))
 
     def verify(self, tree: TokenTree, name: str, size: int) -> None:
-        """Commit the longest allowed path, the nearest and then the first of equally long ones, and the token behind it."""
+        """Commit the longest allowed path, of those the nearest, of those the first; then the token behind it."""
         by_group = self.kind == "hybrid" and name == "retrieval"
         paths = [tuple(tree.tokens[i] for i in tree.path_to(node)) for node in range(len(tree))]
         good = [p for p in paths if self.allowed(p, by_group)]
