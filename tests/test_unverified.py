@@ -1,0 +1,231 @@
+"""What is executed unverified, what lies inside the clock, and K against the chunk's length."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from examples.own_target import SEVEN, MockTarget
+from test_decoding_lossless import plain_greedy, random_prompt, random_target
+from test_proposers import stored
+
+from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import ChainProposer, PredictionProposer, RetrievalProposer
+from kerv_cli.decoding.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
+from kerv_cli.drafting.kinematics import Hold
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.parts import SimilaritySkipSettings
+from kerv_cli.spaces import Observation
+
+PAUSE = 0.03
+SHOWN = Observation(np.array([0.3]), np.zeros(0), "go there")
+HOME = np.array([0.1, 0.6, 0.2])
+
+
+class Near(ChainProposer):
+    """Drafts the target's own tokens, each off by `bins`."""
+
+    name = "near"
+
+    def __init__(self, target: Any, prompt: torch.Tensor, bins: int = 0, pause: float = 0.0) -> None:
+        truth = np.array(plain_greedy(target, prompt))
+        self.drafted = np.where(truth + bins < target.actions.tokens, truth + bins, truth - bins).tolist()
+        self.pause, self.calls = pause, 0
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        self.calls += 1
+        time.sleep(self.pause)
+        return [self.drafted[len(chunk.tokens) :][:depth]]
+
+
+# --- the clock
+
+
+def test_a_proposer_that_sleeps_is_in_the_clock_in_its_phase() -> None:
+    target = MockTarget()
+    slow = Near(target, target.encode(SHOWN), bins=1, pause=PAUSE)
+    decoder = Decoder(target, Parts(proposer=slow))
+    record = decoder.decode(SHOWN)
+    assert slow.calls > 5
+    assert record.phases["propose"] >= PAUSE * slow.calls
+    assert record.seconds >= PAUSE * slow.calls
+    assert record.seconds == pytest.approx(sum(record.phases.values()))
+    assert record.seconds - record.phases["propose"] < PAUSE * slow.calls / 2
+
+
+def test_an_in_prefill_draft_that_sleeps_is_not_the_prefills_time() -> None:
+    target = MockTarget()
+    slow = Near(target, target.encode(SHOWN), pause=PAUSE)
+    decoder = Decoder(target, Parts(prefill_draft=slow))
+    records = [decoder.decode(SHOWN) for _ in range(3)]
+    assert (slow.calls, [r.forwards for r in records]) == (3, [1, 1, 1])
+    assert min(r.phases["propose"] for r in records) >= PAUSE
+    assert min(r.phases["prefill"] for r in records) < PAUSE  # a busy machine does not stop it three times
+
+
+def test_a_skipped_decodes_draft_is_in_the_clock() -> None:
+    target = MockTarget()
+    slow = Near(target, target.encode(SHOWN), pause=PAUSE)
+    record = Decoder(target, Parts(prefill_draft=slow, skip=AlwaysSkip(slow))).decode(SHOWN)
+    assert record.forwards == 0
+    assert record.seconds >= record.phases["propose"] >= PAUSE
+
+
+@pytest.mark.parametrize(("slow", "phase"), [("encode", "vision"), ("forward", "prefill")])
+def test_a_target_that_sleeps_is_in_the_clock_in_its_phase(slow: str, phase: str) -> None:
+    class Slow(MockTarget):
+        def __getattribute__(self, name: str) -> Any:
+            if name == slow:
+                time.sleep(PAUSE)
+            return super().__getattribute__(name)
+
+    decoder = Decoder(Slow(), Parts())
+    records = [decoder.decode(SHOWN) for _ in range(3)]
+    decodes = records[0].forwards - 1 if slow == "forward" else 0
+    for record in records:
+        assert record.phases[phase] >= PAUSE
+        assert record.phases["verify"] >= PAUSE * decodes
+        assert record.seconds >= PAUSE * (1 + decodes)
+    # a busy machine does not stop the same phase three times
+    others = set(records[0].phases) - {phase, "verify"}
+    assert all(min(r.phases[name] for r in records) < PAUSE for name in others)
+
+
+# --- K
+
+
+@pytest.mark.parametrize("make", [lambda: MockTarget(SEVEN, 8), lambda: random_target(3, 2, 2, 8)])
+@pytest.mark.parametrize("before", [True, False])
+def test_variability_does_not_grow_with_the_chunk(make: Callable[[], Any], before: bool) -> None:
+    """The reference level K_S is sampled at full H and used at every H: a sum would be eight times as large."""
+    target = make()
+    prompt = target.encode(SHOWN) if isinstance(target, MockTarget) else random_prompt(target, 3)
+    found, sums = [], []
+    for steps in (1, 8):
+        near = Near(target, prompt, bins=3)
+        parts = Parts(prefill_draft=near, proposer=near) if before else Parts(proposer=near)
+        chunk = Decoder(target, parts, chunk=steps).decode_prompt(prompt)
+        assert chunk.variability is not None
+        found.append(chunk.variability)
+        sums.append(chunk.variability * sum(len(r.drafted) for r in chunk.rounds))
+    assert found[1] / found[0] == pytest.approx(1.0, abs=0.2)
+    assert sums[1] / sums[0] > 6
+
+
+# --- skip=always
+
+
+def test_always_skip_executes_the_sources_tokens_without_a_forward() -> None:
+    target = MockTarget()
+    source = Near(target, target.encode(SHOWN), bins=5)
+    decoder = Decoder(target, Parts(prefill_draft=source, skip=AlwaysSkip(source)))
+    for _ in range(4):  # there is no cap
+        record = decoder.decode(SHOWN)
+        assert record.tokens == tuple(source.drafted) != tuple(plain_greedy(target, target.encode(SHOWN)))
+        assert (record.forwards, record.skipped, record.mode) == (0, True, "skip")
+        assert [(r.mode, r.proposer) for r in record.rounds] == [("skip", "near")]
+        assert record.unverified == record.actions.size == len(record.tokens)
+
+
+@pytest.mark.parametrize("chunk", [1, 2, 4])
+def test_always_skip_executes_the_nearest_stored_chunk(chunk: int) -> None:
+    target = random_target(2, 1, 1, 4)
+    prompt = random_prompt(target, 2)
+    rows = np.arange(3 * 16).reshape(3, 16)
+    source = RetrievalProposer(stored(target, prompt, rows), target, 3, 48)
+    decoder = Decoder(target, Parts(prefill_draft=source, skip=AlwaysSkip(source)), chunk=chunk)
+    decoder.reset("t", 0, HOME)
+    found = decoder.decode_prompt(prompt)
+    nearest = source.neighbours(found).chunks[0]
+    assert found.tokens == nearest[: 4 * chunk].tolist()
+    assert found.forwards == 0
+
+
+def test_always_skip_without_a_history_lets_the_target_decode() -> None:
+    target = MockTarget()
+    hold = PredictionProposer(Hold(SEVEN.is_strict, minimum=1, horizon=2))
+    decoder = Decoder(target, Parts(prefill_draft=hold, skip=AlwaysSkip(hold)))
+    decoder.reset("t", 0, HOME)
+    first = decoder.decode(SHOWN)
+    assert first.tokens == tuple(plain_greedy(target, target.encode(SHOWN)))
+    assert (first.forwards, first.skipped, first.unverified) == (len(first.tokens), False, 0)
+    decoder.observe(first.actions[0], HOME)
+    second = decoder.decode(SHOWN)
+    assert second.tokens == 2 * first.tokens[:7]
+    assert (second.forwards, second.skipped, second.unverified) == (0, True, 14)
+
+
+# --- skip levels through a sweep
+
+
+def swept(blocks: list[list[int]], **feedback: float) -> dict[int, list[tuple[int, ...]]]:
+    """Seed -> its decodes' tokens and forwards; every block has a decoder of its own, odd seeds fail."""
+    target = random_target(2, 1, 1, 4)
+    prompt = random_prompt(target, 2)
+    store = stored(target, prompt, np.arange(64).reshape(4, 16))
+    prompts = {seed: prompt + 0.4 * random_prompt(target, 100 + seed) for block in blocks for seed in block}
+    every = [float(store.query(store.key(x, target), "t", 1).similarity[0]) for x in prompts.values()]
+    level = float(np.median(every))
+    records = {}
+    for block in blocks:
+        retrieval = RetrievalProposer(store, target, 1, 16)
+        levels = SkipLevels(level - 0.2, level, level + 0.2)
+        skip = VerifySkip(SimilaritySkipSettings(max_skips=2, **feedback), retrieval, levels)
+        decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
+        for seed in block:
+            decoder.reset("t", seed, HOME)
+            chunks = [decoder.decode_prompt(prompts[seed]) for _ in range(4)]
+            records[seed] = [(c.forwards, *c.tokens) for c in chunks]
+            decoder.finish(success=seed % 2 == 0)
+    return records
+
+
+ORDERS = [[[0, 1, 2, 3, 4, 5]], [[5, 3, 1, 4, 2, 0]], [[0, 1], [2, 3], [4, 5]], [[4], [0], [5], [2], [1], [3]]]
+
+
+def test_frozen_skip_levels_know_no_order_and_no_block() -> None:
+    found = [swept(blocks) for blocks in ORDERS]
+    assert found[0] == found[1] == found[2] == found[3]
+    forwards = [tokens[0] for record in found[0].values() for tokens in record]
+    assert 0 in forwards  # some were skipped,
+    assert all(record[2][0] > 0 for record in found[0].values())  # never three in a row,
+    assert any(record[0][0] > 0 for record in found[0].values())  # and some episodes lie below s_min
+
+
+def test_skip_levels_with_feedback_depend_on_the_order() -> None:
+    """Why they are frozen: the same episodes in another order are decoded otherwise."""
+    found = [swept(blocks, up=1.0, down=0.5) for blocks in ORDERS[:2]]
+    assert found[0].keys() == found[1].keys()
+    assert found[0] != found[1]
+
+
+# --- the path
+
+
+def test_the_boundarys_path_begins_where_the_episode_does() -> None:
+    seen: list[np.ndarray] = []
+
+    class Watching:
+        def numbers(self, task: str, seed: int) -> np.random.Generator:
+            return np.random.default_rng(seed)
+
+        def choose(self, path: np.ndarray, random: np.random.Generator) -> None:
+            seen.append(path.copy())
+
+    decoder = Decoder(MockTarget(SPEC.actions, 1), Parts(boundary=Watching()))  # type: ignore[arg-type]
+    for start in (HOME, 2 * HOME):
+        decoder.reset("t", 0, start)
+        decoder.decode(SHOWN)
+        decoder.observe(np.zeros(4), start + 0.01)
+        decoder.decode(SHOWN)
+    assert [path.tolist() for path in seen] == [
+        [HOME.tolist()],
+        [HOME.tolist(), (HOME + 0.01).tolist()],
+        [(2 * HOME).tolist()],
+        [(2 * HOME).tolist(), (2 * HOME + 0.01).tolist()],
+    ]
