@@ -6,8 +6,19 @@ import math
 
 import numpy as np
 import pytest
+from statsmodels.stats.contingency_tables import mcnemar as statsmodels_mcnemar
+from statsmodels.stats.proportion import proportion_confint
 
-from kerv_cli.reporting.statistics import PairedCounts, macro_wilson, mcnemar, paired_counts, speedup, wilson
+from kerv_cli.reporting.statistics import (
+    PairedCounts,
+    macro_wilson,
+    mcnemar,
+    paired_counts,
+    paired_difference,
+    pairs_to_settle,
+    speedup,
+    wilson,
+)
 
 Z = 1.959963984540054  # 97.5th percentile of the normal distribution
 
@@ -190,3 +201,89 @@ def test_one_pair_per_task_has_no_interval() -> None:
 
 def test_without_pairs_there_is_no_speedup() -> None:
     assert math.isnan(speedup(np.array([]), np.array([]), []).value)
+
+
+@pytest.mark.parametrize(("successes", "episodes"), [(0, 7), (12, 12), (3, 8), (187, 200)])
+@pytest.mark.parametrize("confidence", [0.9, 0.95])
+def test_wilson_is_statsmodels(successes: int, episodes: int, confidence: float) -> None:
+    expected = proportion_confint(successes, episodes, 1 - confidence, method="wilson")
+    assert wilson(successes, episodes, confidence) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("counts", [(10, 0, 0, 3), (10, 5, 2, 3), (150, 13, 4, 33), (0, 9, 1, 0)])
+def test_mcnemar_is_statsmodels(counts: tuple[int, int, int, int]) -> None:
+    both, lost, won, neither = counts
+    expected = statsmodels_mcnemar([[both, lost], [won, neither]], exact=True).pvalue
+    assert mcnemar(PairedCounts(*counts)) == pytest.approx(min(1.0, expected), abs=1e-12)
+
+
+def test_paired_difference_by_hand() -> None:
+    """Of 50 pairs the method solves 36 + 2, the baseline 36 + 12, none solves 0."""
+    low_a, high_a = wilson_formula(38, 50)
+    low_b, high_b = wilson_formula(48, 50)
+    phi = (36 * 0 - 12 * 2) / math.sqrt(38 * 12 * 48 * 2)  # below 0: without the correction for continuity
+    below, above = 0.76 - low_a, high_b - 0.96
+    low = -0.2 - math.sqrt(below**2 - 2 * phi * below * above + above**2)
+    below, above = high_a - 0.76, 0.96 - low_b
+    high = -0.2 + math.sqrt(below**2 - 2 * phi * below * above + above**2)
+    assert paired_difference(PairedCounts(36, 12, 2, 0)) == pytest.approx((-0.2, low, high), abs=1e-9)
+
+
+def test_paired_difference_of_correlated_pairs_by_hand() -> None:
+    low_a, high_a = wilson_formula(24, 40)
+    low_b, high_b = wilson_formula(22, 40)
+    phi = (20 * 14 - 2 * 4 - 20) / math.sqrt(24 * 16 * 22 * 18)  # less half the pairs, for continuity
+    below, above = 0.6 - low_a, high_b - 0.55
+    low = 0.05 - math.sqrt(below**2 - 2 * phi * below * above + above**2)
+    below, above = high_a - 0.6, 0.55 - low_b
+    high = 0.05 + math.sqrt(below**2 - 2 * phi * below * above + above**2)
+    assert paired_difference(PairedCounts(20, 2, 4, 14)) == pytest.approx((0.05, low, high), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "counts", [(0, 0, 0, 5), (5, 0, 0, 0), (3, 4, 0, 0), (20, 2, 4, 14), (0, 3, 9, 0), (1, 0, 0, 0)]
+)
+def test_paired_difference_is_symmetric_and_bounded(counts: tuple[int, int, int, int]) -> None:
+    both, lost, won, neither = counts
+    value, low, high = paired_difference(PairedCounts(both, lost, won, neither))
+    assert -1 <= low <= value <= high <= 1
+    assert low < high
+    swapped = paired_difference(PairedCounts(both, won, lost, neither))
+    assert swapped == pytest.approx((-value, -high, -low), abs=1e-12)
+    failures = paired_difference(PairedCounts(neither, won, lost, both))  # counted instead of successes
+    assert failures == pytest.approx((-value, -high, -low), abs=1e-12)
+
+
+@pytest.mark.parametrize("rates", [(0.85, 0.05, 0.02, 0.08), (0.5, 0.2, 0.1, 0.2), (0.9, 0.03, 0.03, 0.04)])
+def test_paired_difference_covers_the_truth_as_often_as_it_says(rates: tuple[float, ...]) -> None:
+    draws = np.random.default_rng(7).multinomial(60, rates, size=800)
+    intervals = [paired_difference(PairedCounts(*map(int, counts))) for counts in draws]
+    inside = [found.low <= rates[2] - rates[1] <= found.high for found in intervals]
+    assert np.mean(inside) >= 0.93
+
+
+def test_without_pairs_there_is_no_difference() -> None:
+    assert all(math.isnan(number) for number in paired_difference(PairedCounts(0, 0, 0, 0)))
+    assert math.isnan(pairs_to_settle(PairedCounts(0, 0, 0, 0), 0.03))
+
+
+@pytest.mark.parametrize(
+    ("counts", "pairs"),
+    [
+        ((80, 5, 5, 10), math.ceil(1.96**2 * 0.1 / 0.03**2)),  # no difference, a tenth discordant: 427
+        ((80, 6, 4, 10), math.ceil(1.96**2 * (0.1 - 0.02**2) / 0.01**2)),  # two points worse: 3827
+        ((80, 4, 6, 10), math.ceil(1.96**2 * (0.1 - 0.02**2) / 0.05**2)),
+        ((80, 0, 0, 20), math.ceil(1.96**2 * 0.01 / 0.03**2)),  # one discordant pair is assumed
+        ((80, 10, 5, 5), math.inf),  # five points worse: no number of pairs shows it
+    ],
+)
+def test_pairs_to_settle_by_hand(counts: tuple[int, int, int, int], pairs: float) -> None:
+    assert pairs_to_settle(PairedCounts(*counts), 0.03) == pairs
+
+
+def test_pairs_to_settle_are_enough() -> None:
+    """With so many pairs of the same rates the normal interval's lower bound lies at the margin, no further."""
+    counts, margin = np.array([80, 6, 5, 9]), 0.03
+    needed = pairs_to_settle(PairedCounts(*map(int, counts)), margin)
+    low, short = (-0.01 - 1.96 * math.sqrt((0.11 - 0.01**2) / pairs) for pairs in (needed, needed - 1))
+    assert short < -margin <= low
