@@ -27,6 +27,7 @@ from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.errors import UsageError
 from kerv_cli.reporting.measures import MACRO, MICRO
 from kerv_cli.reporting.report import report
+from kerv_cli.reporting.statistics import PairedCounts, paired_difference, wilson
 from kerv_cli.reporting.summary import summary_frame, summary_table
 from kerv_cli.reporting.tables import StudyData, csv_text, load_study, per_task_table, study_table
 from kerv_cli.settings import StudySettings
@@ -120,6 +121,7 @@ def test_one_task_by_hand(data: StudyData) -> None:
         "AFEP": (4 + 2) / 2,  # N where nothing was rejected; the skipped chunk had no verification
         "forwards_per_step": (2 + 3 + 0) / 3,
         "skip_rate": 1 / 3,
+        "unverified_share": (0 + 2 + 4) / 12,  # compensated tokens and a skipped decode's, of three steps of four
         "compensation_rate": 1 / 3,
         "retrieval_share": 1 / 3,
         "deviation": 0.2,
@@ -145,7 +147,7 @@ def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData)
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == 1.0
     assert row["forwards_per_step"] == 4.0
     assert all(math.isnan(row[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
-    assert row["skip_rate"] == 0.0
+    assert row["skip_rate"] == row["unverified_share"] == 0.0
 
 
 def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> None:
@@ -166,6 +168,11 @@ def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> 
     for row in (micro, macro):
         assert (row["both"], row["only_baseline"], row["only_method"], row["neither"]) == (3, 1, 0, 1)
         assert row["mcnemar_p"] == 1.0
+        assert row["difference"] == pytest.approx(3 / 5 - 4 / 5)
+        found = paired_difference(PairedCounts(3, 1, 0, 1))
+        assert (row["difference_low"], row["difference_high"]) == pytest.approx((found.low, found.high))
+        assert (row["margin"], row["non_inferior"]) == (0.03, False)
+        assert row["pairs_to_settle"] == math.inf  # the difference itself lies below the margin
         assert row["task"] == "push-v3;reach-v3"
         assert row["difficulty"] == "easy;hard"
         assert (row["tasks"], row["episodes"], row["pairs"]) == (2, 5, 5)
@@ -251,7 +258,9 @@ def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
         store.write_cell(cell, [still_episode(cell.task, seed, True, [slower]) for seed in cell.seeds], STATUS)
     store.write_plan(StudySettings("hand", "", "ar"), cells)
     row = row_of(per_task_table(load_study(store)), label="kerv")
-    assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (4, 4, 2, "100000-100001")
+    # a repeat is another time, not another world: successes count once
+    assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (2, 4, 2, "100000-100001")
+    assert (row["successes"], row["both"], row["success_low"]) == (2, 2, pytest.approx(wilson(2, 2).low))
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
@@ -316,7 +325,7 @@ def test_summary_on_a_terminal(data: StudyData) -> None:
     assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
     at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
     words = " ".join(lines[at : at + 2]).split()
-    assert {"60", "(23–88)", "4.22", "180", "2.57", "1.86", "14/14/14"} <= set(words)
+    assert {"60", "(23–88)", "4.22", "180", "2.57", "1.86", "14/21/14/14"} <= set(words)
     assert "/ compensated" in " ".join(lines)
 
 
