@@ -155,7 +155,7 @@ def test_one_forward_whatever_is_rejected(wrong: int, use_target_token: bool) ->
 
 @pytest.mark.parametrize("wrong", range(N - 1))
 def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong: int) -> None:
-    """predictor=draft: behind the target's token come the draft's own values to the step's end, but the gripper is held."""
+    """predictor=draft: behind the target's token come the draft's own values; the gripper is held."""
     prompt = prompt_of(3)
     truth = plain_greedy(TARGET, prompt)
     drafted = [(t + 100) % 255 if i == wrong else t if i < wrong else i for i, t in enumerate(truth)]
