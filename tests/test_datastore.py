@@ -695,4 +695,25 @@ def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
     chunks = np.array([[i in (1, 2, 5)] * 3 + [gripper] for i, gripper in enumerate(grippers)], dtype=np.int64)
     tree = neighbour_tree(chunks, 0, SPACE, cross=0.0)
     assert [path[-1] for path in leaves(tree) if path[0] == 1] == [9, 8]
-    assert (list(tree.tokens), list(tree.parents)) == plain_tree(chunks, 0, SPACE, 50, None, 0.0)
+    assert list(tree.tokens) == [0, 0, 0, 8, 1, 1, 1, 9, 8]
+    assert list(tree.parents) == [ROOT, 0, 1, 2, ROOT, 4, 5, 6, 6]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "tokens", "parents"),
+    [
+        (2, [], []),
+        (3, [0, 0, 0], [ROOT, 0, 1]),
+        (6, [0, 0, 0, 8], [ROOT, 0, 1, 2]),  # a group is there whole or not at all
+        (8, [0, 0, 0, 8, 1, 1, 1, 9], [ROOT, 0, 1, 2, ROOT, 4, 5, 6]),
+        (9, [0, 0, 0, 8, 1, 1, 1, 9, 7], [ROOT, 0, 1, 2, ROOT, 4, 5, 6, 6]),
+    ],
+)
+def test_the_most_probable_groups_are_kept_worked_out_by_hand(
+    nodes: int, tokens: list[int], parents: list[int]
+) -> None:
+    """The neighbours weigh 1, 1/2, 1/3, 1/4: 000 has 1.25 of 2.083 and only 8 behind it; 111 has 0.833, of which 9 has
+    1/2 and 7 has 1/3."""
+    chunks = np.array([[0, 0, 0, 8], [1, 1, 1, 9], [1, 1, 1, 7], [0, 0, 0, 8]], dtype=np.int64)
+    tree = neighbour_tree(chunks, 0, SPACE, nodes, cross=0.0)
+    assert (list(tree.tokens), list(tree.parents)) == (tokens, parents)
