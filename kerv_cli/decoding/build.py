@@ -79,8 +79,8 @@ def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
         )
     if chosen["skip"].traits.get("takes_draft") and not draft.traits.get("chains"):
         raise UsageError(
-            f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before the "
-            "prefill, e.g. prefill_draft=early"
+            f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before "
+            "the prefill, e.g. prefill_draft=early"
         )
 
 

@@ -84,9 +84,9 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
     rates = first / pairs, second / pairs
     bounds = wilson(first, pairs, confidence), wilson(second, pairs, confidence)
     product = first * (pairs - first) * second * (pairs - second)
-    surplus = both * neither - only_method * only_baseline
+    surplus = float(both * neither - only_method * only_baseline)
     if surplus > 0:
-        surplus = max(surplus - pairs / 2, 0)
+        surplus = max(surplus - pairs / 2, 0.0)
     phi = surplus / math.sqrt(product) if product else 0.0
 
     def reach(a: float, b: float) -> float:
@@ -99,9 +99,9 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
 
 
 def pairs_to_settle(counts: PairedCounts, margin: float, z: float = 1.96) -> float:
-    """About how many pairs would show non-inferiority at `margin`, if the rates of the four outcomes stayed as they are:
-    the lower bound of the normal interval of the difference then lies at -margin. Infinite where the difference itself
-    lies there or below; NaN without pairs."""
+    """About how many pairs would show non-inferiority at `margin`, if the four outcomes' rates stayed as they are: the
+    lower bound of the normal interval of the difference then lies at -margin. Infinite where the difference itself lies
+    there or below; NaN without pairs."""
     pairs = sum(counts)
     if not pairs:
         return math.nan
