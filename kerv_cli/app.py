@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 
 import typer
 
@@ -35,7 +34,6 @@ app.command("doctor")(doctor.doctor)
 def main() -> None:
     """Entry point of the `kerv` script."""
     app()
-    sys.exit(0)
 
 
 if __name__ == "__main__":

@@ -320,7 +320,10 @@ _add("executor", "slurm", "studies.executors.slurm:build", SlurmOptions, package
 _add("executor", "ray", "studies.executors.ray:build", RayOptions, package="ray", extra="ray")
 
 _BUILD = "decoding.build:"
-_CHAINS = {"when": PREFILL, "chains": True}  # drafts whole chains, so that a merged draft can take it as a source
+_CHAINS: dict[str, Any] = {
+    "when": PREFILL,
+    "chains": True,
+}  # drafts whole chains, so that a merged draft can take it as a source
 
 _add("proposer", "none", _BUILD + "nothing", colour=0x6E7B8B, when=PREFILL)
 _add("proposer", "drafter", _BUILD + "drafter", DrafterProposerSettings, ("drafter",), colour=0x56B4E9, when=STATES)
