@@ -90,7 +90,7 @@ def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[Ep
 
 def _figures(records: list[EpisodeRecord]) -> list[str]:
     steps = sum(r.steps for r in records)
-    rounds = [x for r in records for d in r.decodes for x in d.rounds if x.tree_size and x.mode != "skip"]
+    rounds = [x for r in records for d in r.decodes for x in d.rounds if x.is_verification]
     per_round = [
         f"{sum(getattr(x, field) for x in rounds) / len(rounds):.2f}" if rounds else "–"
         for field in ("committed", "accepted")

@@ -21,7 +21,7 @@ class Ceiling:
     the baseline's prefill and one verification.
     """
 
-    overhead: float  # preprocessing and vision
+    overhead: float  # encoding the observation: the phase vision
     prefill: float
     one_token: float  # T_1, a forward over one token
     tokens: float  # N
@@ -81,7 +81,7 @@ def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, opens: bool, chunks: 
         undrafted = max(0.0, float(episodes["forwards"].sum()) - prefills - verifications)
         own = (_seconds(episodes, "verify") - undrafted * one_token) / verifications
     return Ceiling(
-        overhead=(_seconds(baseline, "preprocess") + _seconds(baseline, "vision")) / decodes,
+        overhead=_seconds(baseline, "vision") / decodes,
         prefill=_seconds(baseline, "prefill") / decodes,
         one_token=one_token,
         tokens=float(baseline["forwards"].sum()) / decodes,
