@@ -390,7 +390,7 @@ def cut(path: Path) -> None:
         (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "an action space with low -2, -1, -1, -1"),
         (lambda m: m["actions"].update(names=["dx", "dy", "yaw", "gripper"]), "with names dx, dy, yaw, gripper"),
         (lambda m: m["actions"].update(strict=[]), "with strict none"),
-        (lambda m: m.update(chunk=8), "holds chunks of 8 steps, the target decodes 4"),
+        (lambda m: m.update(chunk=8), "was built for chunks of 8 steps, not of 4"),
         (lambda m: m["tasks"]["reach-v3"]["seeds"].append(EVALUATION_SEED), "holds seed 100000 of reach-v3"),
         (lambda m: m.update(format=1), "manifest.json is damaged: format"),
         (lambda m: m.update(kind="drafter"), "manifest.json is damaged: kind"),

@@ -9,14 +9,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from kerv_cli.artifacts import Artifact, Request
+from kerv_cli.artifacts import Artifact, MadeFor, Request
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.drafting.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import sha256_of, write_json
 from kerv_cli.manifests import read_file
 from kerv_cli.places import artifact, beside
-from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 
 FORMAT = 2
@@ -25,15 +24,6 @@ NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
 AGAIN = "run 'kerv calibrate' again"
 Errors = dict[str, dict[str, dict[str, list[float]]]]
 """predictor -> task -> DoF -> mean absolute error 1 … H steps ahead, normalised action units."""
-
-
-@dataclass(frozen=True)
-class CalibratedTarget:
-    """The target of a calibration: SHA-256 of its weights, H, and its action space."""
-
-    sha256: str
-    chunk: int
-    actions: ActionSpace
 
 
 @dataclass(frozen=True)
@@ -105,7 +95,7 @@ class SkipSection:
 class Calibration:
     """Contents of `calibration.json`; `boundary` and `skip` are None and `variability` is empty where not measured."""
 
-    target: CalibratedTarget
+    target: MadeFor
     demos: Demonstrations
     window: int  # control steps of history
     noise: dict[str, Noise]  # per kind of filter
@@ -221,17 +211,8 @@ def load_calibration(path: Path, description: TargetDescription) -> Calibration:
         CheckpointError: missing, damaged, of another format, target, action space or chunk length.
     """
     loaded = read_calibration(path)
-    loaded.target.actions.check_same(description.actions, str(path), "the target", statistics=True)
-    if loaded.target.chunk != description.chunk:
-        raise CheckpointError(
-            f"{path} was made for chunks of {loaded.target.chunk} steps, not of {description.chunk}: "
-            "run 'kerv calibrate'"
-        )
-    if loaded.target.sha256 != description.sha256:
-        raise CheckpointError(
-            f"{path} was made for target {loaded.target.sha256[:12]}, not for {description.sha256[:12]}: "
-            "run 'kerv calibrate'"
-        )
+    own = MadeFor(description.sha256, description.actions, description.chunk)
+    loaded.target.check_same(own, str(path), "made", "run 'kerv calibrate'")
     return loaded
 
 

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli import registry
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.environments import spec_of
@@ -250,16 +250,9 @@ def check_target(manifest: Manifest, description: TargetDescription, folder: Pat
     Raises:
         CheckpointError: another chunk length, action space or action statistics, other weights.
     """
-    where = f"the datastore in {folder}"
-    manifest.actions.check_same(description.actions, where, "the target", statistics=True)
-    if manifest.chunk != description.chunk:
-        raise CheckpointError(
-            f"{where} holds chunks of {manifest.chunk} steps, the target decodes {description.chunk}: {AGAIN}"
-        )
-    if manifest.target != description.sha256:
-        raise CheckpointError(
-            f"{where} was built for target {manifest.target[:12]}, not for {description.sha256[:12]}: {AGAIN}"
-        )
+    own = MadeFor(description.sha256, description.actions, description.chunk)
+    made_for = MadeFor(manifest.target, manifest.actions, manifest.chunk)
+    made_for.check_same(own, f"the datastore in {folder}", "built", AGAIN)
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:

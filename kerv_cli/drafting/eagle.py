@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
@@ -158,12 +157,9 @@ def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> Draf
         CheckpointError: none there, a damaged one, one of another target or action space.
     """
     description = read_description(folder, "drafter", DrafterDescription)
-    description.actions.check_same(actions, f"the drafter in {folder}", "the target", statistics=True)
-    if description.target != target_sha256:
-        raise CheckpointError(
-            f"the drafter in {folder} was trained for target {description.target[:12]}, not for "
-            f"{target_sha256[:12]}: train one with 'kerv train drafter policy.target=…'"
-        )
+    made_for, again = MadeFor(description.target, description.actions), "'kerv train drafter policy.target=…'"
+    own = MadeFor(target_sha256, actions)
+    made_for.check_same(own, f"the drafter in {folder}", "trained", f"train one with {again}")
     return description
 
 

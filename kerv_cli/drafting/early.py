@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
@@ -175,17 +175,14 @@ def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:
     Raises:
         CheckpointError: none there, a damaged one, one of another target, chunk or action space.
     """
+    again = "run 'kerv train drafter drafter=early policy.target=…'"
     if not (folder / "early.json").is_file():
-        raise CheckpointError(f"no early drafter in {folder}: run 'kerv train drafter drafter=early policy.target=…'")
-    description = read_description(folder, "early", EarlyDescription)
-    description.actions.check_same(target.actions, f"the early drafter in {folder}", "the target", statistics=True)
-    if (description.target, description.chunk) != (target.sha256, target.chunk):
-        raise CheckpointError(
-            f"the early drafter in {folder} was trained for target {description.target[:12]} and chunks of "
-            f"{description.chunk}, not for {target.sha256[:12]} and {target.chunk}: train one with "
-            "'kerv train drafter drafter=early policy.target=…'"
-        )
-    return description
+        raise CheckpointError(f"no early drafter in {folder}: {again}")
+    own = read_description(folder, "early", EarlyDescription)
+    made_for = MadeFor(own.target, own.actions, own.chunk)
+    wanted = MadeFor(target.sha256, target.actions, target.chunk)
+    made_for.check_same(wanted, f"the early drafter in {folder}", "trained", again)
+    return own
 
 
 def load_early(
