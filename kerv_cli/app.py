@@ -8,7 +8,7 @@ import typer
 
 from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, sweep, train, view
 
-# Before numpy loads: its products run on as many threads as the settings give torch, one; see runtime.threads.
+# Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(

@@ -64,25 +64,17 @@ class Kinematic:
             self.r = self.level(variability)
 
 
-class Change:
+class Change(Kinematic):
     """Ablation: r shrinks when K grows and grows when K shrinks.
 
     r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max), Δ = K_t − K_{t−1} over decodes
     that compared something. An episode begins where `Kinematic` does, with K_{t−1} = K_S.
     """
 
-    def __init__(self, r_min: int, r_max: int, phi: float, k_s: float) -> None:
-        self.r_min, self.r_max, self.phi, self.k_s = r_min, r_max, phi, k_s
-        self.reset()
-
     def reset(self) -> None:
         """r as after a decode with K = K_S, which is also the K to compare with."""
-        self.r = falling(self.r_min, self.r_max, 1.0, self.phi)
+        super().reset()
         self.last = self.k_s
-
-    def radius(self) -> int:
-        """r rounded to the nearest bin."""
-        return nearest(self.r)
 
     def update(self, variability: float | None) -> None:
         """Moves r against the change of K; a decode without K leaves it."""

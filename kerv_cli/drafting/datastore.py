@@ -285,8 +285,7 @@ def neighbour_tree(
     depth: int | None = None,
     cross: float = CROSS,
 ) -> TokenTree:
-    """The neighbours' chunks behind `start` committed tokens as one tree, merged by kinematic group (docs/methods.md
-    §4.2).
+    """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
 
     chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
     neighbour's next one, but a group of strict DoFs always comes from a neighbour that has the group before it, too.
