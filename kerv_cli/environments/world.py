@@ -1,4 +1,4 @@
-"""What every world does alike: an environment writes its start, its step and its frame."""
+"""Bases of worlds: an environment implements the start, the step and the frame of its simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from kerv_cli.spaces import Observation
 
 
 class EpisodeWorld(ABC):
-    """The World protocol (`environments/spec.py`) but for the simulator itself. Not thread-safe."""
+    """Implements the protocol `World` except for the simulator. Methods and properties are as there. Not
+    thread-safe."""
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
@@ -115,7 +116,7 @@ class EpisodeWorld(ABC):
 
 
 class MujocoWorld(EpisodeWorld):
-    """A world with a MuJoCo model: each view gets a graphics context that is kept."""
+    """A world with a MuJoCo model. Each view has a graphics context, opened when it is first drawn."""
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
