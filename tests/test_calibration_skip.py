@@ -5,11 +5,11 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import typer
+from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -19,18 +19,26 @@ from typer.testing import CliRunner
 from kerv_cli.commands.calibrate import calibrate
 from kerv_cli.config import compose
 from kerv_cli.decoding.boundary import BoundaryRanges
-from kerv_cli.decoding.calibration_file import NEVER, Calibration, load_calibration, save_calibration
-from kerv_cli.drafting.datastore import Datastore
+from kerv_cli.decoding.calibration_file import (
+    NEVER,
+    Calibration,
+    Variability,
+    load_calibration,
+    save_calibration,
+)
+from kerv_cli.drafting.datastore import Datastore, Manifest, Shard
 from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UnknownName
-from kerv_cli.files import sha256_of, write_json
+from kerv_cli.files import write_json
 from kerv_cli.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
-from kerv_cli.spaces import CENTRES
+from kerv_cli.spaces import ActionSpace
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels
 
-BIN = float(CENTRES[1] - CENTRES[0])
+SPACE = SPEC.actions
+BIN = 2 / SPACE.tokens
 
 
 def silent(done: int, total: int) -> None:
@@ -50,7 +58,9 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("skipping") / "results"
     shutil.copytree(policies, folder)
     write_dataset(folder / "artifacts/demos/few", make=recognisable_episode)
-    asked = BuildDatastoreSettings(PolicySettings("nano-state"), demos="few", task=list(TASKS), results=str(folder))
+    asked = BuildDatastoreSettings(
+        PolicySettings(target="nano-state"), demos="few", task=list(TASKS), results=str(folder)
+    )
     DatastoreBuild(asked).build()
     return folder
 
@@ -66,7 +76,7 @@ def words(results: Path, *overrides: str) -> list[str]:
 
 
 def calibrated(
-    results: Path, *overrides: str, levels: dict[str, Any] | None = None
+    results: Path, *overrides: str, levels: dict[str, Variability] | None = None
 ) -> tuple[CalibrationRun, Calibration]:
     """A whole run; `levels` in the place of the pre-sampled variability."""
     run = CalibrationRun(compose("calibrate", words(results, *overrides), CalibrateSettings))
@@ -74,11 +84,13 @@ def calibrated(
     return run, run.finish(levels or {}, run.boundary(silent), run.skip(silent))
 
 
-def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, dofs: int = 4) -> Datastore:
+def store_of(similar: np.ndarray, tokens: np.ndarray, seeds: np.ndarray, space: ActionSpace = SPACE) -> Datastore:
     """One task `a`. similar (n,): angle of each entry's key."""
     vectors = np.stack([np.cos(similar), np.sin(similar)], 1).astype(np.float32)
     rows = np.arange(len(tokens))
-    manifest = {"dofs": dofs, "tasks": {"a": {"seeds": sorted(set(seeds.tolist()))}}}
+    files = {"vectors.npy": "v" * 64, "payload.parquet": "p" * 64}
+    shards = {"a": Shard((0, len(rows)), tuple(sorted(set(seeds.tolist()))))}
+    manifest = Manifest(2, "datastore", ("scene",), 2, len(rows), 2, space, "t" * 64, "d" * 64, files, shards)
     return Datastore(manifest, vectors, tokens.astype(np.uint8), seeds, rows, rows, {"a": slice(0, len(rows))})
 
 
@@ -112,15 +124,15 @@ def test_the_bounds_hold_the_level(seed: int, confidence: float, share: float) -
     similarity = rng.random(80).astype(np.float32)
     matches = Matches(similarity, 0.2 * (rng.random(80) > share), rng.random(80) > 0.97)
     row = task_levels(matches, 0.1, confidence)
-    assert row["low"] <= row["s_min"] <= row["high"] <= NEVER
-    skipped = similarity >= row["s_min"]
-    assert row["share"] == pytest.approx(skipped.mean())
-    if row["s_min"] < 1:
+    assert row.low <= row.s_min <= row.high <= NEVER
+    skipped = similarity >= row.s_min
+    assert row.share == pytest.approx(skipped.mean())
+    if row.s_min < 1:
         assert skipped.sum() >= LEAST
-        assert matches.good(0.1)[skipped].mean() == row["within"] >= confidence
-        assert row["high"] <= similarity.max()
+        assert matches.good(0.1)[skipped].mean() == row.within >= confidence
+        assert row.high <= similarity.max()
     else:
-        assert (row["low"], row["high"], row["share"], row["error"]) == (NEVER, NEVER, 0.0, None)
+        assert (row.low, row.high, row.share, row.error) == (NEVER, NEVER, 0.0, None)
 
 
 def test_the_bounds_are_the_levels_of_twice_and_a_third_of_the_wrong_chunks() -> None:
@@ -128,8 +140,8 @@ def test_the_bounds_are_the_levels_of_twice_and_a_third_of_the_wrong_chunks() ->
     wrong = np.concatenate([5 * k * np.arange(100) % 100 < 5 * k for k in range(10)])
     similarity = np.linspace(1, 0, 1000).astype(np.float32)
     row = task_levels(Matches(similarity, wrong * 1.0, np.zeros(1000, bool)), 0.1, 0.9)
-    shares = {key: float((~wrong[similarity >= row[key]]).mean()) for key in ("low", "s_min", "high")}
-    assert row["low"] < row["s_min"] < row["high"]
+    shares = {key: float((~wrong[similarity >= getattr(row, key)]).mean()) for key in ("low", "s_min", "high")}
+    assert row.low < row.s_min < row.high
     assert shares["s_min"] == pytest.approx(0.9, abs=0.003)
     assert shares["high"] == pytest.approx(0.967, abs=0.003)
     assert shares["low"] == pytest.approx(0.8, abs=0.003)
@@ -144,10 +156,12 @@ def test_an_entry_is_compared_with_the_best_of_another_episode() -> None:
     found = match(store_of(angles, own, seeds), "a")
     np.testing.assert_allclose(found.similarity, np.cos([0.5, 0.49, 0.49, 0.59]), atol=1e-6)
     np.testing.assert_allclose(found.error, np.array([30, 30, 30, 1]) * BIN / 8, atol=1e-9)
-    assert found.gripper.tolist() == [False, False, False, True]
+    assert found.strict.tolist() == [False, False, False, True]
     assert found.good(0.04).tolist() == [True, True, True, False]
     assert found.good(0.02).tolist() == [False] * 4
-    assert not match(store_of(angles, own, seeds, dofs=7), "a").gripper.any()
+    seven = np.full((4, 14), 100)
+    seven[0, 4], seven[3, 13] = 110, 101  # entry 0: a rotation; entry 3: the second step's gripper
+    assert match(store_of(angles, seven, seeds, SEVEN), "a").strict.tolist() == [False, False, False, True]
     with pytest.raises(UnknownName, match="task of the datastore"):
         match(store_of(angles, own, seeds), "b")
 
@@ -155,22 +169,23 @@ def test_an_entry_is_compared_with_the_best_of_another_episode() -> None:
 def test_a_single_episode_or_too_few_good_entries_never_skip() -> None:
     tokens = np.full((40, 8), 100)
     lonely = task_levels(match(store_of(np.linspace(0, 1, 40), tokens, np.zeros(40, int)), "a"), 0.1, 0.9)
-    assert (lonely["s_min"], lonely["entries"]) == (NEVER, 0)
+    assert (lonely.s_min, lonely.entries) == (NEVER, 0)
     seeds = np.arange(40) % 2
-    assert task_levels(match(store_of(np.linspace(0, 1, 40), tokens, seeds), "a"), 0.1, 0.9)["share"] == 1.0
+    assert task_levels(match(store_of(np.linspace(0, 1, 40), tokens, seeds), "a"), 0.1, 0.9).share == 1.0
     few = task_levels(match(store_of(np.linspace(0, 1, 19), tokens[:19], seeds[:19]), "a"), 0.1, 0.9)
-    assert (few["s_min"], few["entries"]) == (NEVER, 19)
+    assert (few.s_min, few.entries) == (NEVER, 19)
     tokens[::2] = 200
-    assert task_levels(match(store_of(np.linspace(0, 1, 40), tokens, seeds), "a"), 0.1, 0.9)["s_min"] == NEVER
+    assert task_levels(match(store_of(np.linspace(0, 1, 40), tokens, seeds), "a"), 0.1, 0.9).s_min == NEVER
 
 
 def test_tasks_that_the_datastore_does_not_hold_are_left_out() -> None:
     store = store_of(np.linspace(0, 1, 40), np.full((40, 8), 100), np.arange(40) % 2)
     seen: list[int] = []
-    section = skip_section(store, "d" * 64, ["b", "a"], 0.1, 0.9, lambda done, total: seen.append(done))
-    assert list(section["tasks"]) == ["a"]
+    section = skip_section(store, ["b", "a"], 0.1, 0.9, lambda done, total: seen.append(done))
+    assert section is not None
+    assert (list(section.tasks), section.datastore) == (["a"], store.content)
     assert seen == [1, 2]
-    assert skip_section(store, "d" * 64, ["b"], 0.1, 0.9, silent) == {}
+    assert skip_section(store, ["b"], 0.1, 0.9, silent) is None
 
 
 def test_the_ranges_are_those_of_the_training_episodes(copy: Path) -> None:
@@ -183,49 +198,50 @@ def test_the_ranges_are_those_of_the_training_episodes(copy: Path) -> None:
     with pytest.raises(CheckpointError, match="over 7, 15 positions, the boundary looks at 9: run 'kerv calibrate"):
         made.ranges(9)
     with pytest.raises(CheckpointError, match="no ranges for the boundary"):
-        replace(made, boundary={}).ranges(7)
+        replace(made, boundary=None).ranges(7)
 
 
 def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
     run, made = calibrated(copy, "epsilon=1.9", "confidence=0.5")
     folder = copy / "artifacts/datastore/nano-state"
-    sha256 = sha256_of(folder / "manifest.json")
-    row = made.skip["tasks"]["reach-v3"]
+    assert made.skip is not None
+    row = made.skip.tasks["reach-v3"]
     store = Datastore.open(folder, run.described)
     assert row == task_levels(match(store, "reach-v3"), 1.9, 0.5)
-    assert row["share"] > 0
-    assert made.skip_levels("reach-v3", sha256) == (row["low"], row["s_min"], row["high"])
-    assert load_calibration(run.path, run.described["sha256"], 4) == made
+    assert row.share > 0
+    assert made.skip_levels("reach-v3", store.content) == (row.low, row.s_min, row.high)
+    assert load_calibration(run.path, run.described) == made
     with pytest.raises(
         CheckpointError, match=r"those of datastore .*, not of eeeeeeeeeeee: run 'kerv calibrate' again"
     ):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):
-        made.skip_levels("push-v3", sha256)
+        made.skip_levels("push-v3", store.content)
     with pytest.raises(CheckpointError, match="no skip levels: build a datastore"):
-        replace(made, skip={}).skip_levels("reach-v3", sha256)
+        replace(made, skip=None).skip_levels("reach-v3", store.content)
 
 
 def test_what_cannot_be_computed_now_is_kept(copy: Path) -> None:
-    levels = {name: {"k_s": 0.25, "decodes": 3, "p25": 0.1, "p75": 0.3, "p90": 0.4} for name in TASKS}
+    levels = {name: Variability(0.25, 3, 0.1, 0.3, 0.4) for name in TASKS}
     _, first = calibrated(copy, levels=levels)
     assert "kept" not in first.provenance
     shutil.rmtree(copy / "artifacts/datastore")
     run, second = calibrated(copy, "window=8", "boundary_windows=[5]")
     assert (second.variability, second.skip) == (levels, first.skip)
-    assert (second.window, list(second.boundary["windows"])) == (8, ["5"])
+    assert second.boundary is not None
+    assert (second.window, list(second.boundary.windows)) == (8, ["5"])
     assert [line.endswith("kept from the earlier run") for line in run.notes] == [True, True]
     _, third = calibrated(copy, "window=9")
     assert (third.variability, third.skip) == (levels, first.skip)
     assert third.provenance["kept"] == {"variability": first.provenance, "skip": first.provenance}
-    _, fourth = calibrated(copy, levels={**levels, TASKS[0]: {**levels[TASKS[0]], "k_s": 0.5}})
+    _, fourth = calibrated(copy, levels={**levels, TASKS[0]: replace(levels[TASKS[0]], k_s=0.5)})
     assert fourth.k_s(TASKS[0]) == 0.5
     assert list(fourth.provenance["kept"]) == ["skip"]
 
 
 def test_nothing_is_kept_of_another_target_or_a_damaged_file(copy: Path) -> None:
-    run, made = calibrated(copy, levels={"reach-v3": {"k_s": 0.25}})
-    save_calibration(run.path, replace(made, target={**made.target, "sha256": "f" * 64}))
+    run, made = calibrated(copy, levels={"reach-v3": Variability(0.25, 3, 0.1, 0.3, 0.4)})
+    save_calibration(run.path, replace(made, target=replace(made.target, sha256="f" * 64)))
     run, made = calibrated(copy)
     assert made.variability == {}
     assert run.notes == ["reference levels K_S: decodes=0; left empty"]

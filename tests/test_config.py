@@ -7,8 +7,10 @@ from itertools import chain
 import pytest
 
 from kerv_cli import settings as s
-from kerv_cli.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.decoding.build import registry_kind
 from kerv_cli.errors import UsageError
+from kerv_cli.registry import find, parts
 from kerv_cli.studies.resolve import resolve
 
 SCHEMAS = {
@@ -38,7 +40,13 @@ def test_every_command_has_a_schema_and_composes() -> None:
 def test_every_config_composes(choice: tuple[str, str]) -> None:
     group, name = choice
     command = HOMES.get(group, f"train_{name}" if group == "train" else "rollout")
-    compose(command, [f"{group}={name}"], SCHEMAS[command])
+    settings = compose(command, [f"{group}={name}"], SCHEMAS[command])
+    if group in PART_GROUPS:
+        chosen = getattr(settings, group)
+        part = find(registry_kind(group), chosen.kind)
+        assert type(chosen) is part.settings
+        assert name.startswith(chosen.kind)  # a variant is named after its part
+        assert name in parts(registry_kind(group)) or (conf_dir() / group / f"{name}.yaml").is_file()
 
 
 @pytest.mark.parametrize("study", groups()["study"])
@@ -63,6 +71,10 @@ def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
         (["thresold.r=3"], "did you mean threshold.r"),
         (["episodes=many"], "episodes: Value 'many'"),
         (["world.camera.size=big"], "world.camera.size"),
+        (["threshold.phi=3"], "unknown key 'threshold.phi'"),  # of another threshold
+        (["method=spec_vla", "proposer.neighbours=3"], "unknown key 'proposer.neighbours'"),
+        (["threshold.r=half"], "threshold.r: Value 'half'"),
+        (["proposer=drafter", "proposer.depth=1.5"], "proposer.depth: Value '1.5'"),
         (["nonsense"], "'nonsense' is not an override: write key=value"),
         (["task=[reach"], "input"),
     ],

@@ -244,7 +244,7 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
     shown, instruction = episode("reach-v3", 1, LENGTHS[1]), SPEC.task("reach").instruction
     with torch.inference_mode():
         for step in (0, 4):
-            state, images = shown.states[step], {"corner4": shown.frames[step // 2]}
+            state, images = shown.states[step], dict.fromkeys(target.cameras, shown.frames[step // 2])
             prompt = target.encode(Observation(state[:4], state, instruction, images))
             found = store.query(store.key(prompt, target), "reach-v3", 3)
             assert (found.seeds[0], found.steps[0], found.left[0]) == (1, step, LENGTHS[1] - step)

@@ -148,7 +148,7 @@ def _kept(folder: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # the engine raises nothing more particular
-        raise StorageError(f"datastore.backend=qdrant cannot keep its vectors in {folder}: {_line(error)}") from error
+        raise StorageError(f"datastore=qdrant cannot keep its vectors in {folder}: {_line(error)}") from error
 
 
 def _discard(shard: Any, folder: str) -> None:

@@ -1,0 +1,45 @@
+"""Example: a proposer of your own, with weights of its own, in two files.
+
+This one is light: it says what there is, so that `--cfg`, completion and wrong overrides are answered before torch is
+imported. `KERV_PLUGINS=examples.own_proposer` registers it; then `kerv rollout proposer=follow`,
+`prefill_draft=follow` and `prefill_draft=merged prefill_draft.sources=[follow]` draft with it, and
+`+policy.others.follow=NAME` names its weights where they do not lie beside the target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kerv_cli.errors import UsageError
+from kerv_cli.parts import PREFILL
+from kerv_cli.registry import Part, register
+
+
+@dataclass
+class FollowSettings:
+    """What most often followed an action, one control step later."""
+
+    kind: str = "follow"
+    depth: int = 0  # tokens drafted at once; 0: all that are left
+
+
+def check(settings: FollowSettings) -> None:
+    """Raises UsageError for a number out of range."""
+    if settings.depth < 0:
+        raise UsageError(f"proposer.depth={settings.depth}: at least 0")
+
+
+register(Part("artifact", "follow", "examples.own_proposer_table:ARTIFACT"))
+register(
+    Part(
+        "proposer",
+        "follow",
+        "examples.own_proposer_table:build",
+        FollowSettings,
+        lambda settings: ("follow",),
+        check,
+        colour=0x7A9E2F,
+        traits={"when": PREFILL, "chains": True},
+        about="the token that most often followed: an example",
+    )
+)

@@ -1,0 +1,162 @@
+"""A policy's files: found, checked, and each loaded and hashed once per process, however many settings share them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_calibration import TASKS, write_dataset
+
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.config import compose
+from kerv_cli.drafting.datastore import Datastore
+from kerv_cli.drafting.eagle import Drafter
+from kerv_cli.errors import CheckpointError, UnknownName
+from kerv_cli.parts import QdrantSearchSettings
+from kerv_cli.rollouts.policy import check, decoder_for, identity_of
+from kerv_cli.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings, RolloutSettings
+from kerv_cli.targets import checkpoint
+from kerv_cli.training.calibration import CalibrationRun
+from kerv_cli.training.datastore import DatastoreBuild
+
+STUDY = (
+    "method=ar",
+    "method=spec_vla",
+    "method=spec_vla threshold.r=3",
+    "method=kerv",
+    "method=kerv threshold.k_s=0.3",
+    "method=retrieval_only",
+    "method=heisd skip.s_min=0.9",
+    "method=heisd skip.s_min=0.8 boundary=random",
+    "method=kalman_only",
+)
+
+
+@pytest.fixture(scope="module")
+def whole(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`nano-state` with everything that belongs to it."""
+    results = tmp_path_factory.mktemp("artifacts") / "results"
+    shutil.copytree(policies, results)
+    write_dataset(results / "artifacts/demos/few")
+    policy = PolicySettings(target="nano-state")
+    DatastoreBuild(BuildDatastoreSettings(policy, demos="few", task=list(TASKS), results=str(results))).build()
+    words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", "policy.target=nano-state"]
+    run = CalibrationRun(compose("calibrate", [*words, f"results={results}"], CalibrateSettings))
+    run.load(quiet)
+    run.finish(run.presample(quiet), run.boundary(quiet), run.skip(quiet))
+    return results
+
+
+def quiet(done: int, total: int) -> None:
+    """No progress."""
+
+
+@pytest.fixture
+def results(whole: Path, tmp_path: Path) -> Path:
+    """A copy: other paths, so nothing of it is loaded yet."""
+    return Path(shutil.copytree(whole, tmp_path / "results"))
+
+
+def settings_of(results: Path, overrides: str) -> RolloutSettings:
+    words = ["task=reach", "policy.target=nano-state", f"results={results}", *overrides.split()]
+    return compose("rollout", words, RolloutSettings)
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, counts: Counter[str], key: Any) -> None:
+    real = getattr(owner, name)
+
+    def counting(*arguments: Any, **options: Any) -> Any:
+        counts[key(*arguments, **options)] += 1
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, counting)
+
+
+def test_a_study_loads_and_hashes_everything_once(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: Counter[str] = Counter()
+    hashed: Counter[str] = Counter()
+    counted(monkeypatch, checkpoint, "load_target", loaded, lambda folder, *rest: f"target {folder}")
+    counted(monkeypatch, Datastore, "open", loaded, lambda folder, *rest: f"datastore {folder}")
+    counted(monkeypatch, Drafter, "beside", loaded, lambda *rest: "drafter")
+    counted(monkeypatch, hashlib, "file_digest", hashed, lambda file, algorithm: os.path.relpath(file.name, results))
+    study = [settings_of(results, overrides) for overrides in STUDY]
+    decoders = []
+    for _ in range(2):
+        for asked in study:
+            check(asked)
+            identity_of(asked)
+            decoders.append(decoder_for(asked, "reach-v3"))
+    assert set(loaded.values()) == {1}
+    assert len(loaded) == 3
+    assert set(hashed.values()) == {1}
+    names = {"target/nano-state", "drafter/nano-state", "datastore/nano-state", "calibration/nano-state"}
+    assert {os.path.dirname(path).removeprefix("artifacts/") for path in hashed} == names
+    assert len({id(decoder.target) for decoder in decoders}) == 1
+    assert len({id(decoder) for decoder in decoders}) == len(decoders)  # the state of an episode is a decoder's own
+
+
+def test_only_what_is_needed_is_read(results: Path) -> None:
+    for kind in ("drafter", "datastore", "calibration"):
+        shutil.rmtree(results / "artifacts" / kind)
+    check(settings_of(results, "method=ar"))
+    check(settings_of(results, "method=jacobi"))
+    for overrides, missing in (
+        ("method=spec_vla", "drafter"),
+        ("method=retrieval_only", "datastore"),
+        ("method=kalman_only", "calibration"),
+        ("method=one_pass", "early"),
+    ):
+        with pytest.raises(CheckpointError, match=f"no .*{missing}") as refused:
+            check(settings_of(results, overrides))
+        assert "\n" not in str(refused.value)
+
+
+def test_a_changed_file_is_another_artifact(results: Path) -> None:
+    asked = settings_of(results, "method=retrieval_only")
+    files = Artifacts(asked.results, asked.policy)
+    before, store = identity_of(asked), files.load("datastore")
+    assert files.load("datastore") is store
+    policy = PolicySettings(target="nano-state")
+    built = BuildDatastoreSettings(policy, demos="few", task=list(TASKS), results=str(results), stride=2)
+    DatastoreBuild(built).build()
+    after = identity_of(asked)
+    assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}
+    again = Artifacts(asked.results, asked.policy).load("datastore")
+    assert len(again.vectors) < len(store.vectors)
+
+
+def test_who_searches_is_part_of_what_is_loaded(results: Path) -> None:
+    pytest.importorskip("qdrant_edge")
+    policy = PolicySettings(target="nano-state")
+    exact = Artifacts(str(results), policy).load("datastore")
+    qdrant = Artifacts(str(results), policy, QdrantSearchSettings()).load("datastore")
+    assert exact is not qdrant
+    assert type(exact.index) is not type(qdrant.index)
+    assert exact.content == qdrant.content
+    assert Artifacts(str(results), policy, QdrantSearchSettings()).load("datastore") is qdrant
+
+
+def test_an_artifact_of_another_target_is_refused(results: Path) -> None:
+    for kind in ("drafter", "datastore", "calibration"):
+        shutil.rmtree(results / "artifacts" / kind / "nano-vision", ignore_errors=True)
+        shutil.copytree(results / "artifacts" / kind / "nano-state", results / "artifacts" / kind / "nano-vision")
+        files = Artifacts(str(results), PolicySettings(target="nano-vision"))
+        with pytest.raises(CheckpointError, match=r"for target|different actions") as refused:
+            files.check([kind])
+        assert "\n" not in str(refused.value)
+
+
+def test_an_artifact_can_be_named(results: Path) -> None:
+    shutil.move(results / "artifacts/drafter/nano-state", results / "artifacts/drafter/better")
+    files = Artifacts(str(results), PolicySettings(target="nano-state", drafter="better"))
+    assert files.place("drafter") == results / "artifacts/drafter/better"
+    files.check(["drafter"])
+    by_path = PolicySettings(target="nano-state", others={"drafter": str(results / "artifacts/drafter/better")})
+    assert Artifacts(str(results), by_path).check(["drafter"]) == files.check(["drafter"])
+    with pytest.raises(UnknownName, match="did you mean drafter"):
+        files.check(["draftr"])

@@ -1,0 +1,197 @@
+"""A proposer with weights that is not kerv's: two files under examples/, and everything that kerv's own can do."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from examples import own_proposer
+from examples.own_proposer_table import FollowProposer, FollowTable, save
+from examples.own_target import SEVEN, MockTarget
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
+
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.config import compose, groups
+from kerv_cli.decoding.build import check, needs
+from kerv_cli.decoding.build import compose as compose_decoder
+from kerv_cli.decoding.chunk import Situation
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import MergedProposer, PredictionProposer
+from kerv_cli.drafting.kinematics import ActionHistory, Hold
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.rollouts.policy import identity_of
+from kerv_cli.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.spaces import Observation
+
+
+def settings_of(results: Path, *overrides: str, name: str = "mine") -> RolloutSettings:
+    words = [f"results={results}", "policy.target=nano-state", f"+policy.others.follow={name}", *overrides]
+    return compose("rollout", words, RolloutSettings)
+
+
+def files_of(asked: RolloutSettings) -> Artifacts:
+    return Artifacts(asked.results, asked.policy)
+
+
+@pytest.fixture
+def results(policies: Path, tmp_path: Path) -> Path:
+    """The small policies, and a table of `nano-state`."""
+    copied = Path(shutil.copytree(policies, tmp_path / "results"))
+    random = np.random.default_rng(0)
+    table = FollowTable.fit([random.integers(0, 255, (400, 4))], SPEC.actions)
+    description = files_of(settings_of(copied)).description
+    save(copied / "artifacts/follow/mine", table, description)
+    return copied
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 2, 4]), depth=st.integers(0, 20), data=st.data())
+@pytest.mark.parametrize("place", ["proposer", "prefill_draft", "merged"])
+@pytest.mark.parametrize("mock", [True, False])
+def test_it_is_lossless_wherever_it_drafts(
+    place: str, mock: bool, seed: int, chunk: int, depth: int, data: st.DataObject
+) -> None:
+    if mock:
+        target: Any = MockTarget(SEVEN, chunk=chunk, seed=seed)
+        prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(seed)).double()
+    else:
+        target = random_target(seed, 2, 2, chunk)
+        prompt = random_prompt(target, seed)
+    space, random = target.actions, np.random.default_rng(seed)
+    truth = plain_greedy(target, prompt)
+    before = random.integers(0, space.tokens, (1, space.dofs))
+    steps = np.concatenate([before, np.reshape(truth, (chunk, space.dofs))])
+    own = FollowProposer(FollowTable.fit([steps[: data.draw(st.integers(1, len(steps)))]], space), depth)
+    hold = PredictionProposer(Hold(space.is_strict, minimum=1, horizon=chunk))
+    parts = {
+        "proposer": Parts(proposer=own),
+        "prefill_draft": Parts(prefill_draft=own, proposer=own),
+        "merged": Parts(prefill_draft=MergedProposer([own], 40, [hold])),
+    }[place]
+    decoder, history = Decoder(target, parts), ActionHistory(space.dofs)
+    if data.draw(st.booleans(), "executed"):
+        history.append(space.values_of(before[0]))
+    decoder.situation = Situation("t", history)
+    for _ in range(2):
+        result = decoder.decode_prompt(prompt)
+        assert result.tokens == truth
+        assert_adds_up(result)
+
+
+def test_the_table_holds_what_most_often_followed() -> None:
+    space = SPEC.actions
+    episodes = [
+        np.array([[7, 1, 2, 0], [9, 1, 3, 0], [7, 1, 2, 0], [9, 1, 5, 0]]),
+        np.array([[7, 8, 2, 0], [8, 8, 3, 0]]),
+    ]
+    follows = FollowTable.fit(episodes, space).follows
+    assert [int(follows[0, t]) for t in (7, 9, 8)] == [9, 7, 8]
+    assert [int(follows[2, t]) for t in (2, 3, 5)] == [3, 2, 5]
+    assert int(follows[1, 200]) == 200
+
+
+def test_a_perfect_table_drafts_the_whole_chunk_in_one_forward() -> None:
+    target = MockTarget(SEVEN, chunk=2)
+    prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(3)).double()
+    truth = np.reshape(plain_greedy(target, prompt), (2, 7))
+    before = np.arange(100, 107)
+    decoder = Decoder(target, Parts(prefill_draft=FollowProposer(FollowTable.fit([[before, *truth]], SEVEN))))  # type: ignore[list-item]
+    decoder.situation.history.append(SEVEN.values_of(before))
+    chunk = decoder.decode_prompt(prompt)
+    assert (chunk.forwards, chunk.tokens) == (1, truth.flatten().tolist())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "wanted"),
+    [
+        ("proposer=follow", {"follow"}),
+        ("prefill_draft=follow proposer=drafter", {"follow", "drafter"}),
+        ("prefill_draft=merged prefill_draft.sources=[follow] prefill_draft.fallback=[hold]", {"follow"}),
+    ],
+)
+def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
+    results: Path, overrides: str, wanted: set[str]
+) -> None:
+    asked = settings_of(results, *overrides.split())
+    check(asked.parts(), asked.chunk, 4)
+    assert set(needs(asked.parts())) == wanted
+    identity = identity_of(asked)
+    assert {"target", *wanted} == set(identity) - {"observation"}
+    assert settings_from(as_plain(asked)) == asked
+    files = files_of(asked)
+    assert files.load("follow") is files_of(asked).load("follow")
+    decoder = compose_decoder(asked.parts(), files.target, files.load)
+    plain = Decoder(files.target)
+    state = np.random.default_rng(1).uniform(0, 0.5, 39)
+    for chosen in (decoder, plain):
+        chosen.reset("reach-v3")
+        chosen.observe(np.zeros(4), np.zeros(3))
+    observation = Observation(state[:4], state, "reach the goal")
+    record = decoder.decode(observation)
+    assert record.tokens == plain.decode(observation).tokens
+    assert any(r.proposer == "follow" or r.proposer == "merged" for r in record.rounds)
+
+
+def damage(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda folder: shutil.rmtree(folder), "no follow in"),
+        (lambda folder: damage(folder / "model.safetensors"), "does not match its description"),
+        (lambda folder: damage(folder / "follow.json"), "cannot be read as JSON"),
+    ],
+)
+def test_what_is_missing_or_damaged_gets_one_line(results: Path, change: Any, says: str) -> None:
+    change(results / "artifacts/follow/mine")
+    with pytest.raises(CheckpointError, match=says) as refused:
+        files_of(settings_of(results)).check(["follow"])
+    assert "\n" not in str(refused.value)
+
+
+def test_a_table_of_another_target_or_action_space_is_refused(results: Path) -> None:
+    files = files_of(settings_of(results, "policy.target=nano-vision"))
+    with pytest.raises(CheckpointError, match="is of target"):
+        files.check(["follow"])
+    own = files_of(settings_of(results)).description
+    other = dataclasses.replace(own, actions=dataclasses.replace(own.actions, control_hz=3.0))
+    save(results / "artifacts/follow/slow", FollowTable(4, 255), other)
+    with pytest.raises(CheckpointError, match="control_hz 3"):
+        files_of(settings_of(results, name="slow")).check(["follow"])
+
+
+def test_it_is_a_choice_like_any_other() -> None:
+    known = groups()
+    assert "follow" in known["proposer"]
+    assert "follow" in known["prefill_draft"]
+    with pytest.raises(KervError, match="did you mean follow"):
+        compose("rollout", ["proposer=folow"], RolloutSettings)
+    with pytest.raises(UsageError, match=r"proposer\.depth=-1"):
+        own_proposer.check(own_proposer.FollowSettings(depth=-1))
+
+
+def test_the_command_knows_it_without_loading_anything_heavy() -> None:
+    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    code = "import sys; from kerv_cli.app import main\ntry: main()\nfinally: print('torch' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "rollout", "--cfg", "proposer=follow", "proposer.depth=3"],
+        env={**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": "examples.own_proposer"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "proposer:\n  kind: follow\n  depth: 3\n" in done.stdout
+    assert done.stdout.endswith("False\n")
