@@ -40,8 +40,7 @@ _FINGER = 0.023, 0.012  # metres: the fingers' distance from the middle when clo
 
 
 class InsertionWorld(MujocoWorld):
-    """Task `insert-peg`: the peg is in the hand, the slot is tilted. `fetch-peg`: the peg stands on the table. Methods
-    and properties are as in `World`."""
+    """Task `insert-peg`: the peg is in the hand, the slot is tilted. `fetch-peg`: the peg stands on the table."""
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
@@ -137,6 +136,7 @@ class InsertionWorld(MujocoWorld):
         return self._model, self._data
 
     def close(self) -> None:
+        """As `World.close`."""
         super().close()
         self._model = self._data = None
 

@@ -43,8 +43,7 @@ def _quiet_simulator() -> Any:
 
 
 class MetaWorld(MujocoWorld):
-    """Seed s is task `s % 50` of `MT1(task, seed=s // 50)`. The simulator is built at the first reset. Methods and
-    properties are as in `World`."""
+    """Seed s is task `s % 50` of `MT1(task, seed=s // 50)`. The simulator is built at the first reset."""
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
@@ -80,6 +79,7 @@ class MetaWorld(MujocoWorld):
         return model, data
 
     def close(self) -> None:
+        """As `World.close`."""
         super().close()
         if self._env is not None:
             self._env.close()
