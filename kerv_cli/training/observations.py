@@ -90,12 +90,12 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
     Raises:
         CheckpointError: too few labels were recorded beyond the success.
     """
-    check_tail(episode, chunk, "chunks")
+    check_tail(episode, chunk, f"chunks of {chunk}")
     return np.stack([episode.labels[t : t + chunk] for t in steps])
 
 
 def check_tail(episode: DemoEpisode, steps: int, what: str) -> None:
-    """Checks that `steps` labels follow from every control step of an episode. what: what is made of them, plural.
+    """Checks that an episode has `steps` labels from each of its control steps on. what: their use, for the message.
 
     Raises:
         CheckpointError: too few labels were recorded beyond the success.
@@ -103,7 +103,7 @@ def check_tail(episode: DemoEpisode, steps: int, what: str) -> None:
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:
         raise CheckpointError(
-            f"the demonstrations have {tail} labels behind an episode's end, {what} of {steps} need {steps - 1}: "
+            f"the demonstrations have {tail} labels behind an episode's end, {what} need {steps - 1}: "
             "record them again with a longer tail"
         )
 

@@ -55,7 +55,7 @@ def episode_windows(
         CheckpointError: too few labels were recorded beyond the episode's end.
     """
     steps, dofs = episode.executed.shape
-    check_tail(episode, horizon, "predictions")
+    check_tail(episode, horizon, f"predictions of {horizon} steps")
     if steps <= window:
         return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
     labels = actions.normalise(episode.labels)
