@@ -121,14 +121,18 @@ def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
 
 def test_a_part_gives_its_setting_a_colour_once_and_the_baseline_is_ink(monkeypatch: pytest.MonkeyPatch) -> None:
     drafter = Part("proposer", "drafter", "nowhere:build", colour=0x123456)
+    none = Part("proposer", "none", "nowhere:build", colour=0x6E7B8B)
     monkeypatch.setattr(
-        "kerv_cli.reporting.drawing.parts", lambda kind: {"drafter": drafter} if kind == "proposer" else {}
+        "kerv_cli.reporting.drawing.parts",
+        lambda kind: {"drafter": drafter, "none": none} if kind == "proposer" else {},
     )
-    kinds = {"ar": "none", "spec_vla": "drafter", "hold": "hold", "kerv": "drafter"}
+    kinds = {"ar": "none", "spec_vla": "drafter", "hold": "hold", "kerv": "drafter", "one_pass": "none"}
     rows = [{"label": label, "baseline": "ar", "proposer.kind": kind} for label, kind in kinds.items()]
     shades = setting_colours(rows)
     assert shades[:2] == [INK, "#123456"]
-    assert shades[2:] == list(COLOURS[:2])
+    assert shades[2:] == list(COLOURS[:3])
+    before = [{"label": "one_pass", "baseline": "ar", "prefill_draft.kind": "drafter", "proposer.kind": "none"}]
+    assert setting_colours(before) == ["#123456"]
     assert len(setting_colours([{"label": str(i), "baseline": "ar"} for i in range(30)])) == 30
 
 

@@ -64,8 +64,8 @@ def colour(place: int) -> str:
     return COLOURS[place % len(COLOURS)]
 
 
-_COLOURED = ("policy", "prefill_draft", "proposer")
-"""Kinds of parts that give a setting its colour; their names are in the columns `<kind>.kind`."""
+_COLOURED = {"policy.kind": "policy", "prefill_draft.kind": "proposer", "proposer.kind": "proposer"}
+"""Columns whose parts give a setting its colour -> the kind of those parts."""
 
 
 def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -76,7 +76,8 @@ def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
         if row["label"] == row["baseline"]:
             taken.append(INK)
             continue
-        known = [parts(kind).get(str(row.get(f"{kind}.kind"))) for kind in _COLOURED]
+        names = {column: str(row.get(column)) for column in _COLOURED}
+        known = [parts(_COLOURED[column]).get(name) for column, name in names.items() if name != "none"]
         own = [f"#{part.colour:06x}" for part in known if part is not None and part.colour is not None]
         free = [shade for shade in (*own, *COLOURS) if shade not in taken]
         taken.append(free[0] if free else colour(len(taken)))

@@ -49,15 +49,11 @@ class ProgressDisplay:
             self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
         elif isinstance(event, events.CellDone):
             rate = event.seconds / max(1, event.episodes)
-            result = f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode"
-            self._finish(event.cell, f"{escape(event.cell.label)} on {event.cell.task}: {result}")
+            self._finish(event.cell, f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode")
         elif isinstance(event, events.CellFailed):
-            line = f"{escape(event.cell.label)} on {event.cell.task}: [red]failed[/red]: {escape(event.reason)}"
-            self._finish(event.cell, line)
+            self._finish(event.cell, f"[red]failed[/red]: {escape(event.reason)}")
         elif isinstance(event, events.CellReused):
-            self._finish(event.cell, f"{escape(event.cell.label)} on {event.cell.task}: completed by another sweep")
-        elif isinstance(event, events.SweepFinished) and self._bar is not None:
-            self._bar.stop()
+            self._finish(event.cell, "completed by another sweep")
         self._refresh()
 
     def _start(self, event: events.SweepStarted) -> None:
@@ -78,7 +74,7 @@ class ProgressDisplay:
         self._task = self._bar.add_task("cells", total=event.total)
         self._bar.start()
 
-    def _finish(self, cell: Cell, line: str) -> None:
+    def _finish(self, cell: Cell, result: str) -> None:
         for name, block in list(self._running.items()):
             left = block.without({cell.id})
             if left is None:
@@ -86,8 +82,9 @@ class ProgressDisplay:
             else:
                 self._running[name] = left
         self._finished += 1
-        width = len(str(self._total))
-        self.console.print(f"[dim]{self._finished:{width}}/{self._total}[/dim] {line}", soft_wrap=True, highlight=False)
+        count = f"[dim]{self._finished:{len(str(self._total))}}/{self._total}[/dim]"
+        line = f"{count} {escape(cell.label)} on {cell.task}: {result}"
+        self.console.print(line, soft_wrap=True, highlight=False)
 
     def _refresh(self) -> None:
         if self._bar is None:
