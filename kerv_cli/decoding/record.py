@@ -39,6 +39,11 @@ class Round:
         """The same round when the verdict at the rejected position is not used."""
         return replace(self, committed=self.accepted)
 
+    @property
+    def is_verification(self) -> bool:
+        """Whether the target judged a draft."""
+        return self.tree_size > 0 and self.mode != "skip"
+
 
 @dataclass(frozen=True)
 class DecodeRecord:
@@ -62,13 +67,13 @@ class DecodeRecord:
     @property
     def verifications(self) -> int:
         """Rounds in which a tree was judged by the target."""
-        return sum(1 for r in self.rounds if r.tree_size > 0 and r.mode != "skip")
+        return sum(r.is_verification for r in self.rounds)
 
     @property
     def first_rejected(self) -> int | None:
         """Index in the chunk of the first rejected token of the first verification; N if none; None if no tree."""
         for r in self.rounds:
-            if r.tree_size > 0 and r.mode != "skip":
+            if r.is_verification:
                 return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
         return None
 
