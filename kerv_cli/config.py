@@ -83,6 +83,7 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
 
     store = ConfigStore.instance()
     base = OmegaConf.structured(schema)
+    _open_mappings(base)
     for group in set(PART_GROUPS) & set(base):
         base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
     store.store(name=f"base_{command}", node=base)
@@ -91,6 +92,17 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
             _store_part(group, name, part.settings)
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return hydra_compose(command, overrides=list(overrides))
+
+
+def _open_mappings(node: Any) -> None:
+    """Lets the command line add keys to the untyped mappings of a schema (`runtime.executor_options`, …)."""
+    from omegaconf import DictConfig, OmegaConf
+
+    for child in (node[name] for name in node if not OmegaConf.is_missing(node, name)):
+        if isinstance(child, DictConfig) and OmegaConf.get_type(child) is dict:
+            OmegaConf.set_struct(child, False)
+        elif isinstance(child, DictConfig):
+            _open_mappings(child)
 
 
 @functools.cache

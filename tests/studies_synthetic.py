@@ -8,12 +8,14 @@ import signal
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.environments import settled
 from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.registry import find
 from kerv_cli.settings import RolloutSettings, StudySettings
 from kerv_cli.studies.block import Prepare, RunEpisode
 from kerv_cli.studies.plan import Cell, plan
@@ -25,10 +27,15 @@ IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
 def settings_of(method: str, r: int = 0, episodes: int = 4, proposer: str = "drafter") -> RolloutSettings:
     settings = RolloutSettings(method=method, episodes=episodes)
     settings.world = settled(settings.world, SPEC)
-    settings.proposer.kind = "none" if method == "ar" else proposer
-    settings.acceptance.kind = "relaxed" if r else "strict"
+    settings.proposer = part("proposer", "none" if method == "ar" else proposer)
+    settings.acceptance = part("acceptance", "relaxed" if r else "strict")
     settings.threshold.r = r
     return settings
+
+
+def part(kind: str, name: str, **values: Any) -> Any:
+    """Settings of a registered part."""
+    return find(kind, name).settings(kind=name, **values)
 
 
 def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord]) -> EpisodeRecord:
@@ -77,7 +84,7 @@ def episode(cell: Cell, seed: int) -> EpisodeRecord:
     world = generator(cell.task, seed)
     initial_state, difficulty = world.uniform(size=3), world.uniform()
     rng = generator(cell.task, seed, cell.label)
-    r = cell.settings["threshold"]["r"]
+    r = cell.settings["threshold"].get("r", 9)
     slow = cell.settings["method"] == "ar"
     decodes = tuple(ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25)))
     steps = 4 * len(decodes)
