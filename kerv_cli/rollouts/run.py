@@ -25,7 +25,7 @@ def camera_config(settings: CameraSettings) -> CameraConfig:
 
 
 _WORLDS = 4  # kept open per process: fifty would take 1.2 GB
-_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the one used last at the end
+_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the most recently used one is last
 
 
 def open_world(task: str, settings: WorldSettings) -> World:
