@@ -43,9 +43,9 @@ class Seeds:
         ValueError: two ranges overlap.
     """
 
-    training: range
-    selection: range
-    evaluation: range
+    training: range = range(50_000)
+    selection: range = range(50_000, 100_000)
+    evaluation: range = range(100_000, 2**31)
 
     def __post_init__(self) -> None:
         ordered = sorted((self.training, self.selection, self.evaluation), key=lambda seeds: seeds.start)
@@ -164,12 +164,12 @@ class EnvironmentSpec:
     difficulties: tuple[str, ...]
     horizon: int
     cameras: tuple[str, ...]
-    seeds: Seeds
     world_class: str
     expert_class: str = ""
     upside_down: tuple[str, ...] = ()
     suffix: str = ""
     packages: tuple[str, ...] = ()
+    seeds: Seeds = Seeds()
 
     def full_name(self, task: str) -> str | None:
         """The task's full name; None when it is none of this environment's."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -34,13 +33,6 @@ class ActionDecoder(Protocol):
         """Told at the end of the episode."""
 
 
-@dataclass(frozen=True)
-class Recording:
-    """The camera whose frames an episode keeps, one per control step; None: none."""
-
-    camera: CameraConfig | None = None
-
-
 class _Trace:
     """Collects executed actions, end-effector positions, gripper openings and frames, step by step."""
 
@@ -66,13 +58,16 @@ class _Trace:
             self.frames[len(self.actions)] = self.world.frame(self.camera)
 
 
-def run_episode(world: World, decoder: ActionDecoder, seed: int, recording: Recording | None = None) -> EpisodeRecord:
-    """One closed-loop episode: decodes a chunk, executes it whole, until success or the horizon. Simulation and
-    rendering happen outside the decoder and so outside inference time."""
+def run_episode(world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None) -> EpisodeRecord:
+    """One closed-loop episode: decodes a chunk, executes it whole, until success or the horizon.
+
+    Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
+    record keeps, one per control step; None: none.
+    """
     began = time.perf_counter()
     world.reset(seed)
     decoder.reset(world.task, world.instruction, seed)
-    trace = _Trace(world, recording.camera if recording else None)
+    trace = _Trace(world, camera)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     while not world.done:

@@ -13,7 +13,7 @@ from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
-from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.policy import decoder_for
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
 from kerv_cli.targets.protocol import Target
@@ -25,7 +25,7 @@ def camera_config(settings: CameraSettings) -> CameraConfig:
 
 
 _WORLDS = 4  # kept open per process: fifty would take 1.2 GB
-_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the one used last at the end
+_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the most recently used one is last
 
 
 def open_world(task: str, settings: WorldSettings) -> World:
@@ -57,9 +57,8 @@ class Runner:
     def __init__(self, settings: RolloutSettings, task: str) -> None:
         self.settings, self.task = settings, task
         self.decoder = decoder_for(settings, task)
-        self._recording = Recording(
-            dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
-        )
+        camera = camera_config(settings.world.camera)
+        self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
         """Runs the episode of a seed; its record has frames where it is recorded."""

@@ -41,6 +41,7 @@ from kerv_cli.settings import BuildDatastoreSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_spaces, read_chunks, read_observations
+from kerv_cli.training.skip_levels import neighbours_elsewhere
 
 BATCH = 128  # observations encoded at once
 KEYS = ("vision", "scene", "proprioception")
@@ -213,26 +214,25 @@ class DatastoreBuild:
 
 
 def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
-    """How well an entry's nearest neighbour in *another* episode predicts its chunk; `per_task` evenly spread entries
-    of each task. Shares of tokens, the median similarity, and the median seconds of a search for five neighbours."""
+    """How well the nearest neighbours in other episodes predict the chunks of `per_task` entries of each task: shares
+    of equal tokens and of those within WITHIN bins, the median similarity, and the median time of a search for five
+    neighbours in ms. Empty where no task has two episodes."""
     gaps, similarities, seconds = [], [], []
-    for name, shard in store.shards.items():
-        if len(store.manifest.tasks[name].seeds) < 2:
-            continue
-        for row in np.linspace(shard.start, shard.stop - 1, min(per_task, shard.stop - shard.start)).astype(int):
+    for name in store.shards:
+        rows, similarity, chunks = neighbours_elsewhere(store, name, per_task)
+        gaps.append(np.abs(chunks - store.tokens[rows]))
+        similarities.append(similarity)
+        for row in rows:
             began = time.perf_counter()
             store.query(store.vectors[row], name, 5)
             seconds.append(time.perf_counter() - began)
-            found = store.query(store.vectors[row], name, 1, without=int(store.seeds[row]))
-            gaps.append(np.abs(found.chunks[0] - store.tokens[row]))
-            similarities.append(found.similarity[0])
-    if not gaps:
+    if not seconds:
         return {}
-    gap = np.stack(gaps)
+    gap = np.concatenate(gaps)
     return {
         "token_agreement": float((gap == 0).mean()),
         f"within_{WITHIN}": float((gap <= WITHIN).mean()),
-        "similarity": float(np.median(similarities)),
+        "similarity": float(np.median(np.concatenate(similarities))),
         "query_ms": 1000 * float(np.median(seconds)),
     }
 

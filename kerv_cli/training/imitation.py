@@ -2,7 +2,7 @@
 
 One sample is one recorded control step: the observation, and the expert's next H clean actions as tokens. Validation
 uses held-out *episodes*. Token accuracy does not show success (two policies with the same accuracy can differ by half
-of the tasks), so closed-loop episodes are the score wherever they are asked for.
+of the tasks), so the score is the success of closed-loop episodes where the settings ask for them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WITHIN = 9
 
 @dataclass(frozen=True)
 class Samples(Observations):
-    """The observations that a policy is trained on, and the answers."""
+    """The training data of a policy: observations and the expert's chunks."""
 
     chunks: Tensor  # (n, H, D) float32, the expert's clean actions, environment units
     episodes: Tensor  # (n,) int64, index of the sample's episode

@@ -59,6 +59,7 @@ class Run(ABC):
     """A training run: `load` reads what it needs, `train` optimises and saves the best checkpoint in `folder`. `plan`
     says in one line what would be done."""
 
+    kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
     dataset: DemoDataset
     folder: Path
@@ -90,7 +91,7 @@ class Run(ABC):
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Writes the weights with their provenance; metrics: of their validation."""
         made = {
-            "command": f"kerv train {'target' if isinstance(self, TargetRun) else 'drafter'}",
+            "command": f"kerv train {self.kind}",
             "settings": asdict(self.settings),
             "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
@@ -108,6 +109,7 @@ class TargetRun(Run):
             demonstrations of another environment or camera.
     """
 
+    kind = "target"
     settings: TrainTargetSettings
 
     def __init__(self, settings: TrainTargetSettings) -> None:
@@ -223,7 +225,7 @@ class DrafterRun(Run):
         UsageError: `train.init` is set. CheckpointError: no such target or demonstrations.
     """
 
-    noun = "drafter"
+    kind = noun = "drafter"
     settings: TrainDrafterSettings
 
     def __init__(self, settings: TrainDrafterSettings) -> None:

@@ -37,28 +37,36 @@ class Matches:
         return (self.error <= epsilon) & ~self.strict
 
 
-def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
-    """Leave-one-episode-out: the best neighbour of up to `entries` evenly spread entries of `task`; no rows where the
-    datastore holds a single episode of it.
+def neighbours_elsewhere(store: Datastore, task: str, entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Leave-one-episode-out: up to `entries` evenly spread entries of `task` and their best neighbours in other
+    episodes.
+
+    Rows (n,), cosines (n,) float32 and the neighbours' chunks (n, N) int64; n is 0 where the datastore holds a single
+    episode of the task.
 
     Raises:
         UnknownName: a task that the datastore does not hold.
     """
     if task not in store.shards:
         raise UnknownName("task of the datastore", task, store.shards)
-    shard, space = store.shards[task], store.manifest.actions
-    if len(np.unique(store.seeds[shard])) < 2:
-        return Matches(np.zeros(0, np.float32), np.zeros(0), np.zeros(0, bool))
-    rows = np.linspace(shard.start, shard.stop - 1, min(entries, shard.stop - shard.start)).astype(int)
-    similarity, chunks = [], []
-    for row in rows:
+    shard = store.shards[task]
+    count = min(entries, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
+    rows = np.linspace(shard.start, shard.stop - 1, count).astype(int)
+    similarity, chunks = np.zeros(count, np.float32), np.zeros((count, store.tokens.shape[1]), np.int64)
+    for i, row in enumerate(rows):
         found = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
-        similarity.append(found.similarity[0])
-        chunks.append(found.chunks[0])
-    own, drafted = store.tokens[rows].astype(np.int64), np.stack(chunks)
+        similarity[i], chunks[i] = found.similarity[0], found.chunks[0]
+    return rows, similarity, chunks
+
+
+def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
+    """The entries of `neighbours_elsewhere`, with the neighbours' chunks compared to their own."""
+    space = store.manifest.actions
+    rows, similarity, drafted = neighbours_elsewhere(store, task, entries)
+    own = store.tokens[rows].astype(np.int64)
     error = np.abs(space.values_of(drafted) - space.values_of(own)).mean(1)
     strict = (drafted != own)[:, space.strict_tokens(own.shape[1])].any(1)
-    return Matches(np.array(similarity, np.float32), error, strict)
+    return Matches(similarity, error, strict)
 
 
 def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
