@@ -121,7 +121,7 @@ def decode_of(rounds: list[Round], phases: dict[str, float], mode: str) -> Decod
 def ar_decode(rng: np.random.Generator) -> DecodeRecord:
     rounds = [Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(TOKENS)]
     noise = rng.lognormal(0, 0.1)
-    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "verify": 0.045 * noise, "other": 0.001}
+    phases = {"vision": 0.005, "prefill": 0.012 * noise, "verify": 0.045 * noise, "other": 0.001}
     return decode_of(rounds, phases, "ar")
 
 
@@ -135,7 +135,7 @@ def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
         rounds.append(Round("verify", "drafter", committed, drafted, drafted, accepted, gain, 24, (r, r, r, 0)))
         committed += gain
     noise, cycles = rng.lognormal(0, 0.1), len(rounds) - 1
-    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}
+    phases = {"vision": 0.005, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}
     phases |= {"verify": 0.0055 * cycles * noise, "accept": 0.0004 * cycles, "other": 0.0008}
     return replace(decode_of(rounds, phases, "drafter"), variability=float(rng.uniform()))
 

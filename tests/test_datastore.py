@@ -29,7 +29,8 @@ from kerv_cli.environments.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.parts import ExactSearchSettings, QdrantSearchSettings
+from kerv_cli.parts import QdrantSearchSettings
+from kerv_cli.registry import NoSettings
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.spaces import ActionSpace, Observation
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
@@ -195,7 +196,7 @@ def test_few_rows_are_read_whole() -> None:
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
 def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
     store, _, description = opened(results, name)
-    backends: list[Any] = [ExactSearchSettings()]
+    backends: list[Any] = [NoSettings("exact")]
     if find_spec("qdrant_edge") is not None:
         backends.append(QdrantSearchSettings())
     for chosen in backends:
@@ -389,7 +390,7 @@ def cut(path: Path) -> None:
         (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "an action space with low -2, -1, -1, -1"),
         (lambda m: m["actions"].update(names=["dx", "dy", "yaw", "gripper"]), "with names dx, dy, yaw, gripper"),
         (lambda m: m["actions"].update(strict=[]), "with strict none"),
-        (lambda m: m.update(chunk=8), "holds chunks of 8 steps, the target decodes 4"),
+        (lambda m: m.update(chunk=8), "was built for chunks of 8 steps, not of 4"),
         (lambda m: m["tasks"]["reach-v3"]["seeds"].append(EVALUATION_SEED), "holds seed 100000 of reach-v3"),
         (lambda m: m.update(format=1), "manifest.json is damaged: format"),
         (lambda m: m.update(kind="drafter"), "manifest.json is damaged: kind"),

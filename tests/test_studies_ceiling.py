@@ -44,7 +44,7 @@ def decode(rounds: Sequence[Round], **phases: float) -> DecodeRecord:
 
 
 # per decode: overhead 0.3, prefill 0.4, three forwards of 0.2, and 0.1 that no ceiling counts
-AR = decode([PREFILL, PLAIN, PLAIN, PLAIN], preprocess=0.1, vision=0.2, prefill=0.4, verify=0.6, other=0.1)
+AR = decode([PREFILL, PLAIN, PLAIN, PLAIN], vision=0.3, prefill=0.4, verify=0.6, other=0.1)
 BASELINE = 0.3 + 0.4 + 3 * 0.2
 DECODES = {
     "ar": [AR, AR],

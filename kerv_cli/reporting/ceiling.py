@@ -22,7 +22,7 @@ class Ceiling:
     prefill and one verification.
     """
 
-    overhead: float  # preprocessing and vision
+    overhead: float  # encoding the observation: the phase vision
     prefill: float
     one_token: float  # T_1, a forward over one token
     tokens: float  # N
@@ -82,7 +82,7 @@ def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, chu
         undrafted = max(0.0, float(episodes["forwards"].sum()) - prefills - verifications)
         own = (_seconds(episodes, "verify") - undrafted * one_token) / verifications
     return Ceiling(
-        overhead=(_seconds(baseline, "preprocess") + _seconds(baseline, "vision")) / decodes,
+        overhead=_seconds(baseline, "vision") / decodes,
         prefill=_seconds(baseline, "prefill") / decodes,
         one_token=one_token,
         tokens=float(baseline["forwards"].sum()) / decodes,

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kerv_cli.artifacts import Artifacts
+from kerv_cli.artifacts import Artifacts, MadeFor
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.decoding.build import compose
 from kerv_cli.decoding.calibration_file import (
     BoundarySection,
-    CalibratedTarget,
     Calibration,
     Demonstrations,
     SkipSection,
@@ -221,7 +220,7 @@ class CalibrationRun:
         }
         sections, origins = self._kept({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target=CalibratedTarget(self.described.sha256, chunk, space),
+            target=MadeFor(self.described.sha256, space, chunk),
             demos=Demonstrations(self.dataset.sha256, self.windows.episodes),
             window=self.settings.window,
             noise=noise,
