@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from heapq import heappop, heappush
 from importlib.util import find_spec
@@ -528,6 +531,44 @@ def test_a_failed_exchange_puts_the_old_one_back(copy: Path, monkeypatch: pytest
         DatastoreBuild(asked(copy, episodes=1)).build()
     assert opened(copy)[0].manifest.rows == 52
     assert sorted(p.name for p in folder_of(copy).parent.iterdir()) == ["nano-state", "nano-vision"]
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from kerv_cli.config import compose
+from kerv_cli.settings import BuildDatastoreSettings
+from kerv_cli.training.datastore import DatastoreBuild
+real = Path.rename
+Path.rename = lambda self, target: os._exit(9) if ".new." in self.name else real(self, target)
+DatastoreBuild(compose("build_datastore", sys.argv[1:], BuildDatastoreSettings)).build()
+"""
+
+
+def test_a_kill_between_the_two_renames_loses_nothing(copy: Path) -> None:
+    words = ["policy.target=nano-state", "demos=few", "task=reach", f"results={copy}"]
+    killed = subprocess.run([sys.executable, "-W", "ignore", "-c", KILLED, *words], capture_output=True, timeout=100)
+    assert killed.returncode == 9, killed.stderr
+    assert not folder_of(copy).exists()
+    run = DatastoreBuild(asked(copy))
+    assert opened(copy)[0].manifest.rows == 52
+    run.build()
+    assert opened(copy)[0].manifest.rows == 52
+
+
+@pytest.mark.parametrize("full", ["vectors.npy", "payload.parquet"])
+def test_a_full_disk_is_one_line(copy: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+    @contextmanager
+    def somewhere(path: Path) -> Iterator[Path]:
+        if path.name == full:
+            path.symlink_to("/dev/full")
+        yield path
+
+    monkeypatch.setattr(datastore_build, "atomic_path", somewhere)
+    with pytest.raises(StorageError, match=r"cannot write .*nano-state: the disk is full") as caught:
+        DatastoreBuild(asked(copy)).build()
+    assert "\n" not in str(caught.value)
+    assert opened(copy)[0].manifest.rows == 52
 
 
 def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:

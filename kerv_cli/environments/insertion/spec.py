@@ -1,6 +1,7 @@
-"""Insertion: a free-flying gripper with OpenVLA's seven degrees of freedom, a flat peg and a slot that it fits one way.
+"""Insertion: a free-flying gripper with OpenVLA's seven degrees of freedom, and a flat peg that fits a slot one way
+only.
 
-Small on purpose: it shows that nothing of Meta-World is built into kerv, and its tasks need rotation.
+It is a small second environment beside Meta-World, with other spaces and with tasks that need rotation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Meta-World v3: all numbers of it that anything else needs."""
+"""The specification of Meta-World v3."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ SPEC = EnvironmentSpec(
     tasks=TASKS,
     suites=SUITES,
     difficulties=DIFFICULTIES,
-    horizon=500,  # the simulator refuses the step after
-    # corner4 is the literature's view
+    horizon=500,  # the simulator raises at step 501
+    # corner4 is the view that publications use
     cameras=("corner4", "corner", "corner2", "corner3", "topview", "behindGripper", "gripperPOV"),
     upside_down=("corner", "corner2", "corner3", "corner4"),
     seeds=Seeds(training=range(50_000), selection=range(50_000, 100_000), evaluation=range(100_000, 2**31)),
