@@ -58,11 +58,11 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of the wrong type.
     """
+    _check(command, overrides)
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    _check(command, overrides)
     overrides = [_task_list(word) for word in overrides]
     try:
         settings = OmegaConf.to_object(_composed(command, overrides, schema))

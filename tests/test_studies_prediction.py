@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
-from kerv_cli.decoding.calibration_file import CalibratedTarget, Calibration, Demonstrations, save_calibration
+from kerv_cli.artifacts import MadeFor
+from kerv_cli.decoding.calibration_file import Calibration, Demonstrations, save_calibration
 from kerv_cli.drafting.kinematics import FILTERS, Noise
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
@@ -45,7 +46,7 @@ def calibrate(results: Path, name: str = "made-here") -> Path:
     path = results / "artifacts/calibration" / name / "calibration.json"
     noise = Noise((0.1,) * 4, (1.0,) * 4, (1.0,) * 4)
     calibration = Calibration(
-        target=CalibratedTarget("a" * 64, 2, SPEC.actions),
+        target=MadeFor("a" * 64, SPEC.actions, 2),
         demos=Demonstrations("d" * 64, {t: {"training": 9, "held_out": 1} for t in ("reach-v3", "push-v3")}),
         window=10,
         noise=dict.fromkeys(FILTERS, noise),

@@ -28,13 +28,6 @@ class ActionHistory:
         self.dofs = dofs
         self._actions: deque[np.ndarray] = deque(maxlen=window)
 
-    def __len__(self) -> int:
-        return len(self._actions)
-
-    def reset(self) -> None:
-        """A new episode begins."""
-        self._actions.clear()
-
     def append(self, action: np.ndarray) -> None:
         """An action (D,) in [-1, 1] was executed.
 
