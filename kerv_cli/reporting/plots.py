@@ -18,7 +18,7 @@ from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.scatter import tradeoff_figure
 from kerv_cli.reporting.tables import is_number, rows_of
 
-_PHASE_COLOURS = ("#b8c4d0", "#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
+_PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
 _PANELS = (
     ("speedup", "Speedup", "time per step, baseline ÷ setting", 1.0),
     ("success", "Success", "episodes, % and 95 % interval", 100.0),
