@@ -52,7 +52,6 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
         )
         return
     from kerv_cli.places import results_dir
-    from kerv_cli.viewing.rerun_log import save_episode
 
     folder = results_dir(settings.results) / "rollouts" / settings.method
     seeds = range(settings.seed, settings.seed + settings.episodes)
@@ -62,6 +61,8 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
         for name in tasks:
             for record in run_task(settings, name, seeds):
                 if record.frames:
+                    from kerv_cli.viewing.rerun_log import save_episode  # only a recording needs rerun
+
                     path = folder / f"{record.task}-{record.seed}.rrd"
                     files.append(save_episode(record, path, method=settings.method))
                 records.append(record)
