@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 
 import typer
 
 from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, sweep, train, view
 
-# Before numpy loads: its products run on as many threads as the settings give torch, one; see runtime.threads.
+# Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
@@ -35,7 +34,6 @@ app.command("doctor")(doctor.doctor)
 def main() -> None:
     """Entry point of the `kerv` script."""
     app()
-    sys.exit(0)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""What a policy is made of on disk: the target and the artifacts that belong to it, each loaded and hashed once per
-process, however many settings of a study share them."""
+"""The files of a policy: the target and the artifacts that belong to it, each loaded and hashed once per process,
+however many settings of a study share them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kerv_cli.errors import CheckpointError
 from kerv_cli.places import artifact, beside, find_target
 from kerv_cli.registry import find, load
 from kerv_cli.settings import PolicySettings
+from kerv_cli.spaces import ActionSpace
 
 if TYPE_CHECKING:
     from kerv_cli.targets.checkpoint import TargetDescription
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Request:
-    """Whom an artifact is wanted for. search: settings of who searches a datastore."""
+    """The target that an artifact is wanted for. search: settings of a datastore's search."""
 
     description: TargetDescription
     search: Any = None
@@ -31,9 +33,9 @@ class Request:
 class Artifact:
     """One kind of artifact.
 
-    place: (results, name or None, the target's folder) -> where it lies; None names the one beside the target. check:
-    (place, request) -> its hash, or CheckpointError where it is missing, damaged or another target's. load: (place,
-    request) -> it.
+    place: (results, name or None, the target's folder) -> its path; None names the one beside the target. check: (path,
+    request) -> its hash, or CheckpointError where it is missing, damaged or another target's. load: (path, request) ->
+    the loaded artifact.
     """
 
     kind: str
@@ -49,6 +51,29 @@ def artifact_folder(kind: str) -> Callable[[str, str | None, Path], Path]:
         return artifact(results, kind, name) if name else beside(target, kind)
 
     return place
+
+
+@dataclass(frozen=True)
+class MadeFor:
+    """The target that an artifact was made for: SHA-256 of its weights, its action space, H (0: any)."""
+
+    sha256: str
+    actions: ActionSpace
+    chunk: int = 0
+
+    def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
+        """Refuses another target. what: the artifact in messages. made: e.g. trained. again: the remedy.
+
+        Raises:
+            CheckpointError: another action space, normalisation, chunk length or other weights.
+        """
+        self.actions.check_same(target.actions, what, "the target", statistics=True)
+        if self.chunk != target.chunk:
+            raise CheckpointError(f"{what} was {made} for chunks of {self.chunk} steps, not of {target.chunk}: {again}")
+        if self.sha256 != target.sha256:
+            raise CheckpointError(
+                f"{what} was {made} for target {self.sha256[:12]}, not for {target.sha256[:12]}: {again}"
+            )
 
 
 class Artifacts:
@@ -76,7 +101,7 @@ class Artifacts:
         return _target(self.folder, self.description.sha256, self.device, self.dtype)
 
     def place(self, kind: str) -> Path:
-        """Where the artifact of this kind lies."""
+        """Path of the artifact of this kind."""
         return _kind(kind).place(self.results, self.policy.named(kind), self.folder)
 
     def check(self, kinds: Iterable[str]) -> dict[str, str]:
@@ -90,7 +115,11 @@ class Artifacts:
         return found | {kind: _kind(kind).check(self.place(kind), request) for kind in kinds}
 
     def load(self, kind: str) -> Any:
-        """The artifact, for the loaded target; the same object for everybody in this process."""
+        """The artifact, for the loaded target; one object per process.
+
+        Raises:
+            CheckpointError: as `check`.
+        """
         digest = self.check([kind])[kind]
         return _artifact(kind, self.place(kind), digest, _Owner(self.folder, self.device, self.dtype, self.search))
 

@@ -1,12 +1,13 @@
-"""The only place that knows Hydra: compose a command's YAML files, check overrides, expand a grid.
+"""The only module that uses Hydra: it composes a command's YAML files, checks overrides, expands a grid.
 
-Typer owns the process and the messages. An override is checked before torch or MuJoCo load; a wrong one gives one line
-with the nearest known keys.
+Typer owns the process and the messages. Overrides are checked before torch or MuJoCo load; a wrong one is answered by
+one line with the nearest known keys.
 """
 
 from __future__ import annotations
 
 import difflib
+import functools
 import itertools
 import os
 from collections.abc import Iterator, Sequence
@@ -15,13 +16,17 @@ from typing import Any, TypeVar
 
 from kerv_cli import registry
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.parts import METHOD_KINDS, PREFILL
+from kerv_cli.parts import PART_GROUPS, PREFILL
 
 T = TypeVar("T")
 
 
 def conf_dir() -> Path:
-    """`$KERV_CONF_DIR`, else the checkout's `conf/`, else the one inside the installed package."""
+    """`$KERV_CONF_DIR`, else the checkout's `conf/`, else the one inside the installed package.
+
+    Raises:
+        UsageError: no configuration there.
+    """
     chosen = os.environ.get("KERV_CONF_DIR")
     package = Path(__file__).resolve().parent
     places = [Path(chosen).resolve()] if chosen else [package.parent / "conf", package / "conf"]
@@ -29,10 +34,6 @@ def conf_dir() -> Path:
         if (place / "rollout.yaml").is_file():
             return place
     raise UsageError(f"no configuration in {' or '.join(map(str, places))}: set KERV_CONF_DIR to a folder like conf/")
-
-
-PART_GROUPS = (*METHOD_KINDS, "datastore")
-"""Config groups whose choices are the registry's parts; YAML files in them are further choices."""
 
 
 def groups() -> dict[str, list[str]]:
@@ -45,7 +46,7 @@ def groups() -> dict[str, list[str]]:
 
 
 def _parts_of(group: str) -> dict[str, registry.Part]:
-    """The parts that a group may choose, by name; before the prefill only what needs no states of the target."""
+    """The parts that a group may choose, by name; in-prefill drafts are proposers that need no states of the target."""
     if group != "prefill_draft":
         return dict(registry.parts(group))
     return {name: part for name, part in registry.parts("proposer").items() if part.traits.get("when") == PREFILL}
@@ -57,11 +58,11 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of the wrong type.
     """
+    _check(command, overrides)
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    _check(command, overrides)
     overrides = [_task_list(word) for word in overrides]
     try:
         settings = OmegaConf.to_object(_composed(command, overrides, schema))
@@ -82,20 +83,43 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
 
     store = ConfigStore.instance()
     base = OmegaConf.structured(schema)
+    _open_mappings(base)
     for group in set(PART_GROUPS) & set(base):
         base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
     store.store(name=f"base_{command}", node=base)
     for group in PART_GROUPS:
         for name, part in _parts_of(group).items():
-            store.store(group=group, name=name, node=part.settings(kind=name))
+            _store_part(group, name, part.settings)
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return hydra_compose(command, overrides=list(overrides))
+
+
+def _open_mappings(node: Any) -> None:
+    """Lets the command line add keys to the untyped mappings of a schema (`runtime.executor_options`, …)."""
+    from omegaconf import DictConfig, OmegaConf
+
+    for child in (node[name] for name in node if not OmegaConf.is_missing(node, name)):
+        if isinstance(child, DictConfig) and OmegaConf.get_type(child) is dict:
+            OmegaConf.set_struct(child, False)
+        elif isinstance(child, DictConfig):
+            _open_mappings(child)
+
+
+@functools.cache
+def _store_part(group: str, name: str, settings: type) -> None:
+    """Once per process: a study composes many settings, and storing all parts takes a sixth of a composition."""
+    from hydra.core.config_store import ConfigStore
+
+    ConfigStore.instance().store(group=group, name=name, node=settings(kind=name))
 
 
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
     """Hydra's grid grammar -> one override list per point: `threshold.r=0,3` or `threshold.r=range(0,4)`.
 
     A string is split at white space outside quotes.
+
+    Raises:
+        UsageError: an override that cannot be parsed.
     """
     import shlex
 
@@ -135,7 +159,7 @@ def to_yaml(settings: Any) -> str:
 
 
 def _check(command: str, overrides: Sequence[str]) -> None:
-    """Group choices first: Hydra's own message about a missing file is long."""
+    """Refuses unknown group choices before Hydra sees them: its own message about a missing file is long."""
     known = groups()
     for word in overrides:
         if "=" not in word:
@@ -146,12 +170,13 @@ def _check(command: str, overrides: Sequence[str]) -> None:
 
 
 def _task_list(word: str) -> str:
-    """`task=reach` and `task=reach,push` are lists of tasks without the brackets."""
+    """Adds the brackets that `task=reach` and `task=reach,push` leave out."""
     key, value = word.split("=", 1)
     return f"task=[{value}]" if key == "task" and not value.startswith("[") else word
 
 
 def _explained(command: str, error: Exception, overrides: Sequence[str], schema: type) -> UsageError:
+    """Names the first unknown key and the nearest known ones; without one, Hydra's own message on one line."""
     from hydra.errors import HydraException
 
     choices = [word for word in overrides if word.split("=", 1)[0] in groups()]

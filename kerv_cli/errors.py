@@ -1,4 +1,4 @@
-"""Every error that kerv raises on purpose. The command line prints one line for each and exits with its code."""
+"""The errors that kerv raises deliberately. The command line prints one line for each and exits with its code."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class KervError(Exception):
-    """Something failed while the command ran. Message: what, where, what to do, in one line."""
+    """A failure while a command ran. The message names cause, place and remedy in one line."""
 
     exit_code = 1
 
@@ -29,7 +29,7 @@ class UnknownName(UsageError):
         super().__init__(f"unknown {kind} '{name}': {hint}")
 
     def __reduce__(self) -> tuple[type[UnknownName], tuple[str, str, list[str]]]:
-        return UnknownName, self._arguments  # so that it crosses from a worker process as it is
+        return UnknownName, self._arguments  # pickled by these: worker processes hand it on
 
 
 class RenderingUnavailable(KervError):
@@ -41,4 +41,4 @@ class CheckpointError(KervError):
 
 
 class StorageError(KervError):
-    """The disk refused: full, read-only, or not permitted."""
+    """Writing failed: the disk is full or read-only, or permission is missing."""

@@ -1,4 +1,4 @@
-"""Files that are either complete or absent: atomic writes, JSON, hashes."""
+"""Atomic writes (a file is complete or absent), JSON, hashes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _REFUSALS = {
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turns the disk's refusals (full, read-only, not permitted) into a StorageError that names `path`."""
+    """Turns OSErrors of a full, read-only or protected disk into a StorageError that names `path`."""
     try:
         yield
     except OSError as error:
@@ -64,7 +64,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Brings a file or a folder's entries to the disk."""
+    """fsync of a file, or of a folder's entries."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -73,10 +73,10 @@ def sync(path: Path) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as indented JSON, atomically; refuses NaN and infinity, which JSON has not.
+    """Writes `value` as indented JSON, atomically; refuses NaN and infinity, which JSON lacks.
 
     Raises:
-        StorageError: as in `atomic_path`.
+        StorageError: as in `atomic_path`. ValueError: NaN or infinity.
     """
     text = json.dumps(value, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
@@ -98,7 +98,7 @@ def read_json(path: Path) -> Any:
 
 
 def sha256_of(path: Path) -> str:
-    """Hex SHA-256 of a file's bytes; read once per process as long as the file stays as it is.
+    """Hex SHA-256 of a file's bytes; read once per process as long as inode, size and time of change stay the same.
 
     Raises:
         CheckpointError: the file is missing or unreadable.

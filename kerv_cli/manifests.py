@@ -1,4 +1,4 @@
-"""Every JSON that describes an artifact is read through one schema: a dataclass, checked field by field."""
+"""Reads JSON that describes an artifact into a dataclass, checked field by field."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _adapter(kind: Any) -> Any:
 
 
 def _forbid_unknown(kind: Any) -> None:
-    """Marks a dataclass and those in its fields: a field that they do not know, or a number that is none, is damage."""
+    """Makes pydantic refuse unknown fields and NaN or infinity in a dataclass and in those that its fields hold."""
     if dataclasses.is_dataclass(kind) and not hasattr(kind, "__pydantic_config__"):
         setattr(kind, "__pydantic_config__", {"extra": "forbid", "allow_inf_nan": False})  # noqa: B010
         for hint in get_type_hints(kind).values():

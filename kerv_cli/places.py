@@ -1,4 +1,4 @@
-"""Where things lie below the results folder (ARCHITECTURE, On disk)."""
+"""Paths below the results folder (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from kerv_cli.errors import CheckpointError, UsageError
 
 
 def results_dir(results: str) -> Path:
+    """The results folder.
+
+    Raises:
+        UsageError: it is a file.
+    """
     path = Path(results).expanduser()
     if path.exists() and not path.is_dir():
         raise UsageError(f"results={results} is a file: name a folder")
@@ -15,7 +20,7 @@ def results_dir(results: str) -> Path:
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
-    """The folder of something trained or built; a name with a slash is a path of its own."""
+    """Folder of a trained or built artifact: results/artifacts/<kind>/<name>, or `name` itself with a slash in it."""
     if "/" in name:
         return Path(name).expanduser()
     return results_dir(results) / "artifacts" / kind / name
@@ -27,7 +32,7 @@ def shipped_dir() -> Path:
 
 
 def find_target(results: str, name: str) -> Path:
-    """The target's folder: a path, a freshly trained artifact, else what the project ships.
+    """Folder of the target `name`: `name` itself if it is a path, else an artifact, else a shipped policy.
 
     Raises:
         CheckpointError: nothing of that name; the line lists what there is.
@@ -35,11 +40,8 @@ def find_target(results: str, name: str) -> Path:
     if "/" in name:
         places = [Path(name).expanduser()]
     else:
-        places = [
-            artifact(results, "target", name),
-            results_dir(results) / "pretrained" / name / "target",
-            shipped_dir() / name / "target",
-        ]
+        shipped = (folder / name / "target" for folder in (results_dir(results) / "pretrained", shipped_dir()))
+        places = [artifact(results, "target", name), *shipped]
     for place in places:
         if (place / "target.json").is_file():
             return place
@@ -52,8 +54,8 @@ def find_target(results: str, name: str) -> Path:
 
 
 def beside(target: Path, kind: str) -> Path:
-    """The folder of this kind that belongs to the target. Shipped: pretrained/<name>/{target,<kind>}; trained:
-    artifacts/target/<name> and artifacts/<kind>/<name>; else a folder inside the target's."""
+    """Folder of the artifact `kind` of a target: its sibling in a shipped policy (pretrained/<name>/{target,<kind>}),
+    artifacts/<kind>/<name> for a trained one (artifacts/target/<name>), else a subfolder."""
     if target.name == "target":
         return target.parent / kind
     return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind

@@ -1,20 +1,21 @@
 """What kerv is put together from: parts of a method, artifacts, targets, environments and executors, by kind and name.
 
-Light: names, settings and needs are known without torch or MuJoCo. `build` names a function, `module:function`, which
-is imported when the part is built. Everything that depends on which parts there are derives from here: what a method
-loads, the identity of its results, which compositions are refused, completion, `--cfg`, colours.
+Names, settings and needs are known without importing torch or MuJoCo. `build` names a function, `module:function`,
+whose module is imported when the part is built. Everything that depends on which parts there are derives from here:
+what a method loads, the identity of its results, which compositions are refused, completion, `--cfg`, colours.
 
 A package adds parts by an entry point of the group `kerv.parts`, a file by `KERV_PLUGINS=module,…`: the module is
-imported and registers what it has.
+imported and registers its parts.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
+import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -23,9 +24,16 @@ from kerv_cli.errors import UnknownName, UsageError
 PLUGINS = "KERV_PLUGINS"
 
 
-@dataclass(frozen=True)
+@dataclass
 class NoSettings:
-    """A part without settings."""
+    """A part without settings but its name."""
+
+    kind: str = "none"
+
+
+def number(default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> Any:
+    """A field of a part's settings with limits: least ≤ value ≤ most and value > above; None is let through."""
+    return field(default=default, metadata={"limits": (least, most, above)})
 
 
 def nothing(settings: Any) -> tuple[str, ...]:
@@ -35,13 +43,13 @@ def nothing(settings: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Part:
-    """One way to do one thing.
+    """One choice among the parts of a kind.
 
-    kind: what it is a way of: proposer, acceptance, threshold, rectifier, boundary, skip, predictor, artifact, target,
-    policy, environment, executor. settings: dataclass of its settings, with defaults. build: `module:function`; what it
-    is called with is documented with the kind. needs: artifact kinds that these settings need. check: raises UsageError
-    for numbers out of range. colour: 0xRRGGBB of its rows, lines and timeline. traits: what else the kind wants to
-    know, e.g. when a proposer can draft.
+    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
+    environment or executor. build: `module:function`; its arguments are documented where the kind is used. settings:
+    dataclass of its settings, with defaults; limits by `number`. needs: artifact kinds that these settings need. check:
+    raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines and timeline. traits:
+    further properties that the kind asks for, e.g. when a proposer can draft.
     """
 
     kind: str
@@ -52,18 +60,34 @@ class Part:
     check: Callable[[Any], None] | None = None
     colour: int | None = None
     traits: Mapping[str, Any] = field(default_factory=dict)
-    about: str = ""  # one line
 
     def built(self, *arguments: Any, **keywords: Any) -> Any:
         """Imports and calls `build`."""
         return load(self.build)(*arguments, **keywords)
+
+    def check_settings(self, settings: Any, what: str) -> None:
+        """Checks every number against its limits, then `check`. what: how messages call the settings.
+
+        Raises:
+            UsageError: a number out of range, or settings that do not fit together.
+        """
+        for name, limits in ((f.name, f.metadata["limits"]) for f in fields(settings) if "limits" in f.metadata):
+            value, (least, most, above) = getattr(settings, name), limits
+            if value is None or (least <= value <= most and value > above):
+                continue
+            wanted = "a number" if math.isinf(least) else f"at least {least:g}"
+            if not math.isinf(most):
+                wanted = f"from {least:g} to {most:g}" if math.isinf(above) else f"above {above:g}, at most {most:g}"
+            raise UsageError(f"{what}.{name}={value}: {wanted}")
+        if self.check is not None:
+            self.check(settings)
 
 
 _PARTS: dict[str, dict[str, Part]] = {}
 
 
 def register(part: Part) -> Part:
-    """Adds a part. A name can be registered again by the same code, e.g. when a module is reloaded.
+    """Adds a part. The same code can register a name again, e.g. when a module is reloaded.
 
     Raises:
         UsageError: another part of that kind has the name.
@@ -76,7 +100,7 @@ def register(part: Part) -> Part:
 
 
 def load(name: str) -> Any:
-    """What `module:attribute` names.
+    """Imports the object that `module:attribute` names.
 
     Raises:
         UsageError: no such module or attribute.
@@ -92,10 +116,10 @@ def load(name: str) -> Any:
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
-    """The part of that kind and name.
+    """The part of that kind and name. what: how the message calls the kind.
 
     Raises:
-        UnknownName: there is none; the message names the nearest ones. what: how the message calls the kind.
+        UnknownName: there is none; the message names the nearest ones.
     """
     known = parts(kind)
     if name not in known:

@@ -1,4 +1,4 @@
-"""Device, dtype and threads, set deliberately and once per process."""
+"""Device, dtype and threads of a process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 
 
 def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
-    """Apply `settings` to this process -> (device, dtype).
+    """Applies `settings` to this process -> (device, dtype).
 
     Raises:
         UsageError: no such device here, unknown dtype, thread count below one.

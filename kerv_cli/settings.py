@@ -1,6 +1,6 @@
-"""Every setting a command can take, as plain dataclasses. The YAML files under `conf/` fill them.
+"""The settings of every command, as plain dataclasses; the YAML files under `conf/` hold what differs from them.
 
-Nothing heavy is imported here: a wrong override must be answered before torch or MuJoCo load.
+Nothing heavy is imported here: a wrong override is answered before torch or MuJoCo load.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from kerv_cli import manifests, parts, registry
+from kerv_cli import manifests, parts
+from kerv_cli.registry import NoSettings
 
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
@@ -17,6 +18,8 @@ EVALUATION_SEED = 100_000
 
 @dataclass
 class CameraSettings:
+    """The policy's view: a camera of the environment, vertical field of view in degrees, pixels, supersampling."""
+
     name: str = ""  # empty: the environment's first camera
     fovy: float = 45.0
     size: int = 96  # pixels, square
@@ -25,18 +28,43 @@ class CameraSettings:
 
 @dataclass
 class WorldSettings:
+    """The simulated world of an episode."""
+
     camera: CameraSettings = field(default_factory=CameraSettings)
     horizon: int = 0  # control steps; 0: the environment's
 
 
 @dataclass
 class RuntimeSettings:
+    """Device, number format and parallelism of a process."""
+
     device: str = "cpu"  # cpu | cuda | auto
     dtype: str = "float32"
     threads: int = 1  # torch threads of each process
-    executor: str = "local"  # sweeps: who runs the blocks: local (processes here) | slurm | ray
+    executor: str = "local"  # sweeps: what runs the blocks: local (processes here) | slurm | ray
     workers: int = 1  # sweeps: blocks that run at the same time
     executor_options: dict[str, Any] = field(default_factory=dict)  # see SlurmOptions, RayOptions in parts.py
+
+
+@dataclass(kw_only=True)
+class CommandSettings:
+    """Settings of every command."""
+
+    results: str = "results"
+
+
+@dataclass(kw_only=True)
+class RunSettings(CommandSettings):
+    """Settings of every command that computes."""
+
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+
+
+@dataclass(kw_only=True)
+class TaskSettings(RunSettings):
+    """Settings of every command that works on tasks."""
+
+    task: list[str] = field(default_factory=lambda: ["MT10"])  # task names and suites
 
 
 MODEL, EXPERT = "model", "expert"
@@ -44,7 +72,7 @@ MODEL, EXPERT = "model", "expert"
 
 @dataclass
 class PolicySettings:
-    """Who acts. Weights are named by what lies under results/pretrained or results/artifacts, or by a folder."""
+    """What chooses the actions. Weights are named by folders of results/pretrained or results/artifacts, or paths."""
 
     kind: str = MODEL  # model | expert (the environment's scripted policy: privileged, the reference of success)
     target: str = "mt10-vision"
@@ -55,41 +83,38 @@ class PolicySettings:
     others: dict[str, str] = field(default_factory=dict)  # artifacts of parts that are not kerv's: kind -> name
 
     def named(self, kind: str) -> str | None:
-        """The artifact of this kind that is asked for by name."""
+        """The name given for the artifact of this kind, None without one."""
         return self.others.get(kind) or getattr(self, kind, None)
 
 
 @dataclass
-class RolloutSettings:
+class RolloutSettings(TaskSettings):
     """`kerv rollout`: episodes of one method. Its parts are settings of the classes in kerv_cli/parts.py."""
 
-    task: list[str] = field(default_factory=lambda: ["MT10"])  # task names and suites
     episodes: int = 3  # per task
     seed: int = EVALUATION_SEED  # first seed; episode i uses seed + i in every setting: that is the pairing
     policy: PolicySettings = field(default_factory=PolicySettings)
     method: str = "ar"  # name of the composition; its parts follow
-    prefill_draft: Any = field(default_factory=parts.Nothing)  # a proposer, before the prefill
-    proposer: Any = field(default_factory=parts.Nothing)
-    acceptance: Any = field(default_factory=parts.StrictAcceptanceSettings)
+    prefill_draft: Any = field(default_factory=NoSettings)  # a proposer, before the prefill
+    proposer: Any = field(default_factory=NoSettings)
+    acceptance: Any = field(default_factory=lambda: NoSettings("strict"))
     threshold: Any = field(default_factory=parts.FixedThresholdSettings)
-    rectifier: Any = field(default_factory=parts.ReinferSettings)
-    boundary: Any = field(default_factory=parts.ConstantBoundarySettings)
-    skip: Any = field(default_factory=parts.Nothing)
+    rectifier: Any = field(default_factory=lambda: NoSettings("reinfer"))
+    boundary: Any = field(default_factory=lambda: NoSettings("always"))
+    skip: Any = field(default_factory=NoSettings)
     chunk: int = 0  # H, control steps decoded at once; 0: as many as the target was trained for
-    datastore: Any = field(default_factory=parts.ExactSearchSettings)
+    datastore: Any = field(default_factory=lambda: NoSettings("exact"))
     world: WorldSettings = field(default_factory=WorldSettings)
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     deviation_every: int = 0  # decodes between two deviation samples; 0: never
     record: int = 1  # episodes per task that are saved as .rrd; -1: all
     record_size: int = 240  # pixels of the logged camera
-    results: str = "results"
 
     def __post_init__(self) -> None:
         if self.policy.kind == EXPERT:
-            self.method = EXPERT  # it decodes nothing: no method is a name for what it does
+            self.method = EXPERT  # it decodes nothing, so that no method's name fits
 
     def parts(self) -> dict[str, Any]:
-        """Kind -> settings of the method's parts: what a decoder is composed of."""
+        """Kind -> settings, for every part of the method."""
         return {kind: getattr(self, kind) for kind in parts.METHOD_KINDS}
 
 
@@ -108,11 +133,10 @@ class StudySettings:
 
 
 @dataclass
-class SweepSettings:
+class SweepSettings(CommandSettings):
     """`kerv sweep`: a study. Everything else on the command line goes to each of its settings."""
 
     study: StudySettings = field(default_factory=StudySettings)
-    results: str = "results"
 
 
 @dataclass
@@ -145,7 +169,7 @@ class TrainSettings:
     weight_decay: float = 0.02
     clip: float = 1.0
     ema: float = 0.999
-    init: str | None = None  # target whose weights the run begins with; its chunk may be shorter or longer
+    init: str | None = None  # target that gives the initial weights; its chunk may be shorter or longer
     label_sigma: float = 1.0  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
     scene_weight: float = 1.0  # weight of the position loss (vision only)
     scene_steps: int = 0  # first steps that train only the vision encoder, on positions
@@ -158,32 +182,26 @@ class TrainSettings:
 
 
 @dataclass
-class TrainTargetSettings:
+class TrainTargetSettings(TaskSettings):
     """`kerv train target`."""
 
     name: str = "mt10-vision"
     demos: str = "mt10"
-    task: list[str] = field(default_factory=lambda: ["MT10"])
     target: TargetSettings = field(default_factory=TargetSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
     world: WorldSettings = field(default_factory=WorldSettings)
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    results: str = "results"
 
 
 @dataclass
-class DemosSettings:
+class DemosSettings(TaskSettings):
     """`kerv demos`."""
 
     name: str | None = None  # default: the tasks' names, in small letters
-    task: list[str] = field(default_factory=lambda: ["MT10"])
     episodes: int = 100  # per task
     seed: int = 0
     perturbed: float = 0.5
     frame_stride: int = 2
     world: WorldSettings = field(default_factory=WorldSettings)
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    results: str = "results"
 
 
 @dataclass
@@ -195,7 +213,7 @@ class DrafterSettings:
     layers: int = 1
     width: int = 512  # early: hidden units
     rank: int = 64  # early: features per token in front of the bins
-    history: int = 2  # early: last executed actions it is shown
+    history: int = 2  # early: last executed actions it reads
     noise: float = 0.0  # uniform noise on the input states, training only
     unroll: int = 3  # passes that feed the drafter its own predicted states, as drafting does; 1: the paper's
     samples: int = 12_000  # observations whose greedy decodes it is trained on
@@ -204,67 +222,56 @@ class DrafterSettings:
 
 
 @dataclass
-class TrainDrafterSettings:
+class TrainDrafterSettings(RunSettings):
     """`kerv train drafter`."""
 
-    policy: PolicySettings = field(default_factory=PolicySettings)  # policy.drafter: where the drafter is put
+    policy: PolicySettings = field(default_factory=PolicySettings)  # policy.drafter: name of the new drafter
     demos: str = "mt10"
     drafter: DrafterSettings = field(default_factory=DrafterSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    results: str = "results"
 
 
 @dataclass
-class DoctorSettings:
+class DoctorSettings(RunSettings):
     """`kerv doctor`."""
 
     seed: int = EVALUATION_SEED
     world: WorldSettings = field(default_factory=WorldSettings)
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    results: str = "results"
 
 
 @dataclass
-class ReportSettings:
+class ReportSettings(CommandSettings):
     """`kerv report`."""
 
     only: str | None = None  # name of one study (study=NAME on the command line); default: all that are there
-    results: str = "results"
 
 
 @dataclass
-class ViewSettings:
+class ViewSettings(CommandSettings):
     """`kerv view`."""
 
-    results: str = "results"
-
 
 @dataclass
-class BuildDatastoreSettings:
-    """`kerv build datastore` (METHODS §4.1)."""
+class BuildDatastoreSettings(TaskSettings):
+    """`kerv build datastore` (docs/methods.md §4.1)."""
 
     policy: PolicySettings = field(default_factory=PolicySettings)
     name: str | None = None  # default: datastore/ beside the target
     demos: str = "mt10"
-    task: list[str] = field(default_factory=lambda: ["MT10"])
     episodes: int = 0  # per task, the first ones by seed; 0: all
     stride: int = 1  # of an episode's observations every so many become entries
     half: bool = False  # keys on disk in float16: half the size, for shipping
     components: int = 0  # directions that keys are projected onto; 0: keys stay as they are
     key: list[str] = field(default_factory=lambda: ["scene"])  # pooled parts of the prompt; also vision, proprioception
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    results: str = "results"
 
 
 @dataclass
-class CalibrateSettings:
-    """`kerv calibrate`: noise of the kinematic predictors, and the reference level K_S of each task (METHODS §3)."""
+class CalibrateSettings(TaskSettings):
+    """`kerv calibrate` (docs/methods.md §3, §4): noise of the predictors, K_S, boundary ranges and skip levels."""
 
     policy: PolicySettings = field(default_factory=PolicySettings)
     name: str | None = None  # default: beside the target
     demos: str = "mt10"
-    task: list[str] = field(default_factory=lambda: ["MT10"])
     episodes: int = 0  # per task, the first ones by seed; 0: all
     held_out: float = 0.1  # share of episodes that the errors are measured on
     history: str = "labels"  # what predictions are made from: labels (clean) | executed (perturbed episodes: noisy)
@@ -277,8 +284,6 @@ class CalibrateSettings:
     proposer: Any = field(default_factory=parts.DrafterProposerSettings)  # pre-sampling decodes with these parts
     acceptance: Any = field(default_factory=parts.RelaxedAcceptanceSettings)
     threshold: Any = field(default_factory=parts.FixedThresholdSettings)
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    results: str = "results"
 
 
 def as_plain(settings: Any) -> dict[str, Any]:
@@ -287,15 +292,14 @@ def as_plain(settings: Any) -> dict[str, Any]:
 
 
 def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
-    """The inverse of `as_plain` for a rollout; the parts get the classes of their kinds.
+    """The inverse of `as_plain` for a rollout; every part's settings become their own class.
 
     Raises:
         CheckpointError: not such settings. UnknownName: a part that is not registered here.
     """
     settings = manifests.read(RolloutSettings, dict(plain), "a stored setting")
-    for group in (*parts.METHOD_KINDS, "datastore"):
+    for group in parts.PART_GROUPS:
         value = dict(getattr(settings, group))
-        kind = "proposer" if group == "prefill_draft" else group
-        schema = registry.find(kind, value["kind"], f"{group}.kind").settings
+        schema = parts.part_of(group, value["kind"]).settings
         setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}"))
     return settings

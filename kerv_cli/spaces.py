@@ -1,7 +1,7 @@
-"""What a policy observes and what it does, as data: no constant of a simulator stands anywhere else.
+"""Action and observation spaces as data: constants of a robot or simulator stand in environments alone.
 
-An `ActionSpace` and an `ObservationSpace` belong to an environment and travel with every artifact made from it: target,
-drafter, datastore, calibration. Where two that meet differ, kerv refuses (`check_same`).
+An environment has an `ActionSpace` and an `ObservationSpace`, and every artifact made from it stores them: target,
+drafter, datastore, calibration. Artifacts of different action spaces are refused together (`check_same`).
 
 Notation (docs/methods.md §0): D degrees of freedom (DoFs) per control step, H control steps per chunk, N = H · D
 tokens; token j is control step j // D, DoF j % D.
@@ -21,7 +21,7 @@ from kerv_cli.errors import CheckpointError
 
 @dataclass(frozen=True)
 class Group:
-    """A kinematic group: neighbouring DoFs that are drafted and judged together, e.g. position or rotation."""
+    """A kinematic group: neighbouring DoFs that are drafted and accepted together, e.g. position or rotation."""
 
     name: str
     size: int  # DoFs
@@ -63,17 +63,6 @@ class ActionSpace:
         if self.bins < 3 or not 0 < self.control_hz < np.inf:
             raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
 
-    @classmethod
-    def from_dict(cls, value: Mapping[str, Any]) -> ActionSpace:
-        """The inverse of `as_dict`.
-
-        Raises:
-            CheckpointError: not an action space.
-        """
-        from kerv_cli.manifests import read
-
-        return read(cls, value, "an action space")
-
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return asdict(self)
@@ -85,7 +74,7 @@ class ActionSpace:
 
     @property
     def tokens(self) -> int:
-        """How many tokens there are."""
+        """Size of the vocabulary: one token per bin."""
         return self.bins - 1
 
     @cached_property
@@ -95,7 +84,7 @@ class ActionSpace:
 
     @cached_property
     def centres(self) -> np.ndarray:
-        """(tokens,) what every token means, normalised."""
+        """(tokens,) normalised value of every token."""
         return (self.edges[:-1] + self.edges[1:]) / 2
 
     @cached_property
@@ -161,11 +150,12 @@ class ActionSpace:
         return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
-        """Refuse another action space: names, groups, strict DoFs, bins and control rate; with `statistics` the
-        normalisation too, without which the same token is another action.
+        """Refuses another action space: names, groups, strict DoFs, bins and control rate; with `statistics` the
+        normalisation too, without which the same token is another action. here, there: names of the two owners for
+        the message.
 
         Raises:
-            CheckpointError: they differ; the line names the first difference. here, there: who they belong to.
+            CheckpointError: they differ; the message names the first difference.
         """
         fields = ["names", "groups", "strict", "bins", "control_hz", *(("low", "high") if statistics else ())]
         for name in fields:
@@ -195,7 +185,7 @@ class Place:
 
 @dataclass(frozen=True)
 class ObservationSpace:
-    """What an environment tells besides images.
+    """The observations of an environment besides images.
 
     proprioception: names of its numbers; the first three are the end effector's position in metres. state: how many
     privileged numbers there are. places: positions in the state that a policy may estimate from images, e.g. object and
@@ -212,17 +202,6 @@ class ObservationSpace:
     extra: tuple[int, ...] = ()
     previous: tuple[int, int] | None = None
 
-    @classmethod
-    def from_dict(cls, value: Mapping[str, Any]) -> ObservationSpace:
-        """The inverse of `as_dict`.
-
-        Raises:
-            CheckpointError: not an observation space.
-        """
-        from kerv_cli.manifests import read
-
-        return read(cls, value, "an observation space")
-
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return asdict(self)
@@ -230,10 +209,10 @@ class ObservationSpace:
 
 @dataclass(frozen=True)
 class Observation:
-    """What is known before a decode.
+    """One observation, the input of a decode.
 
-    proprioception: (p,) float64, what the robot feels. state: (s,) float64, privileged. instruction: what the robot is
-    told. images: camera name -> (h, w, 3) uint8, only those that were asked for.
+    proprioception: (p,) float64, the robot's own measurements. state: (s,) float64, privileged. instruction: the task
+    in words. images: camera name -> (h, w, 3) uint8, only those that were requested.
     """
 
     proprioception: np.ndarray
@@ -242,5 +221,5 @@ class Observation:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
-        """The same observation, seen."""
+        """The same observation with these images."""
         return replace(self, images=images)

@@ -48,24 +48,24 @@ def ar_decode(random: np.random.Generator, chunk: int = 4) -> DecodeRecord:
 def drafted_decode(random: np.random.Generator, chunk: int = 4, compensate: bool = False) -> DecodeRecord:
     """Drafts of up to five tokens against random target_tokens; a rejection ends a round, and maybe the chunk."""
     size = chunk * DOFS
-    verdict = random.integers(20, 235, size)
-    tokens, rounds, compensated = [int(verdict[0])], [prefill(int(verdict[0]))], 0
+    targets = random.integers(20, 235, size)
+    tokens, rounds, compensated = [int(targets[0])], [prefill(int(targets[0]))], 0
     variability = 0.0
     while len(tokens) < size:
         start = len(tokens)
         depth = min(5, size - start - 1)
         if depth == 0:
-            rounds.append(Round("decode", "none", start, (), (int(verdict[start]),), 0, 1, 0, ()))
-            tokens.append(int(verdict[start]))
+            rounds.append(Round("decode", "none", start, (), (int(targets[start]),), 0, 1, 0, ()))
+            tokens.append(int(targets[start]))
             continue
         off = random.choice([0, 0, 0, 0, 3, -6, 25], depth)
         limits = [0 if (start + i) % DOFS == 3 else 9 for i in range(depth)]
         accepted = next((i for i in range(depth) if abs(off[i]) > limits[i]), depth)
         judged = min(accepted + 1, depth)
-        drafted = tuple(int(verdict[start + i] + off[i]) for i in range(judged))
-        seen = tuple(int(v) for v in verdict[start : start + (judged if accepted < depth else depth + 1)])
+        drafted = tuple(int(targets[start + i] + off[i]) for i in range(judged))
+        seen = tuple(int(v) for v in targets[start : start + (judged if accepted < depth else depth + 1)])
         rounds.append(verify(start, drafted, seen, accepted))
-        tokens += [*drafted[:accepted], int(verdict[start + accepted])]
+        tokens += [*drafted[:accepted], int(targets[start + accepted])]
         variability += float(np.abs(off[:judged]).sum()) / 128
         if accepted < depth and compensate:
             compensated = -len(tokens) % DOFS

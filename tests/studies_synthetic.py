@@ -8,12 +8,14 @@ import signal
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.environments import settled
 from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.registry import find
 from kerv_cli.settings import RolloutSettings, StudySettings
 from kerv_cli.studies.block import Prepare, RunEpisode
 from kerv_cli.studies.plan import Cell, plan
@@ -25,10 +27,15 @@ IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
 def settings_of(method: str, r: int = 0, episodes: int = 4, proposer: str = "drafter") -> RolloutSettings:
     settings = RolloutSettings(method=method, episodes=episodes)
     settings.world = settled(settings.world, SPEC)
-    settings.proposer.kind = "none" if method == "ar" else proposer
-    settings.acceptance.kind = "relaxed" if r else "strict"
+    settings.proposer = part("proposer", "none" if method == "ar" else proposer)
+    settings.acceptance = part("acceptance", "relaxed" if r else "strict")
     settings.threshold.r = r
     return settings
+
+
+def part(kind: str, name: str, **values: Any) -> Any:
+    """Settings of a registered part."""
+    return find(kind, name).settings(kind=name, **values)
 
 
 def still_episode(task: str, seed: int, success: bool, decodes: Sequence[DecodeRecord]) -> EpisodeRecord:
@@ -77,7 +84,7 @@ def episode(cell: Cell, seed: int) -> EpisodeRecord:
     world = generator(cell.task, seed)
     initial_state, difficulty = world.uniform(size=3), world.uniform()
     rng = generator(cell.task, seed, cell.label)
-    r = cell.settings["threshold"]["r"]
+    r = cell.settings["threshold"].get("r", 9)
     slow = cell.settings["method"] == "ar"
     decodes = tuple(ar_decode(rng) if slow else draft_decode(rng, r) for _ in range(rng.integers(12, 25)))
     steps = 4 * len(decodes)
@@ -114,7 +121,7 @@ def decode_of(rounds: list[Round], phases: dict[str, float], mode: str) -> Decod
 def ar_decode(rng: np.random.Generator) -> DecodeRecord:
     rounds = [Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(TOKENS)]
     noise = rng.lognormal(0, 0.1)
-    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "verify": 0.045 * noise, "other": 0.001}
+    phases = {"vision": 0.005, "prefill": 0.012 * noise, "verify": 0.045 * noise, "other": 0.001}
     return decode_of(rounds, phases, "ar")
 
 
@@ -128,7 +135,7 @@ def draft_decode(rng: np.random.Generator, r: int) -> DecodeRecord:
         rounds.append(Round("verify", "drafter", committed, drafted, drafted, accepted, gain, 24, (r, r, r, 0)))
         committed += gain
     noise, cycles = rng.lognormal(0, 0.1), len(rounds) - 1
-    phases = {"preprocess": 0.001, "vision": 0.004, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}
+    phases = {"vision": 0.005, "prefill": 0.012 * noise, "propose": 0.0015 * cycles}
     phases |= {"verify": 0.0055 * cycles * noise, "accept": 0.0004 * cycles, "other": 0.0008}
     return replace(decode_of(rounds, phases, "drafter"), variability=float(rng.uniform()))
 

@@ -33,8 +33,7 @@ def boundary_of(kind: str, **values: Any) -> Boundary:
     """As a method's part: its numbers are checked, then it is built; the calibration has `RANGES` for 10 and 15."""
     part = find("boundary", kind)
     chosen = part.settings(kind=kind, **values)
-    if part.check is not None:
-        part.check(chosen)
+    part.check_settings(chosen, "boundary")
     calibration = SimpleNamespace(ranges={10: RANGES, WINDOW: RANGES}.__getitem__)
 
     def artifact(kind: str) -> Any:

@@ -16,13 +16,13 @@ import torch
 import typer
 from typer.testing import CliRunner
 
+from kerv_cli.artifacts import MadeFor
 from kerv_cli.commands.calibrate import calibrate
 from kerv_cli.config import compose
 from kerv_cli.decoding.boundary import BoundaryRanges
 from kerv_cli.decoding.build import Context
 from kerv_cli.decoding.calibration_file import (
     BoundarySection,
-    CalibratedTarget,
     Calibration,
     Demonstrations,
     SkipLevel,
@@ -280,7 +280,7 @@ def test_the_tasks_reference_level_reaches_the_threshold() -> None:
 
 def calibration(levels: dict[str, float]) -> Calibration:
     return Calibration(
-        target=CalibratedTarget("a" * 64, 4, SPACE),
+        target=MadeFor("a" * 64, SPACE, 4),
         demos=Demonstrations("b" * 64, {}),
         window=10,
         noise={kind: Noise.uniform(4, 1.0) for kind in ("kalman", "damped", "acceleration")},

@@ -172,8 +172,7 @@ class Demos:
 def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A results folder with a trained target, drafter and early drafter of seven DoFs."""
     monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: Demos()))
-    for module in ("imitation", "early_distillation"):
-        monkeypatch.setattr(f"kerv_cli.training.{module}.instruction_of", lambda name: "insert the peg")
+    monkeypatch.setattr("kerv_cli.training.observations.instruction_of", lambda name: "insert the peg")
     train = TrainSettings(steps=4, batch=4, warmup=1, validate_every=2, held_out=0.34, bf16=False)
     dataset, settings = Demos(), nano().settings
     words = WordTokenizer.build(["insert the peg"])

@@ -18,7 +18,8 @@ from kerv_cli.drafting.kinematics import ActionHistory, Hold, Linear
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.parts import CompensateSettings, check_compensate
+from kerv_cli.parts import CompensateSettings
+from kerv_cli.registry import find
 
 D, N = 4, 16
 SPACE = SPEC.actions
@@ -204,7 +205,7 @@ def test_without_a_gripper_to_hold_the_target_decodes_on(wrong: int) -> None:
 )
 def test_what_cannot_compensate_is_refused(values: dict[str, Any], error: type[Exception], says: str) -> None:
     with pytest.raises(error) as caught:
-        check_compensate(CompensateSettings(**values))
+        find("rectifier", "compensate").check_settings(CompensateSettings(**values), "rectifier")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -12,18 +12,19 @@ from kerv_cli import parts as p
 from kerv_cli.config import compose, groups
 from kerv_cli.decoding.build import check, needs
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.registry import NoSettings
 from kerv_cli.rollouts.policy import check as check_rollout
 from kerv_cli.settings import RolloutSettings, as_plain, settings_from
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {
-    "prefill_draft": p.Nothing(),
-    "proposer": p.Nothing(),
-    "acceptance": p.StrictAcceptanceSettings(),
+    "prefill_draft": NoSettings(),
+    "proposer": NoSettings(),
+    "acceptance": NoSettings("strict"),
     "threshold": p.FixedThresholdSettings(r=9),
-    "rectifier": p.ReinferSettings(),
-    "boundary": p.ConstantBoundarySettings(),
-    "skip": p.Nothing(),
+    "rectifier": NoSettings("reinfer"),
+    "boundary": NoSettings("always"),
+    "skip": NoSettings(),
 }
 CHAIN = p.DrafterProposerSettings(depth=15, top_k=1, nodes=15)
 RELAXED = p.RelaxedAcceptanceSettings(strict_dofs=True)
@@ -41,8 +42,8 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
     "naive_sd": {"proposer": p.DrafterProposerSettings(depth=5, top_k=1, nodes=5)},
     "spec_vla": {"proposer": CHAIN, "acceptance": RELAXED},
     "jacobi": {"proposer": p.JacobiProposerSettings(depth=0)},
-    "hold": {"proposer": p.PredictionProposerSettings("hold"), "acceptance": RELAXED},
-    "kalman_only": {"proposer": p.PredictionProposerSettings("kalman"), "acceptance": RELAXED},
+    "hold": {"proposer": NoSettings("hold"), "acceptance": RELAXED},
+    "kalman_only": {"proposer": NoSettings("kalman"), "acceptance": RELAXED},
     "kerv": {
         "proposer": CHAIN,
         "acceptance": RELAXED,
@@ -87,7 +88,7 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
     },
     "one_pass": ONE_PASS,
     "one_pass_skip": {**ONE_PASS, "skip": SKIP},
-    "one_pass_strict": {"prefill_draft": p.EarlyProposerSettings(), "proposer": p.JacobiProposerSettings(depth=0)},
+    "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": p.JacobiProposerSettings(depth=0)},
 }
 
 
@@ -105,7 +106,7 @@ def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
     assert asked.method == method
     assert asked.policy.kind == ("expert" if method == "expert" else "model")
     assert asked.parts() == {**AR, **PRESETS[method]}
-    assert (asked.chunk, asked.datastore) == (0, p.ExactSearchSettings())
+    assert (asked.chunk, asked.datastore) == (0, NoSettings("exact"))
     check(asked.parts(), asked.chunk, 4)
 
 
@@ -114,7 +115,7 @@ def test_every_part_of_a_preset_can_be_replaced(method: str) -> None:
     words = "prefill_draft=hold proposer=retrieval acceptance=sequence threshold=schedule rectifier=reinfer"
     asked = composed(f"method={method}", *words.split(), "boundary=random", "skip=none", "threshold.tau=7")
     replaced = {
-        "prefill_draft": p.PredictionProposerSettings("hold"),
+        "prefill_draft": NoSettings("hold"),
         "proposer": p.RetrievalProposerSettings(),
         "acceptance": p.SequenceAcceptanceSettings(),
         "threshold": p.ScheduleThresholdSettings(tau=7.0),

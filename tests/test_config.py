@@ -8,9 +8,9 @@ import pytest
 
 from kerv_cli import settings as s
 from kerv_cli.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
-from kerv_cli.decoding.build import registry_kind
 from kerv_cli.errors import UsageError
-from kerv_cli.registry import find, parts
+from kerv_cli.parts import part_of
+from kerv_cli.registry import parts
 from kerv_cli.studies.resolve import resolve
 
 SCHEMAS = {
@@ -43,10 +43,10 @@ def test_every_config_composes(choice: tuple[str, str]) -> None:
     settings = compose(command, [f"{group}={name}"], SCHEMAS[command])
     if group in PART_GROUPS:
         chosen = getattr(settings, group)
-        part = find(registry_kind(group), chosen.kind)
+        part = part_of(group, chosen.kind)
         assert type(chosen) is part.settings
         assert name.startswith(chosen.kind)  # a variant is named after its part
-        assert name in parts(registry_kind(group)) or (conf_dir() / group / f"{name}.yaml").is_file()
+        assert name in parts(part.kind) or (conf_dir() / group / f"{name}.yaml").is_file()
 
 
 @pytest.mark.parametrize("study", groups()["study"])

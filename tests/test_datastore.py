@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from heapq import heappop, heappush
 from importlib.util import find_spec
@@ -29,7 +32,8 @@ from kerv_cli.environments.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.parts import ExactSearchSettings, QdrantSearchSettings
+from kerv_cli.parts import QdrantSearchSettings
+from kerv_cli.registry import NoSettings
 from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.spaces import ActionSpace, Observation
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
@@ -195,7 +199,7 @@ def test_few_rows_are_read_whole() -> None:
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
 def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
     store, _, description = opened(results, name)
-    backends: list[Any] = [ExactSearchSettings()]
+    backends: list[Any] = [NoSettings("exact")]
     if find_spec("qdrant_edge") is not None:
         backends.append(QdrantSearchSettings())
     for chosen in backends:
@@ -389,7 +393,7 @@ def cut(path: Path) -> None:
         (lambda m: m["actions"].update(low=[-2, -1, -1, -1]), "an action space with low -2, -1, -1, -1"),
         (lambda m: m["actions"].update(names=["dx", "dy", "yaw", "gripper"]), "with names dx, dy, yaw, gripper"),
         (lambda m: m["actions"].update(strict=[]), "with strict none"),
-        (lambda m: m.update(chunk=8), "holds chunks of 8 steps, the target decodes 4"),
+        (lambda m: m.update(chunk=8), "was built for chunks of 8 steps, not of 4"),
         (lambda m: m["tasks"]["reach-v3"]["seeds"].append(EVALUATION_SEED), "holds seed 100000 of reach-v3"),
         (lambda m: m.update(format=1), "manifest.json is damaged: format"),
         (lambda m: m.update(kind="drafter"), "manifest.json is damaged: kind"),
@@ -527,6 +531,44 @@ def test_a_failed_exchange_puts_the_old_one_back(copy: Path, monkeypatch: pytest
         DatastoreBuild(asked(copy, episodes=1)).build()
     assert opened(copy)[0].manifest.rows == 52
     assert sorted(p.name for p in folder_of(copy).parent.iterdir()) == ["nano-state", "nano-vision"]
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from kerv_cli.config import compose
+from kerv_cli.settings import BuildDatastoreSettings
+from kerv_cli.training.datastore import DatastoreBuild
+real = Path.rename
+Path.rename = lambda self, target: os._exit(9) if ".new." in self.name else real(self, target)
+DatastoreBuild(compose("build_datastore", sys.argv[1:], BuildDatastoreSettings)).build()
+"""
+
+
+def test_a_kill_between_the_two_renames_loses_nothing(copy: Path) -> None:
+    words = ["policy.target=nano-state", "demos=few", "task=reach", f"results={copy}"]
+    killed = subprocess.run([sys.executable, "-W", "ignore", "-c", KILLED, *words], capture_output=True, timeout=100)
+    assert killed.returncode == 9, killed.stderr
+    assert not folder_of(copy).exists()
+    run = DatastoreBuild(asked(copy))
+    assert opened(copy)[0].manifest.rows == 52
+    run.build()
+    assert opened(copy)[0].manifest.rows == 52
+
+
+@pytest.mark.parametrize("full", ["vectors.npy", "payload.parquet"])
+def test_a_full_disk_is_one_line(copy: Path, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+    @contextmanager
+    def somewhere(path: Path) -> Iterator[Path]:
+        if path.name == full:
+            path.symlink_to("/dev/full")
+        yield path
+
+    monkeypatch.setattr(datastore_build, "atomic_path", somewhere)
+    with pytest.raises(StorageError, match=r"cannot write .*nano-state: the disk is full") as caught:
+        DatastoreBuild(asked(copy)).build()
+    assert "\n" not in str(caught.value)
+    assert opened(copy)[0].manifest.rows == 52
 
 
 def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:

@@ -44,7 +44,8 @@ from kerv_cli.training.early_distillation import (
     observations,
     teach_early,
 )
-from kerv_cli.training.imitation import load_samples, split
+from kerv_cli.training.imitation import load_samples
+from kerv_cli.training.observations import split
 from kerv_cli.training.runs import EarlyRun, drafter_run
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
@@ -256,14 +257,14 @@ def test_observations_come_with_what_was_executed_before_them(nano: CompactTarge
     for t in range(2, 10):
         assert np.allclose(some.history[t], normal[t - 2 : t])
     assert np.allclose(some.history[1, 1], normal[0])
-    assert torch.equal(some.inputs.states, torch.from_numpy(demo.states))
+    assert torch.equal(some.states, torch.from_numpy(demo.states))
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.5, 5), (0.1, 1), (0.34, 4), (1.0, 10)])
 def test_a_share_of_the_observations_is_spread_evenly(nano: CompactTarget, share: float, count: int) -> None:
     demo = episode(10)
     some = observations(nano, demo, 0, share, 0)
-    where = [int(np.flatnonzero((demo.states == s).all(1))[0]) for s in some.inputs.states.numpy()]
+    where = [int(np.flatnonzero((demo.states == s).all(1))[0]) for s in some.states.numpy()]
     assert len(where) == count
     assert where[0] == 0
     assert np.ptp(np.diff([*where, 10])) <= 1
@@ -285,7 +286,7 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
         prompt, _ = target.encode_batch(samples.inputs(torch.tensor([i]), target.device))
         assert taught.tokens[i].tolist() == decoder.decode_prompt(prompt).tokens
         assert torch.allclose(taught.features[i].float(), target.pooled(prompt)[0], atol=1e-2)
-    held = taught.split(0.34)[1]
+    held = split(taught, 0.34)[1]
     assert torch.equal(held.episodes, split(samples, 0.34)[1].episodes)
     few = teach_early(target, dataset, dataclasses.replace(SMALL, samples=12))
     assert 12 <= len(few) <= 18
@@ -295,9 +296,9 @@ def test_held_out_shares_that_leave_nothing_are_refused() -> None:
     zeros = torch.zeros(4, dtype=torch.long)
     one = EarlySamples(torch.zeros(4, 1), torch.zeros(4, 0, 4), torch.zeros(4, 0), zeros[:, None], zeros, zeros.bool())
     with pytest.raises(CheckpointError, match="at least two"):
-        one.split(0.1)
+        split(one, 0.1)
     with pytest.raises(UsageError, match="held_out"):
-        dataclasses.replace(one, episodes=torch.arange(4)).split(0.7)
+        split(dataclasses.replace(one, episodes=torch.arange(4)), 0.7)
 
 
 def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results: Path) -> None:

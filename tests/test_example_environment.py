@@ -17,7 +17,7 @@ from kerv_cli.environments import resolve_tasks, spec_of, task_names
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.errors import KervError, UsageError
-from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.viewing.rerun_log import save_episode
 from kerv_cli.viewing.viewer import read_back
@@ -45,7 +45,7 @@ def test_it_is_found_beside_the_others(spec: EnvironmentSpec) -> None:
 
 def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) -> None:
     with spec.open_world("push-point") as world:
-        record = run_episode(world, ExpertDecoder(), 100_000, Recording(CameraConfig(size=24)))
+        record = run_episode(world, ExpertDecoder(), 100_000, CameraConfig(size=24))
         world.reset(100_000)
         assert record.initial_state.tolist() == world.initial_state.tolist()
         with pytest.raises(KervError, match="2 finite numbers"):

@@ -76,11 +76,11 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     slow = frame.assign(seconds=frame["seconds"] * 10, success=False)
     for averaging in (MICRO, MACRO):
         found = measure(frame, slow, averaging)
-        assert found.success.value == 1.0
-        assert (found.counts.only_method, found.counts.both) == (1, 0)
-        assert found.values["time_per_step_ms"] > 0
-        assert found.values["forwards_per_step"] == found.values["skip_rate"] == 0.0
-        assert all(math.isnan(found.values[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
+        assert found["success"] == 1.0
+        assert (found["only_method"], found["both"]) == (1, 0)
+        assert found["time_per_step_ms"] > 0
+        assert found["forwards_per_step"] == found["skip_rate"] == 0.0
+        assert all(math.isnan(found[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
 
 
 @pytest.mark.parametrize("frames", [False, True])

@@ -50,7 +50,7 @@ EVERY = [(kind, name) for kind in kinds() for name in parts(kind)]
 
 def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) -> None:
     first = register(Part("proposer", "mine", "one:build"))
-    again = register(Part("proposer", "mine", "one:build", about="reloaded"))
+    again = register(Part("proposer", "mine", "one:build", colour=1))
     assert find("proposer", "mine") is again is not first
     with pytest.raises(UsageError, match="proposer 'mine' is registered twice: one:build and two:build") as refused:
         register(Part("proposer", "mine", "two:build"))
@@ -81,8 +81,7 @@ def test_what_a_part_names_is_there(kind: str, name: str) -> None:
         assert chosen.kind == name
         assert isinstance(part.needs(chosen), tuple)
         assert set(part.needs(chosen)) <= set(parts("artifact"))
-        if part.check is not None:
-            part.check(chosen)  # defaults are in range
+        part.check_settings(chosen, kind)  # defaults are in range
 
 
 def test_every_proposer_says_when_it_can_draft() -> None:

@@ -193,7 +193,7 @@ def test_a_rejection_stays_visible_whoever_fills_the_place() -> None:
     refused = Round("verify", "drafter", 1, (60, 99), (60, 70), 1, 1, 20, (9,))
     filled = decode_of((50, 60, 128, 128), (prefill(50), refused), 1, compensated=2)
     assert [f.kind for f in outcomes_of(filled, 8, DOFS)[:4]] == ["target", "accepted", "rejected", "compensated"]
-    # the papers' preset takes the verdict back: the place is predicted too, and the tokens end before it
+    # the papers' preset takes the target token back: the place is predicted too, and the tokens end before it
     taken_back = decode_of((50, 60), (prefill(50), refused), 1, compensated=2, size=8)
     assert [f.kind for f in outcomes_of(taken_back, 8, DOFS)] == ["target", "accepted", "rejected", "compensated"] + [
         "dropped"

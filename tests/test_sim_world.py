@@ -225,8 +225,7 @@ def test_a_world_can_be_closed_twice_and_used_again():
 
 @pytest.fixture
 def forgotten_backend(monkeypatch):
-    monkeypatch.setattr(camera_module, "_backend", None)
-    monkeypatch.setattr(camera_module, "_refusal", None)
+    monkeypatch.setattr(camera_module, "_chosen", None)
     monkeypatch.delitem(sys.modules, "mujoco.gl_context", raising=False)
     for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "LP_NUM_THREADS"):
         monkeypatch.setenv(name, "")  # so that the old value comes back
@@ -236,7 +235,8 @@ def forgotten_backend(monkeypatch):
 
 def fake_probe(working):
     def run(command, env, **_):
-        return subprocess.CompletedProcess(command, returncode=0 if env["MUJOCO_GL"] in working else 1)
+        if env["MUJOCO_GL"] not in working:
+            raise subprocess.CalledProcessError(1, command)
 
     return run
 

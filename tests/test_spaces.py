@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.manifests import read
 from kerv_cli.spaces import ActionSpace, Group, ObservationSpace
 from kerv_cli.targets.compact.text import PAD, UNKNOWN, WordTokenizer
 
@@ -70,9 +71,9 @@ def test_groups_and_strict_dofs_follow_from_the_space() -> None:
 
 def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
     for space in (METAWORLD.actions, INSERTION.actions):
-        assert ActionSpace.from_dict(json.loads(json.dumps(space.as_dict()))) == space
+        assert read(ActionSpace, json.loads(json.dumps(space.as_dict())), "a space") == space
     for space in (METAWORLD.observation, INSERTION.observation):
-        assert ObservationSpace.from_dict(json.loads(json.dumps(space.as_dict()))) == space
+        assert read(ObservationSpace, json.loads(json.dumps(space.as_dict())), "a space") == space
     wrong = (
         {"names": 1},
         {**SPACE.as_dict(), "more": 1},
@@ -83,7 +84,7 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line() -> None:
     )
     for value in wrong:
         with pytest.raises(CheckpointError, match="an action space is damaged") as refused:
-            ActionSpace.from_dict(value)
+            read(ActionSpace, value, "an action space")
         assert "\n" not in str(refused.value)
 
 

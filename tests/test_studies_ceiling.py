@@ -1,4 +1,4 @@
-"""The ceiling column against numbers worked out by hand (METHODS §5)."""
+"""The ceiling column against numbers worked out by hand (docs/methods.md §5)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from studies_synthetic import IDENTITY, settings_of, still_episode
+from studies_synthetic import IDENTITY, part, settings_of, still_episode
 
 from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.reporting.measures import MACRO, MICRO
@@ -44,7 +44,7 @@ def decode(rounds: Sequence[Round], **phases: float) -> DecodeRecord:
 
 
 # per decode: overhead 0.3, prefill 0.4, three forwards of 0.2, and 0.1 that no ceiling counts
-AR = decode([PREFILL, PLAIN, PLAIN, PLAIN], preprocess=0.1, vision=0.2, prefill=0.4, verify=0.6, other=0.1)
+AR = decode([PREFILL, PLAIN, PLAIN, PLAIN], vision=0.3, prefill=0.4, verify=0.6, other=0.1)
 BASELINE = 0.3 + 0.4 + 3 * 0.2
 DECODES = {
     "ar": [AR, AR],
@@ -64,8 +64,10 @@ EXPECTED = {
 
 def settings() -> dict[str, RolloutSettings]:
     found = {label: settings_of(label, 0 if label == "ar" else 9, episodes=2) for label in DECODES}
-    found["one_pass"].opening.sources = ["early", "hold"]
-    found["expert"].proposer.kind = "none"
+    found["one_pass"].proposer = part("proposer", "none")
+    found["one_pass"].prefill_draft = part("proposer", "merged", sources=["early", "hold"])
+    found["expert"].proposer = part("proposer", "none")
+    found["expert"].policy.kind = "expert"
     return found
 
 
@@ -130,7 +132,15 @@ def test_the_expert_has_no_speedup(tmp_path: Path) -> None:
     rows = table[table["label"] == "expert"]
     assert rows["speedup"].isna().all()
     assert (rows["success"] == 1.0).all()
+    assert set(rows["policy.kind"]) == {"expert"}
     assert (rows["pairs"] == 2).all()
+
+
+def test_an_expert_that_is_called_ar_is_no_reference(tmp_path: Path) -> None:
+    chosen = settings()
+    chosen["expert"].method = "ar"
+    cells = plan({"expert": chosen["expert"], "kerv": chosen["kerv"]}, ["reach-v3"], IDENTITY)
+    assert all(math.isnan(value) for value in ceilings(write(tmp_path, cells)).values())
 
 
 def test_macro_takes_the_ratio_of_the_groups_means(tmp_path: Path) -> None:
@@ -173,12 +183,11 @@ def test_another_target_or_device_gives_none(tmp_path: Path) -> None:
 
 
 def test_cells_of_before_are_readable(tmp_path: Path) -> None:
-    """Settings without skip, datastore, chunk and opening.sources, beside newer ones."""
+    """Settings without skip, datastore, chunk and policy.kind, beside newer ones."""
     cells = plan(settings(), ["reach-v3"], IDENTITY, baseline="ar")
     old = []
     for cell in cells[:2]:
         plain = {k: v for k, v in cell.settings.items() if k not in ("skip", "datastore", "chunk")}
-        plain["opening"] = {"kind": "none", "nodes": 0}
         plain["policy"] = {"target": "mt10-vision", "drafter": None}
         old.append(make_cell(cell.label, "", plain, IDENTITY, "reach-v3", cell.seeds))
     assert [cell.label for cell in old] == ["ar", "kerv"]
@@ -188,13 +197,13 @@ def test_cells_of_before_are_readable(tmp_path: Path) -> None:
     columns = list(table.columns)
     # a setting that only later rows have stands among the settings, not behind the provenance
     assert columns.index("overrides") < columns.index("skip.kind") < columns.index("target") < columns.index("horizon")
-    assert list(table["opening.sources"].fillna("missing"))[:3] == ["missing", "missing", "early;hold"]
+    assert list(table["prefill_draft.sources"].fillna("missing"))[:3] == ["missing", "missing", "early;hold"]
 
 
 def test_flatten() -> None:
-    assert flatten({"opening": {"sources": ["early", "hold"]}, "skip": {"s_min": None}, "chunk": 4}) == {
-        "opening.sources": "early;hold",
+    assert flatten({"prefill_draft": {"sources": ["early", "hold"]}, "skip": {"s_min": None}, "chunk": 4}) == {
+        "prefill_draft.sources": "early;hold",
         "skip.s_min": None,
         "chunk": 4,
     }
-    assert flatten({"opening": {"sources": []}}) == {"opening.sources": ""}
+    assert flatten({"prefill_draft": {"sources": []}}) == {"prefill_draft.sources": ""}

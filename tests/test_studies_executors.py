@@ -15,9 +15,10 @@ from typing import Any
 import pytest
 from studies_synthetic import misbehave, prepare, slow_elsewhere, threshold_study
 
+from kerv_cli.config import compose
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.settings import RuntimeSettings
+from kerv_cli.settings import RolloutSettings, RuntimeSettings
 from kerv_cli.studies.block import RunEpisode
 from kerv_cli.studies.claims import is_claimed
 from kerv_cli.studies.events import CellDone, Event
@@ -68,6 +69,13 @@ def test_a_cluster_loses_only_the_guilty_cells_and_resumes(cluster: RuntimeSetti
     assert list(store.claims.iterdir()) == []
     again = execute(cells, prepare, store, RuntimeSettings())
     assert (len(again.reused), len(again.done)) == (4, 4)
+
+
+def test_options_come_from_the_command_line() -> None:
+    for executor, option, value in (("slurm", "partition", "short"), ("ray", "gpus", 0.5)):
+        words = [f"runtime={executor}", f"runtime.executor_options.{option}={value}"]
+        composed = compose("rollout", words, RolloutSettings).runtime
+        assert (composed.executor, composed.executor_options) == (executor, {option: value})
 
 
 def test_an_interrupt_ends_a_clusters_work(cluster: RuntimeSettings, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from studies_synthetic import IDENTITY, settings_of, threshold_settings, thresho
 import kerv_cli
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import RolloutSettings
-from kerv_cli.studies.code import code_hash
+from kerv_cli.studies.code import _meaning, code_hash
 from kerv_cli.studies.plan import blocks_of, cell_id, parse_seeds, plan, seeds_text, unique_cells
 from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
 
@@ -41,7 +41,7 @@ def changed(path: str, value: Any) -> RolloutSettings:
     [
         ("proposer.kind", "hold"),
         ("proposer.depth", 3),
-        ("acceptance.strict_gripper", True),
+        ("acceptance.strict_dofs", False),
         ("threshold.r", 5),
         ("rectifier.kind", "compensate"),
         ("boundary.kind", "fused"),
@@ -132,16 +132,23 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, mon
     shutil.copytree(Path(kerv_cli.__file__).parent, tmp_path / "kerv_cli")
     monkeypatch.setattr(kerv_cli, "__file__", str(tmp_path / "kerv_cli" / "__init__.py"))
 
-    def hash_after(file: str) -> str:
+    def hash_after(file: str, more: str) -> str:
         path = tmp_path / "kerv_cli" / file
-        path.write_text(path.read_text() + "\n")
+        path.write_text(f"{path.read_text()}\n{more}\n")
         return code_hash.__wrapped__()
 
     before = code_hash.__wrapped__()
-    assert hash_after("reporting/tables.py") == hash_after("commands/sweep.py") == before
-    assert (
-        len({before, hash_after("decoding/decoder.py"), hash_after("settings.py"), hash_after("rollouts/run.py")}) == 4
-    )
+    assert hash_after("reporting/tables.py", "x = 1") == hash_after("commands/sweep.py", "x = 1") == before
+    assert hash_after("settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
+    computing = [hash_after(file, "x = 1") for file in ("decoding/decoder.py", "settings.py", "rollouts/run.py")]
+    assert len({before, *computing}) == 4
+
+
+def test_docstrings_and_layout_do_not_make_other_code() -> None:
+    first = b'def f(x):\n    """Doubles."""\n    return 2*x\n'
+    assert _meaning(first) == _meaning(b"# doubles\ndef f( x ):\n\n    return (2 * x)\n")
+    assert _meaning(first) != _meaning(b"def f(x):\n    return 3 * x\n")
+    assert _meaning(first) != _meaning(b'def f(x):\n    return "Doubles."\n')
 
 
 def test_settings_may_have_weights_of_their_own() -> None:

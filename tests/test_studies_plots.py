@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from studies_synthetic import IDENTITY, run_cell, settings_of
+from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
 from kerv_cli.registry import Part
 from kerv_cli.reporting.drawing import COLOURS, INK, STYLE, new_figure, setting_colours
@@ -25,10 +25,10 @@ from kerv_cli.studies.store import StudyStore
 
 
 def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:
+    """parts: settings by kind, e.g. boundary={"kind": "fused"}."""
     found = settings_of(method, 0 if method == "ar" else 9, episodes=2)
-    for part, values in parts.items():
-        for name, value in values.items():
-            setattr(getattr(found, part), name, value)
+    for kind, values in parts.items():
+        setattr(found, kind, part(kind, values["kind"], **{k: v for k, v in values.items() if k != "kind"}))
     return found
 
 
@@ -50,7 +50,7 @@ def boundary_study() -> dict[str, RolloutSettings]:
 
 @pytest.fixture(scope="module")
 def boundaries(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
-    unused = setting("kerv", rectifier={"use_verdict": False}, threshold={"r": 3})
+    unused = setting("kerv", rectifier={"kind": "compensate"}, threshold={"kind": "fixed", "r": 3})
     return table_of(tmp_path_factory.mktemp("boundaries"), boundary_study() | {"unused": unused})
 
 
@@ -102,7 +102,7 @@ def test_a_baseline_that_is_a_point_of_a_series_is_drawn_in_it(tmp_path: Path) -
     assert list(series["ar"]["speedup"])[1] == 1.0
 
 
-@pytest.mark.parametrize("axis", ["boundary.kind", "rectifier.use_verdict", "no.such"])
+@pytest.mark.parametrize("axis", ["boundary.kind", "rectifier.use_target_token", "no.such"])
 def test_without_numbers_on_the_axis_every_setting_is_a_row(boundaries: pd.DataFrame, axis: str) -> None:
     figures = study_figures(boundaries, axis, "Title")
     assert set(figures) == {"", "_phases", "_tradeoff"}
@@ -121,14 +121,18 @@ def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
 
 def test_a_part_gives_its_setting_a_colour_once_and_the_baseline_is_ink(monkeypatch: pytest.MonkeyPatch) -> None:
     drafter = Part("proposer", "drafter", "nowhere:build", colour=0x123456)
+    none = Part("proposer", "none", "nowhere:build", colour=0x6E7B8B)
     monkeypatch.setattr(
-        "kerv_cli.reporting.drawing.parts", lambda kind: {"drafter": drafter} if kind == "proposer" else {}
+        "kerv_cli.reporting.drawing.parts",
+        lambda kind: {"drafter": drafter, "none": none} if kind == "proposer" else {},
     )
-    kinds = {"ar": "none", "spec_vla": "drafter", "hold": "hold", "kerv": "drafter"}
+    kinds = {"ar": "none", "spec_vla": "drafter", "hold": "hold", "kerv": "drafter", "one_pass": "none"}
     rows = [{"label": label, "baseline": "ar", "proposer.kind": kind} for label, kind in kinds.items()]
     shades = setting_colours(rows)
     assert shades[:2] == [INK, "#123456"]
-    assert shades[2:] == list(COLOURS[:2])
+    assert shades[2:] == list(COLOURS[:3])
+    before = [{"label": "one_pass", "baseline": "ar", "prefill_draft.kind": "drafter", "proposer.kind": "none"}]
+    assert setting_colours(before) == ["#123456"]
     assert len(setting_colours([{"label": str(i), "baseline": "ar"} for i in range(30)])) == 30
 
 

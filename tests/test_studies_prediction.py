@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from studies_synthetic import IDENTITY, run_cell, settings_of
+from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
-from kerv_cli.decoding.calibration_file import Calibration, save_calibration
+from kerv_cli.artifacts import MadeFor
+from kerv_cli.decoding.calibration_file import Calibration, Demonstrations, save_calibration
 from kerv_cli.drafting.kinematics import FILTERS, Noise
+from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of, write_json
 from kerv_cli.reporting.curvature import RADII, radius_table
@@ -44,8 +46,8 @@ def calibrate(results: Path, name: str = "made-here") -> Path:
     path = results / "artifacts/calibration" / name / "calibration.json"
     noise = Noise((0.1,) * 4, (1.0,) * 4, (1.0,) * 4)
     calibration = Calibration(
-        target={"sha256": "a" * 64, "chunk": 2, "dofs": 4},
-        demos={"sha256": "d" * 64, "tasks": {t: {"training": 9, "held_out": 1} for t in ("reach-v3", "push-v3")}},
+        target=MadeFor("a" * 64, SPEC.actions, 2),
+        demos=Demonstrations("d" * 64, {t: {"training": 9, "held_out": 1} for t in ("reach-v3", "push-v3")}),
         window=10,
         noise=dict.fromkeys(FILTERS, noise),
         errors={"hold": errors(0.1), "linear": errors(0.05), "kalman": errors(0.025)},
@@ -63,8 +65,8 @@ def write_study(results: Path, name: str) -> None:
     settings["wide"] = settings_of("kerv", 15, episodes=1)
     for s in settings.values():
         s.policy.target = "made-here"
-    settings["kerv"].rectifier.kind = "compensate"
-    settings["kerv"].boundary.kind, settings["wide"].boundary.kind = "fused", "always_drafter"
+    settings["kerv"].rectifier = part("rectifier", "compensate")
+    settings["kerv"].boundary, settings["wide"].boundary = part("boundary", "fused"), part("boundary", "always_drafter")
     cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar")
     store = StudyStore(results, name)
     for cell in cells:
@@ -116,25 +118,18 @@ def test_what_is_not_calibrated_has_no_errors(tmp_path: Path) -> None:
 
 def test_a_damaged_calibration_is_named(tmp_path: Path) -> None:
     path = calibrate(tmp_path)
-    path.write_text("{}", encoding="utf-8")
-    with pytest.raises(CheckpointError, match="is not a calibration"):
-        read_predictions(tmp_path, "made-here")
-    write_json(path, {"format": 1, "kind": "calibration", "errors": {"hold": {}}})
-    with pytest.raises(CheckpointError, match=r"damaged \('window' is missing\)"):
-        read_predictions(tmp_path, "made-here")
-
-
-def test_sections_of_another_version_do_not_matter(tmp_path: Path) -> None:
-    path = calibrate(tmp_path)
-    write_json(path, {**read_json(path), "boundary": {"what": "ever"}, "noise": {}})
-    assert read_predictions(tmp_path, "made-here") is not None
+    for harm in ({"window": "ten"}, {"boundary": {"what": "ever"}}, {"format": 1}):
+        write_json(path, {**read_json(path), **harm})
+        with pytest.raises(CheckpointError, match=f"calibration.json is damaged: {next(iter(harm))}"):
+            read_predictions(tmp_path, "made-here")
+        calibrate(tmp_path)
 
 
 def test_whose_methods_predict() -> None:
     def plain(kind: str = "drafter", rectifier: str = "reinfer", sources: list[str] | None = None) -> dict[str, object]:
         found: dict[str, object] = {"policy": {"target": "t"}, "proposer": {"kind": kind}}
         found["rectifier"] = {"kind": rectifier}
-        return found | ({"opening": {"sources": sources}} if sources is not None else {})
+        return found | ({"prefill_draft": {"kind": "merged", "sources": sources}} if sources is not None else {})
 
     for predicts in (plain(rectifier="compensate"), plain("kalman"), plain("none", sources=["early", "hold"])):
         assert predicting_targets([predicts, predicts]) == ["t"]

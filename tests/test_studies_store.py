@@ -20,7 +20,7 @@ from kerv_cli.decoding.record import PHASES
 from kerv_cli.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.studies import claims, rows
 from kerv_cli.studies.plan import Cell
-from kerv_cli.studies.store import StudyStore, list_studies
+from kerv_cli.studies.store import StudyStore, begun_studies
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 
@@ -330,9 +330,9 @@ def test_listing(store: StudyStore, tmp_path: Path) -> None:
     cells = threshold_study(["reach-v3"])
     store.write_plan(threshold_settings(), cells)
     store.write_cell(cells[0], run_cell(cells[0]), STATUS)
-    (found,) = list_studies(tmp_path)
-    assert (found.name, found.title, found.planned, found.complete) == ("threshold", "Acceptance threshold", 4, 1)
-    assert list_studies(tmp_path / "nowhere") == []
+    StudyStore(tmp_path, "planned").write_plan(dataclasses.replace(threshold_settings(), name="planned"), cells)
+    assert begun_studies(tmp_path) == ["threshold"]
+    assert begun_studies(tmp_path / "nowhere") == []
 
 
 def test_status_is_json_for_people(store: StudyStore, cell: Cell) -> None:

@@ -189,6 +189,7 @@ def test_a_row_says_everything(data: StudyData) -> None:
         "threshold.r": 9,
         "rectifier.kind": "reinfer",
         "boundary.kind": "always",
+        "policy.kind": "model",
         "seeds": "100000-100002",
         "target": "mt10-vision",
         "target_sha256": "a" * 64,

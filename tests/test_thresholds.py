@@ -33,8 +33,7 @@ def artifact(kind: str) -> Any:
 def built(chosen: Any, task: str = "reach-v3") -> Threshold:
     """As a method's part: its numbers are checked, then it is built."""
     part = find("threshold", chosen.kind)
-    assert part.check is not None
-    part.check(chosen)
+    part.check_settings(chosen, "threshold")
     found: Threshold = part.built(chosen, Context(SimpleNamespace(actions=SPEC.actions), artifact, task))  # type: ignore[arg-type]
     return found
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, composed, console, edge, print_plan, progress_bar
+from kerv_cli.commands import common
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, edge, progress_bar
 
-app = typer.Typer(
-    help="Build what is not trained.", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
-)
+HELP = "Build artifacts that need no training."
+
+app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
-@app.callback()
+@app.callback(help=HELP)
 def build() -> None:
-    """Build what is not trained."""  # with a callback, a single command keeps its name
+    """The group: with a callback, its single command keeps its name."""
 
 
 @app.command("datastore")
@@ -22,21 +23,13 @@ def datastore(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPl
     """Store the demonstrations' action chunks under the target's own features, for retrieval."""
     from kerv_cli.settings import BuildDatastoreSettings
 
-    settings = composed("build_datastore", overrides, BuildDatastoreSettings, cfg)
+    settings = common.composed("build_datastore", overrides, BuildDatastoreSettings, cfg)
     from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
 
     run = DatastoreBuild(settings)
     if plan:
-        print_plan(run.plan())
-    with progress_bar("encoding demonstrations", 1000) as advance:
-        store = run.build(lambda done, total: advance(1000 * done // total, ""))
-    _summary({"entries": len(store.vectors), "tasks": len(store.shards), **leave_one_out(store)}, run.folder)
-
-
-def _summary(figures: dict[str, float], folder: object) -> None:
-    from rich.table import Table
-
-    table = Table("datastore, nearest neighbour in another episode", str(folder))
-    for name, value in figures.items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    console().print(table)
+        common.print_plan(run.plan())
+    with progress_bar("encoding demonstrations") as advance:
+        store = run.build(advance)
+    figures = {"entries": len(store.vectors), "tasks": len(store.shards), **leave_one_out(store)}
+    common.print_figures("datastore, nearest neighbour in another episode", figures, run.folder)

@@ -1,39 +1,36 @@
-"""What every command shares: the error edge, override arguments and their completion, progress bars."""
+"""What every command shares: turning errors into one line, override arguments and their completion, progress bars,
+tables."""
 
 from __future__ import annotations
 
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
 
 from kerv_cli.errors import KervError
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def complete_overrides(incomplete: str) -> list[str]:
-    """`method=` -> every method; otherwise the groups. Reads file names only: completion must be instant."""
+    """Completions of an override: `method=` -> every method; without `=`, the groups. Imports nothing heavy."""
     from kerv_cli.config import groups
 
-    known = groups()
-    if "=" in incomplete:
-        group = incomplete.split("=", 1)[0]
-        words = [f"{group}={name}" for name in known.get(group, [])]
-        if group == "task":
-            from kerv_cli.environments import task_names
-
-            words = [f"task={name}" for name in task_names()]
-    else:
+    known, (group, equals, _) = groups(), incomplete.partition("=")
+    if not equals:
         words = [f"{name}=" for name in [*known, "task", "results"]]
+    elif group == "task":
+        from kerv_cli.environments import task_names
+
+        words = [f"task={name}" for name in task_names()]
+    else:
+        words = [f"{group}={name}" for name in known.get(group, [])]
     return [word for word in words if word.startswith(incomplete)]
 
 
@@ -61,7 +58,7 @@ def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bo
 
 
 def print_plan(text: str) -> None:
-    """What would be done, for --plan; the command ends."""
+    """Prints what would be done, for --plan; the command ends."""
     typer.echo(text)
     raise typer.Exit(0)
 
@@ -99,8 +96,12 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
 
 
 @contextmanager
-def progress_bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]:
-    """Yields `advance_to(done, text)`. A bar on a terminal; elsewhere a line now and then, so that logs stay short."""
+def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+    """Yields `advance(done, total, text="")`: a progress bar on a terminal, elsewhere at most 10 lines (50 for totals
+    from 2000 on)."""
+    if not sys.stderr.isatty():
+        yield _plain_lines(title)
+        return
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -110,36 +111,19 @@ def progress_bar(title: str, total: int) -> Iterator[Callable[[int, str], None]]
         TimeRemainingColumn,
     )
 
-    if not sys.stderr.isatty():
-        yield _plain_lines(title, total)
-        return
-    columns: tuple[Any, ...] = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
-    )
-    with Progress(*columns, console=console(stderr=True)) as bar:
-        yield _advance(bar, title, total)
+    timed = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    texts = (TextColumn(f"{{task.{name}}}") for name in ("description", "fields[text]"))
+    with Progress(next(texts), *timed, next(texts), console=console(stderr=True)) as bar:
+        task = bar.add_task(title, total=None, text="")
+        yield lambda done, total, text="": bar.update(task, completed=done, total=total, text=text)
 
 
-def _advance(bar: Progress, title: str, total: int) -> Callable[[int, str], None]:
-    task = bar.add_task(title, total=total, text="")
+def _plain_lines(title: str) -> Callable[..., None]:
+    shown = -1
 
-    def advance(done: int, text: str = "") -> None:
-        bar.update(task, completed=done, text=text)
-
-    return advance
-
-
-def _plain_lines(title: str, total: int) -> Callable[[int, str], None]:
-    shown, parts = -1, 50 if total >= 2000 else 10
-
-    def advance(done: int, text: str = "") -> None:
+    def advance(done: int, total: int, text: str = "") -> None:
         nonlocal shown
-        part = parts * done // max(1, total)
+        part = (50 if total >= 2000 else 10) * done // max(1, total)
         if part > shown:
             shown = part
             typer.echo(f"{title} {done}/{total} {text}".rstrip(), err=True)
@@ -148,14 +132,31 @@ def _plain_lines(title: str, total: int) -> Callable[[int, str], None]:
 
 
 def called() -> str:
-    """How to call kerv from here: by name where the shell finds it, else as it was called now."""
+    """The command to show in hints: `kerv` where the shell finds it, else the path of this script."""
     import shutil
 
     return "kerv" if shutil.which("kerv") or not sys.argv[0].endswith("kerv") else os.path.relpath(sys.argv[0])
 
 
 def console(stderr: bool = False) -> Any:
+    """A rich console; 200 columns wide where the output is no terminal."""
     from rich.console import Console
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
     return Console(stderr=stderr, width=wide, highlight=False)
+
+
+def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
+    """Prints a table; columns: its header."""
+    from rich.table import Table
+
+    table = Table(*columns, title=title)
+    for row in rows:
+        table.add_row(*map(str, row))
+    console().print(table)
+
+
+def print_figures(what: str, figures: dict[str, float], folder: object) -> None:
+    """Prints named numbers, four digits of each, and the folder of what they belong to."""
+    rows = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in figures.items())
+    print_table((what, str(folder)), rows)

@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import typer
-
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, console, edge, progress_bar
-
-if TYPE_CHECKING:
-    from kerv_cli.environments.demos.dataset import DemoManifest
+from kerv_cli.commands.common import (
+    Overrides,
+    ShowConfig,
+    ShowPlan,
+    composed,
+    edge,
+    print_plan,
+    print_table,
+    progress_bar,
+)
 
 
 @edge
 def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset."""
-    from kerv_cli.config import compose, to_yaml
-    from kerv_cli.environments import resolve_tasks, spec_of
     from kerv_cli.settings import DemosSettings, as_plain
 
-    settings = compose("demos", overrides or [], DemosSettings)
-    tasks = resolve_tasks(settings.task)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        return
+    settings = composed("demos", overrides, DemosSettings, cfg)
+    from kerv_cli.environments import resolve_tasks, spec_of
     from kerv_cli.places import artifact
 
+    tasks = resolve_tasks(settings.task)
     folder = artifact(settings.results, "demos", settings.name or "-".join(settings.task).lower())
     if plan:
         steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
         minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
-        typer.echo(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
-        return
+        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
     from kerv_cli.environments.camera import CameraConfig
     from kerv_cli.environments.demos.recording import DemoConfig, record
 
@@ -45,15 +42,7 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         workers=settings.runtime.workers,
         horizon=settings.world.horizon,
     )
-    with progress_bar("demonstrations", settings.episodes * len(tasks)) as advance:
-        manifest = record(config, folder, lambda done, total: advance(done, ""))
-    _summary(manifest, folder)
-
-
-def _summary(manifest: DemoManifest, folder: object) -> None:
-    from rich.table import Table
-
-    table = Table("task", "episodes", "mean steps", "failed seeds", title=f"demonstrations in {folder}")
-    for name, row in manifest.tasks.items():
-        table.add_row(name, str(len(row.episodes)), f"{row.mean_steps:.0f}", str(len(row.failed_seeds)))
-    console().print(table)
+    with progress_bar("demonstrations") as advance:
+        manifest = record(config, folder, advance)
+    rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
+    print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")

@@ -1,4 +1,4 @@
-"""`kerv doctor`: what works on this machine, how fast a frame is, and what mends what does not."""
+"""`kerv doctor`: checks this machine (rendering, torch, policies, disk) and names the remedy for each failure."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, console, edge
+from kerv_cli.commands.common import Overrides, ShowConfig, composed, edge, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.environments.spec import EnvironmentSpec
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Finding:
+    """The result of one check."""
+
     what: str
     ok: bool
     says: str
@@ -24,20 +26,11 @@ class Finding:
 @edge
 def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing."""
-    from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import DoctorSettings
 
-    settings = compose("doctor", overrides or [], DoctorSettings)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        return
+    settings = composed("doctor", overrides, DoctorSettings, cfg)
     findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
-    from rich.table import Table
-
-    table = Table("check", "", "finding")
-    for finding in findings:
-        table.add_row(finding.what, "ok" if finding.ok else "FAILS", finding.says)
-    console().print(table)
+    print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
     if not all(finding.ok for finding in findings):
         raise typer.Exit(1)
 
@@ -56,7 +49,7 @@ def _rendering(settings: DoctorSettings) -> list[Finding]:
 
 
 def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
-    """Draws real frames of a real world: a backend that loads but cannot draw is no backend."""
+    """Draws frames of a world and times them: a backend can load and still draw nothing."""
     import time
 
     from kerv_cli.environments.camera import CameraConfig, choose_backend
@@ -98,10 +91,8 @@ def _torch(settings: DoctorSettings) -> Finding:
 def _policies(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.errors import KervError
     from kerv_cli.places import find_target, shipped_dir
-    from kerv_cli.settings import DoctorSettings
     from kerv_cli.targets.checkpoint import read_target
 
-    assert isinstance(settings, DoctorSettings)
     findings = []
     for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
         try:

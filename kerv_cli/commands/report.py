@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, console, edge
+from kerv_cli.commands.common import Overrides, ShowConfig, composed, console, edge
 
 
 @edge
 def report(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
-    from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import ReportSettings
 
-    # study=NAME names a folder of results here; to Hydra it would be a choice among the files of conf/study
+    # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
     words = [f"only={o[6:]}" if o.startswith("study=") else o for o in overrides or []]
-    settings = compose("report", words, ReportSettings)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        return
+    settings = composed("report", words, ReportSettings, cfg)
     from kerv_cli.places import results_dir
     from kerv_cli.reporting.report import report as write_report
     from kerv_cli.reporting.summary import summary_table

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge, progress_bar
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, edge, print_table, progress_bar
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -57,50 +57,41 @@ def _run(settings: RolloutSettings, plan: bool) -> None:
     seeds = range(settings.seed, settings.seed + settings.episodes)
     records: list[EpisodeRecord] = []
     files: list[Path] = []
-    with progress_bar(settings.method, total) as advance:
+    with progress_bar(settings.method) as advance:
         for name in tasks:
             for record in run_task(settings, name, seeds):
                 if record.frames:
-                    files.append(_save(record, folder, settings))
+                    from kerv_cli.viewing.rerun_log import save_episode  # only a recording needs rerun
+
+                    path = folder / f"{record.task}-{record.seed}.rrd"
+                    files.append(save_episode(record, path, method=settings.method))
                 records.append(record)
-                advance(len(records), f"{name} {'success' if record.success else 'failure'}")
+                advance(len(records), total, f"{name} {'success' if record.success else 'failure'}")
     close_worlds()
     _summary(settings, tasks, records)
     if files:
         typer.echo(f"{len(files)} rollouts in {folder}; open one with: {called()} view {files[0]}")
 
 
-def _save(record: EpisodeRecord, folder: Path, settings: RolloutSettings) -> Path:
-    from kerv_cli.viewing.rerun_log import save_episode
-
-    path = folder / f"{record.task}-{record.seed}.rrd"
-    return save_episode(record, path, method=settings.method)
-
-
 def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[EpisodeRecord]) -> None:
-    from rich.table import Table
-
-    headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
     from kerv_cli.rollouts.policy import identity_of
 
     seen = identity_of(settings)["observation"]
     last = settings.seed + settings.episodes - 1
-    table = Table(*headers, title=f"{settings.method}, observation {seen}, seeds {settings.seed}…{last}")
-    phases = Table("phase", "ms per decode", "share", title="time by phase")
-    for name in (*tasks, "all") if len(tasks) > 1 else tasks:
-        table.add_row(name, *_figures([r for r in records if name in ("all", r.task)]))
+    names = (*tasks, "all") if len(tasks) > 1 else tasks
+    rows = [(name, *_figures([r for r in records if name in ("all", r.task)])) for name in names]
+    headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
+    print_table(headers, rows, f"{settings.method}, observation {seen}, seeds {settings.seed}…{last}")
     decodes = [d for r in records for d in r.decodes]
     total = sum(d.seconds for d in decodes)
-    for phase in decodes[0].phases:
-        seconds = sum(d.phases[phase] for d in decodes)
-        phases.add_row(phase, f"{1000 * seconds / len(decodes):.2f}", f"{seconds / total:.0%}")
-    console().print(table)
-    console().print(phases)
+    seconds = {phase: sum(d.phases[phase] for d in decodes) for phase in decodes[0].phases}
+    rows = [(phase, f"{1000 * s / len(decodes):.2f}", f"{s / total:.0%}") for phase, s in seconds.items()]
+    print_table(("phase", "ms per decode", "share"), rows, "time by phase")
 
 
 def _figures(records: list[EpisodeRecord]) -> list[str]:
     steps = sum(r.steps for r in records)
-    rounds = [x for r in records for d in r.decodes for x in d.rounds if x.tree_size and x.mode != "skip"]
+    rounds = [x for r in records for d in r.decodes for x in d.rounds if x.is_verification]
     per_round = [
         f"{sum(getattr(x, field) for x in rounds) / len(rounds):.2f}" if rounds else "–"
         for field in ("committed", "accepted")

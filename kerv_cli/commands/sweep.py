@@ -1,4 +1,4 @@
-"""`kerv sweep`: run a study's settings over tasks and seeds; go on where it was cut."""
+"""`kerv sweep`: run a study's settings over tasks and seeds; an interrupted sweep resumes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.settings import RuntimeSettings
@@ -58,21 +58,19 @@ def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
 
 
 def _print_plan(cells: list[Cell], store: StudyStore, workers: int) -> None:
-    from rich.table import Table
-
     from kerv_cli.studies.estimate import estimate
     from kerv_cli.studies.plan import seeds_text
 
     by_label: dict[str, list[Cell]] = {}
     for cell in cells:
         by_label.setdefault(cell.label, []).append(cell)
-    table = Table("setting", "to run", "reused", "tasks", "seeds", "repeats", title=f"study {store.name}")
+    rows = []
     for label, own in by_label.items():
         reused = sum(store.has_cell(cell.id) for cell in own)
         seeds = seeds_text(seed for cell in own for seed in cell.seeds)
         tasks, repeats = len({cell.task for cell in own}), len({cell.repeat for cell in own})
-        table.add_row(label, *map(str, (len(own) - reused, reused, tasks, seeds, repeats)))
-    console().print(table)
+        rows.append((label, len(own) - reused, reused, tasks, seeds, repeats))
+    print_table(("setting", "to run", "reused", "tasks", "seeds", "repeats"), rows, f"study {store.name}")
     time = estimate(cells, store, workers, SECONDS_PER_EPISODE)
     typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kerv_cli.commands.common import ShowConfig, edge
+from kerv_cli.commands.common import ShowConfig, composed, edge
 
 
 @edge
@@ -19,15 +19,11 @@ def view(
     summary: Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")] = False,
 ) -> None:
     """Open recordings in the Rerun viewer; without a display, print the command that does."""
-    from kerv_cli.config import compose, to_yaml
     from kerv_cli.settings import ViewSettings
 
     words = arguments or []
     overrides = [w for w in words if w.split("=", 1)[0] == "results" and "=" in w]
-    settings = compose("view", overrides, ViewSettings)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        return
+    settings = composed("view", overrides, ViewSettings, cfg)
     from kerv_cli.viewing.viewer import find_recordings, open_recording, read_summary
 
     places = [Path(w) for w in words if w not in overrides] or [Path(settings.results)]

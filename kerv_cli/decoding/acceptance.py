@@ -15,14 +15,15 @@ Bounds = Sequence[tuple[int, int]]
 
 @dataclass(frozen=True)
 class Accepted:
-    """The best accepted path (node indices, root to leaf) and the best rejected candidate behind it, or None."""
+    """Result of an acceptance rule. path: node indices of the best accepted path, from depth 0 down. rejected: the
+    child of its last node that is nearest to the target token there; None without children."""
 
     path: tuple[int, ...]
     rejected: int | None
 
 
 def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Accepted:
-    """Accept a node when abs(token − target token at its parent) ≤ the limit of its DoF and its parent was accepted.
+    """Accepts a node when its parent is accepted and abs(token − target token behind the parent) ≤ its DoF's limit.
 
     target_tokens: 1 + n, the first for the position after the last committed token, then after each node.
     start: index in the chunk of the nodes of depth 0. limits: r per DoF, in bins; all zero is strict.
@@ -55,11 +56,11 @@ def accept_by_group(
 ) -> Accepted:
     """HeiSD's `sequence` rule: a kinematic group of one control step is accepted or not as a whole.
 
-    A group is accepted when its abs biases (token − target token at its parent) are each ≤ the limit of their DoF and
-    sum to at most `group_limit`. A rejected group ends the path at its first token. So does an incomplete one: where a
-    path leaves the tree inside a group, that group's tokens are not accepted. `start` may lie inside a group: its
-    remaining tokens are then judged as a group of their own. In the decode loop nothing is lost by that: accepted paths
-    end with a group, so what is committed of a begun group are target tokens, with bias 0.
+    A group is accepted when the biases of its tokens, abs(token − target token behind its parent), are each ≤ the limit
+    of their DoF and sum to at most `group_limit`. A rejected group ends the path at its first token. So does an
+    incomplete one: where a path leaves the tree inside a group, that group's tokens are not accepted. `start` may lie
+    inside a group: its remaining tokens are then judged as a group of their own. In the decode loop the committed ones
+    are target tokens, with bias 0: accepted paths end with a whole group, and only a bonus begins another.
 
     target_tokens, start, limits: as in `accept_by_distance`. `rejected` is the first token of the group that ended the
     path.
@@ -86,7 +87,7 @@ def accept_by_group(
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """The child of `node` that is closest to the target's token there."""
+    """The child of `node` (or ROOT) whose token is nearest to the target token behind `node`; None without children."""
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
@@ -106,13 +107,14 @@ class Acceptance:
     token_limit: int = 0
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """The rule for drafts of `proposer`: `hybrid` judges retrieved ones by `sequence`, all others by `relaxed`."""
+        """The rule for drafts of `proposer`: under `hybrid`, `sequence` for retrieved ones and `relaxed` for others."""
         if self.kind != "hybrid":
             return self
         return replace(self, kind="sequence" if proposer == "retrieval" else "relaxed")
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Bins per DoF that a draft may be off: `r`, or the rule's own."""
+        """Largest accepted distance per DoF, bins (D,): 0 for `strict`, `token_limit` for `sequence`, `r` otherwise; 0
+        for strict DoFs under `sequence` and `strict_dofs`."""
         if self.kind == "strict":
             return (0,) * self.space.dofs
         limit = self.token_limit if self.kind == "sequence" else r

@@ -1,7 +1,7 @@
-"""Which proposer drafts now: retrieval or the drafter (METHODS §4.4; HeiSD).
+"""Which side of a hybrid proposer drafts, retrieval or the drafter (docs/methods.md §4.4; HeiSD).
 
 R is the radius of curvature of the measured end-effector path, D its length. A straight, fast reach (large R, large D)
-repeats what demonstrations hold; a tight or slow path is precise work, which the drafter does better.
+repeats demonstrated motion; a tight or slow path is precise work, for which the drafter is better.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from kerv_cli.errors import CheckpointError
 Mode = Literal["retrieval", "drafter"]
 
 LEAST = 3  # positions; fewer have no curvature
-STILL = 1e-3  # metres; a hand whose path is shorter stands still (one control step at full speed is 10 mm)
+STILL = 1e-3  # metres; a hand with a shorter path counts as still (in Meta-World a control step at full speed is 10 mm)
 COINCIDENT = 1e-7  # metres of spread; below it float32 positions are the same point
 STRAIGHT = 1e-6  # spread across the path by the spread along it; below it the points lie on a line
 
@@ -29,7 +29,7 @@ def radius_of_curvature(points: np.ndarray) -> float:
 
     The best-fit plane by singular values, in it Taubin's algebraic circle fit, which is exact on arcs. Centred and
     scaled to unit mean square, the fit's smallest singular vector (a, b, c) over [(z − 1) / 2, x, y], z = x² + y²,
-    gives R = scale / |a|. Infinite for fewer than three points, a hand that stands still and a straight line.
+    gives R = scale / |a|. Infinite for fewer than three points, a hand at rest and a straight line.
 
     Raises:
         ValueError: points of another shape.
@@ -59,10 +59,12 @@ def path_length(points: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class BoundaryRanges:
-    """What R and D of the training demonstrations range over: the minimum and the 95th percentile, in metres.
+    """Ranges of R and D over the training demonstrations: minimum and 95th percentile, metres.
 
-    Infinite radii (straight lines, a hand at rest) do not enter the ranges: one straight reach would make every other
-    radius zero.
+    Infinite radii (straight lines, a hand at rest) are left out: one straight reach would make every other radius zero.
+
+    Raises:
+        CheckpointError: no range between finite numbers.
     """
 
     radius_low: float
@@ -77,8 +79,9 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
-        """paths: (T, 3) measured positions of whole episodes, metres. Every window that the running system would see
-        counts, the short ones of an episode's beginning included.
+        """Ranges over every window that decoding would see, including the short ones at an episode's beginning.
+
+        paths: (T, 3) measured positions of whole episodes, metres.
 
         Raises:
             CheckpointError: no path bends, or none moves.
@@ -96,8 +99,8 @@ class BoundaryRanges:
         return cls(float(radii.min()), next(high), float(lengths.min()), next(high))
 
     def normalise(self, radius: float, length: float) -> tuple[float, float]:
-        """(R̂, D̂) in [0, 1], clipped. An infinite radius is 1 where the hand moves: a straight reach. Where it stands
-        still R̂ is 0: otherwise a hand at rest would count as half a reach and call for retrieval."""
+        """(R̂, D̂) in [0, 1], clipped. R̂ is 1 for an infinite radius of a moving hand (a straight reach) and 0 for a hand
+        at rest, whose radius is infinite too."""
         scaled = 0.0
         if length >= STILL:
             scaled = min(1.0, max(0.0, (radius - self.radius_low) / (self.radius_high - self.radius_low)))
@@ -111,22 +114,24 @@ class BoundaryRanges:
 
 @dataclass(frozen=True)
 class Choice:
-    """Who drafts, and the metric F it was decided by; None where no metric was taken."""
+    """A boundary's decision: which side drafts, and F where the decision used it."""
 
     mode: Mode
     metric: float | None = None
 
 
 class Boundary(Protocol):
+    """Chooses the side of a hybrid proposer that drafts the next chunk."""
+
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """path (n, 3): the episode's measured positions up to now, metres, oldest first; the newest `window` count."""
 
     def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """The episode's own random numbers: the same whatever ran before it and in whichever process."""
+        """Generator for one episode; depends on the boundary's seed, the task and the episode's seed alone."""
 
 
 class Seeded:
-    """A boundary whose random numbers follow from its own seed, the task and the episode's seed."""
+    """Base of all boundaries: the episode's generator."""
 
     seed = 0
 
@@ -137,7 +142,7 @@ class Seeded:
 
 @dataclass(frozen=True)
 class Always(Seeded):
-    """One side, always."""
+    """The same side for every chunk."""
 
     mode: Mode
 
@@ -148,7 +153,7 @@ class Always(Seeded):
 
 @dataclass(frozen=True)
 class Random(Seeded):
-    """Retrieval with probability p."""
+    """Retrieval with probability p, without looking at the path: a control."""
 
     p: float
     seed: int = 0

@@ -1,6 +1,6 @@
-"""Each part's settings become the part: the functions that the registry names, and `compose`, which calls them.
+"""Builds parts from their settings: the functions that the registry names, and `compose`, which calls them.
 
-A build function takes (settings, context) and returns the part, or None where there is nothing to do.
+A build function takes (settings, context) and returns the part, or None for the absence of one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kerv_cli.decoding.rectify import DRAFT, Compensation
 from kerv_cli.decoding.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
 from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
 from kerv_cli.errors import UsageError
-from kerv_cli.parts import METHOD_KINDS, PREFILL, PredictionProposerSettings, RetrievalProposerSettings
+from kerv_cli.parts import METHOD_KINDS, PREFILL, RetrievalProposerSettings, part_of
 from kerv_cli.registry import find
 from kerv_cli.targets.protocol import Target
 
@@ -37,7 +37,8 @@ LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at le
 
 @dataclass(frozen=True)
 class Context:
-    """What a part is built from. artifact: kind -> the loaded artifact. built: the method's parts so far, by kind."""
+    """The surroundings of a part. artifact: kind -> the loaded artifact. task: full name, or empty. built: the method's
+    parts so far, by kind."""
 
     target: Any  # a Target; some parts want a ReadableTarget
     artifact: Callable[[str], Any]
@@ -46,25 +47,24 @@ class Context:
 
     @property
     def calibration(self) -> Calibration:
-        """What `kerv calibrate` fitted."""
+        """The calibration of the target."""
         loaded: Calibration = self.artifact("calibration")
         return loaded
 
 
 def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
-    """Refuse parts that do not belong together, and numbers out of range, before anything heavy is loaded.
+    """Refuses parts that do not belong together, and numbers out of range, before anything heavy is loaded.
 
     method: kind -> settings, for every kind of METHOD_KINDS. chunk: asked for; trained: H of the target.
 
     Raises:
         UnknownName: no such part. UsageError: a composition that cannot work, or a number out of range.
     """
-    chosen = {kind: find(registry_kind(kind), method[kind].kind, f"{kind}.kind") for kind in METHOD_KINDS}
+    chosen = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
     for kind, part in chosen.items():
         if not isinstance(method[kind], part.settings):
             raise UsageError(f"{kind}.kind={part.name}: choose {kind}={part.name}, each has settings of its own")
-        if part.check is not None:
-            part.check(method[kind])
+        part.check_settings(method[kind], kind)
     steps_of(chunk, trained)
     proposer, boundary, draft = chosen["proposer"], chosen["boundary"], chosen["prefill_draft"]
     if bool(proposer.traits.get("sides")) != bool(boundary.traits.get("chooses")):
@@ -84,16 +84,9 @@ def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
         )
 
 
-def registry_kind(kind: str) -> str:
-    """The registry's kind of a method's part: what drafts before the prefill is an ordinary proposer."""
-    return "proposer" if kind == "prefill_draft" else kind
-
-
 def needs(method: Mapping[str, Any]) -> tuple[str, ...]:
     """The kinds of artifacts that a method's parts read, each once, in the order of its parts."""
-    wanted = [
-        need for kind in METHOD_KINDS for need in find(registry_kind(kind), method[kind].kind).needs(method[kind])
-    ]
+    wanted = (need for kind in METHOD_KINDS for need in part_of(kind, method[kind].kind).needs(method[kind]))
     return tuple(dict.fromkeys(wanted))
 
 
@@ -106,8 +99,8 @@ def compose(
 ) -> Decoder:
     """The decoder of a method around a target.
 
-    method: kind -> settings. artifact: kind -> the loaded artifact, asked for what `needs` names and nothing else.
-    task: whose calibrated levels hold, where a part has one per task. chunk: H; 0: the target's.
+    method: kind -> settings. artifact: kind -> the loaded artifact; called for the kinds in `needs` alone. task: full
+    name, for parts whose calibrated levels differ between tasks. chunk: H; 0: the target's.
 
     Raises:
         UsageError: as `check`. CheckpointError: an artifact is missing or belongs to another target.
@@ -115,13 +108,12 @@ def compose(
     check(method, chunk, target.chunk)
     context = Context(target, artifact, task)
     for kind in METHOD_KINDS:
-        part = find(registry_kind(kind), method[kind].kind)
-        context.built[kind] = part.built(method[kind], context)
+        context.built[kind] = part_of(kind, method[kind].kind).built(method[kind], context)
     return Decoder(target, Parts(**context.built), chunk)
 
 
 def nothing(settings: Any, context: Context) -> None:
-    """Parts that stand for the absence of one."""
+    """Choices that stand for the absence of a part: none, reinfer, always."""
 
 
 def drafter(settings: Any, context: Context) -> DrafterProposer:
@@ -134,7 +126,7 @@ def early(settings: Any, context: Context) -> EarlyProposer:
     return EarlyProposer(context.artifact("early"), context.target)
 
 
-def prediction(settings: PredictionProposerSettings, context: Context) -> PredictionProposer:
+def prediction(settings: Any, context: Context) -> PredictionProposer:
     """proposer=hold, linear, kalman, …"""
     return PredictionProposer(predictor(settings.kind, context))
 
@@ -198,13 +190,11 @@ def threshold(settings: Any, context: Context) -> thresholds.Threshold:
     """All thresholds; K_S is the task's, from the calibration, where none is given.
 
     Raises:
-        UsageError: a radius that no token is away from another.
+        UsageError: a radius above the largest distance of two tokens.
     """
-    most = context.target.actions.tokens - 1
-    largest = settings.r if settings.kind == "fixed" else settings.r_max
-    if largest > most:
-        name = "r" if settings.kind == "fixed" else "r_max"
-        raise UsageError(f"threshold.{name}={largest}: bins from 0 to {most}")
+    most, name = context.target.actions.tokens - 1, "r" if settings.kind == "fixed" else "r_max"
+    if getattr(settings, name) > most:
+        raise UsageError(f"threshold.{name}={getattr(settings, name)}: bins from 0 to {most}")
     if settings.kind == "fixed":
         return thresholds.Fixed(settings.r)
     if settings.kind == "schedule":
@@ -230,10 +220,10 @@ def always_skip(settings: Any, context: Context) -> AlwaysSkip:
 
 
 def similarity_skip(settings: Any, context: Context) -> VerifySkip:
-    """skip=similarity; it looks up what the method's proposer looks up, where that retrieves."""
+    """skip=similarity; it shares the retrieval of the method's proposer, where that retrieves."""
     own: Proposer | None = context.built["proposer"]
     found = own.sides["retrieval"] if isinstance(own, HybridProposer) else own
-    if not isinstance(found, RetrievalProposer):  # nothing else of the method retrieves
+    if not isinstance(found, RetrievalProposer):
         found = RetrievalProposer(context.artifact("datastore"), context.target, 1, 1)
     if settings.s_min is not None:
         return VerifySkip(settings, found, SkipLevels(settings.s_min, settings.s_min, settings.s_min))

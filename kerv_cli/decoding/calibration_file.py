@@ -1,4 +1,4 @@
-"""The calibration file: what was fitted on training demonstrations, read back and checked (docs/methods.md §3, §4).
+"""The calibration file: figures fitted on training demonstrations, read and checked (docs/methods.md §3, §4).
 
 `kerv calibrate` writes it (training/calibration.py); thresholds, predictors, boundaries and verify-skip read it.
 """
@@ -9,36 +9,26 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from kerv_cli.artifacts import Artifact, Request
+from kerv_cli.artifacts import Artifact, MadeFor, Request
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.drafting.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import sha256_of, write_json
 from kerv_cli.manifests import read_file
 from kerv_cli.places import artifact, beside
-from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 
 FORMAT = 2
 FILE = "calibration.json"
-NEVER = 1.01  # a similarity that no neighbour reaches: the task is never skipped
+NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
 AGAIN = "run 'kerv calibrate' again"
 Errors = dict[str, dict[str, dict[str, list[float]]]]
 """predictor -> task -> DoF -> mean absolute error 1 … H steps ahead, normalised action units."""
 
 
 @dataclass(frozen=True)
-class CalibratedTarget:
-    """Whom the figures are for: SHA-256 of the target's weights, H, and its action space."""
-
-    sha256: str
-    chunk: int
-    actions: ActionSpace
-
-
-@dataclass(frozen=True)
 class Demonstrations:
-    """What the figures are from. tasks: task -> {"training": episodes, "held_out": episodes}."""
+    """The demonstrations of a calibration, by hash. tasks: task -> {"training": episodes, "held_out": episodes}."""
 
     sha256: str
     tasks: dict[str, dict[str, int]]
@@ -46,7 +36,7 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """How K is spread over the pre-sampled decodes of a task, normalised action units."""
+    """Distribution of K over the pre-sampled decodes of a task, normalised action units; p25, p90: percentiles."""
 
     k_s: float  # the reference level K_S
     decodes: int
@@ -74,8 +64,9 @@ class BoundarySection:
 
 @dataclass(frozen=True)
 class SkipLevel:
-    """From which similarity on a task's retrieved chunk is executed unverified, and what that would have skipped in the
-    datastore itself (§4.3)."""
+    """Verify-skip levels of a task (§4.3), cosines. share: part of the datastore's `entries` that s_min would skip,
+    with another episode's best neighbour. within: part of those with an error of at most epsilon. error: their mean
+    error, normalised action units."""
 
     s_min: float
     low: float
@@ -102,9 +93,9 @@ class SkipSection:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What `calibration.json` holds; `boundary` and `skip` are None and `variability` is empty where not taken."""
+    """Contents of `calibration.json`; `boundary` and `skip` are None and `variability` is empty where not measured."""
 
-    target: CalibratedTarget
+    target: MadeFor
     demos: Demonstrations
     window: int  # control steps of history
     noise: dict[str, Noise]  # per kind of filter
@@ -138,7 +129,7 @@ class Calibration:
         return self.variability[task].k_s
 
     def ranges(self, window: int) -> BoundaryRanges:
-        """What the boundary's R and D are normalised with when it looks at `window` positions.
+        """Ranges that normalise R and D for a boundary with a window of `window` positions.
 
         Raises:
             CheckpointError: none were taken, or none over so many positions.
@@ -185,8 +176,8 @@ class Calibration:
 
 
 def calibration_place(results: str, name: str | None, target: Path) -> Path:
-    """The file of the named calibration, else of the one beside the target: shipped in pretrained/<name>, made here in
-    artifacts/calibration/<name>."""
+    """Path of the named calibration, else of the target's: pretrained/<name>/calibration.json where it is shipped,
+    artifacts/calibration/<name>/calibration.json where it was made here."""
     if name is not None:
         return artifact(results, "calibration", name) / FILE
     if target.name == "target":
@@ -200,7 +191,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The calibration at `path`, whoever it was made for.
+    """The calibration at `path`, of any target.
 
     Raises:
         CheckpointError: missing, damaged or of another format.
@@ -220,17 +211,8 @@ def load_calibration(path: Path, description: TargetDescription) -> Calibration:
         CheckpointError: missing, damaged, of another format, target, action space or chunk length.
     """
     loaded = read_calibration(path)
-    loaded.target.actions.check_same(description.actions, str(path), "the target", statistics=True)
-    if loaded.target.chunk != description.chunk:
-        raise CheckpointError(
-            f"{path} was made for chunks of {loaded.target.chunk} steps, not of {description.chunk}: "
-            "run 'kerv calibrate'"
-        )
-    if loaded.target.sha256 != description.sha256:
-        raise CheckpointError(
-            f"{path} was made for target {loaded.target.sha256[:12]}, not for {description.sha256[:12]}: "
-            "run 'kerv calibrate'"
-        )
+    own = MadeFor(description.sha256, description.actions, description.chunk)
+    loaded.target.check_same(own, str(path), "made", "run 'kerv calibrate'")
     return loaded
 
 

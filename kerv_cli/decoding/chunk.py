@@ -1,4 +1,4 @@
-"""The chunk being decoded, what is known before the target runs, and the clock: what the parts of a decode share."""
+"""What the parts of a decode share: the chunk, the situation before it, the clock; the protocols of proposers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from kerv_cli.targets.protocol import Cache
 
 
 class Clock:
-    """Seconds by phase between two synchronised ends."""
+    """Stopwatch of one decode: seconds per phase; on CUDA it synchronises before reading the time."""
 
     def __init__(self, device: torch.device) -> None:
         self.cuda = device.type == "cuda"
@@ -34,13 +34,13 @@ class Clock:
         return time.perf_counter()
 
     def lap(self, phase: str) -> None:
-        """Everything since the last lap belongs to `phase`."""
+        """Adds the time since the last lap to `phase`."""
         now = self._now()
         self.phases[phase] += now - self.last
         self.last = now
 
     def stop(self) -> float:
-        """Seconds since the clock was made; what no lap claimed belongs to `other`."""
+        """Seconds since the clock was made; the time since the last lap is added to `other`."""
         self.lap("other")
         return self.last - self.began
 
@@ -58,8 +58,8 @@ def steps_of(asked: int, trained: int) -> int:
 
 @dataclass(frozen=True)
 class Situation:
-    """What is known before the target runs. history: executed actions, normalised, oldest first; path: measured
-    end-effector positions (3,), metres; random: the episode's own numbers, for boundaries that draw lots."""
+    """The episode before a decode. history: executed actions, normalised, oldest first. path: measured end-effector
+    positions (3,), metres. random: the boundary's generator, seeded per episode."""
 
     task: str
     history: ActionHistory
@@ -69,8 +69,9 @@ class Situation:
 
 @dataclass(frozen=True)
 class Rejection:
-    """What a verification knew behind the accepted path. draft: the rejected draft's tokens behind its rejected one.
-    target: the target's tokens behind the rejected token and behind those, right if the draft was."""
+    """What a verification found behind the accepted path. draft: the rejected draft's tokens behind its rejected token.
+    target: target tokens behind the rejected token and behind those; valid only if the tokens before them had been
+    right."""
 
     draft: tuple[int, ...] = ()
     target: tuple[int, ...] = ()
@@ -79,9 +80,9 @@ class Rejection:
 class Chunk:
     """The N tokens of one decode. Only its own methods change what is committed; the parts of a method read it.
 
-    prompt (1, P, E), size N, limits: bins per DoF that a draft may be off, on which it depends what is worth drafting.
-    choice: which side drafts, where a boundary decides. The cache holds the prompt and every committed token but the
-    last; `hidden` (1, P + c − 1, E) are the target's states there once the first c tokens are committed.
+    prompt: (1, P, E). size: N. limits: r per DoF in bins; early drafters choose their tokens by it. choice: which side
+    drafts, where a boundary decides. The cache holds the prompt and every committed token but the
+    last; `hidden` (1, P + c − 1, E) are the target's states there after the prefill, which committed c tokens.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class Chunk:
         self.hidden = torch.empty(0)
         self.forwards = 0
         self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
-        self.similarity: float | None = None  # of the best stored chunk, where one was looked up
+        self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
         self.closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property
@@ -122,80 +123,77 @@ class Chunk:
 
     @property
     def left(self) -> int:
-        """Tokens still to be decoded; none once the chunk was closed."""
+        """Tokens still to be decoded; 0 after a rectifier closed the chunk."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
     @property
     def variability(self) -> float | None:
-        """K: mean difference of draft and target over the judged tokens, normalised action units; strict DoFs left out,
-        of which one flip would outweigh all others. None where none was judged (§3.2)."""
+        """K: mean difference of draft and target over the judged tokens, normalised action units; None where none was
+        judged. Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2)."""
         return float(np.mean(self._differences)) if self._differences else None
 
-    def encoded(self, hidden: Tensor) -> None:
-        """The prompt, and what of a draft behind it was accepted, has the states hidden (1, P + c − 1, E)."""
-        self.hidden = hidden
-
     def commit(self, played: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
-        """A forward ended: `tokens` are committed, `played` tells how."""
+        """Commits `tokens` after a forward; `played` is its record."""
         self.forwards += 1
         self.tokens += tokens
         self.rounds.append(played)
         self.rejection = rejection or Rejection()
         if played.drafted:
-            judged = np.array(played.drafted), np.array(played.target_tokens[: len(played.drafted)])
-            drafted, wanted = map(self.space.values_of, judged)
+            both = np.array((played.drafted, played.target_tokens[: len(played.drafted)]))
+            drafted, wanted = self.space.values_of(both)
             moving = ~self.space.strict_tokens(self.size)[played.start : played.start + len(drafted)]
             self._differences += np.abs(drafted - wanted)[moving].tolist()
 
     def skip(self, tokens: Sequence[int], proposer: str) -> None:
-        """All N tokens are `proposer`'s, without a verification."""
+        """Takes all N tokens from `proposer`, without a verification."""
         self.tokens = list(tokens[: self.size])
         self.rounds.append(Round("skip", proposer, 0, tuple(self.tokens), (), self.size, self.size, 0, ()))
 
     def close(self, values: np.ndarray, with_target_token: bool) -> None:
-        """The chunk ends with values (steps, D), normalised: its committed tokens, then predictions. Without the target
-        token at the rejected position, that one is taken back."""
+        """Ends the chunk with values (steps, D), normalised: its committed tokens, then predictions. with_target_token:
+        whether the target token at the rejected position stays committed."""
         if not with_target_token:
             del self.tokens[-1]
             self.rounds[-1] = self.rounds[-1].without_bonus()
         del self.tokens[values.size :]
         self.closed = values
 
-    def looked_up(self, similarity: float) -> None:
-        """The best stored chunk is this similar to what is seen, cosine."""
-        self.similarity = similarity
-
 
 class DraftsChunks(Protocol):
-    """Drafts whole chunks without the target's states: what a merged draft is made of."""
+    """A source of merged drafts: drafts whole chunks without the target's hidden states."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """As in the record, e.g. `early`."""
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Tokens behind the committed ones, at most `depth` each, the best first; none where nothing is known."""
+        """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
+        it has no draft."""
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether it expects its first chain to be accepted whole."""
 
 
 class Proposer(Protocol):
-    """Drafts a tree behind the committed tokens. `name` goes into the record; `needs_states` says whether it reads the
-    target's hidden states: one that does not can also draft before the prefill. `nodes`: the largest tree it proposes;
-    0: at most a chunk's tokens."""
+    """Drafts a tree behind the committed tokens."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """As in the record, e.g. `drafter`."""
+
     @property
-    def needs_states(self) -> bool: ...
+    def needs_states(self) -> bool:
+        """Whether it reads the target's hidden states, so that it cannot draft before the prefill."""
+
     @property
-    def nodes(self) -> int: ...
+    def nodes(self) -> int:
+        """Most nodes of its trees, for which the cache has room; 0: as many as the chunk has tokens."""
 
     def begin(self, chunk: Chunk) -> None:
-        """The prompt is encoded and the first tokens are committed."""
+        """Called once per chunk, when the prompt is encoded and the first tokens are committed."""
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        """A tree of depth ≤ `depth`; an empty one means that nothing is drafted this round."""
+        """A tree of depth ≤ `depth`; an empty one where it has no draft."""
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the

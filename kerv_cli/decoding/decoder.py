@@ -26,11 +26,11 @@ from kerv_cli.targets.protocol import Target
 
 @dataclass(frozen=True)
 class Parts:
-    """What a method is made of; the defaults are autoregressive decoding.
+    """The parts of a method; the defaults are autoregressive decoding.
 
-    prefill_draft: drafts before the prefill, which then verifies it (§5). proposer: drafts behind committed tokens.
-    rectifier: ends a chunk after a rejection; without one the target decodes on. boundary: chooses between the sides of
-    a hybrid proposer. skip: executes a draft unverified.
+    prefill_draft: makes the in-prefill draft, which the prefill verifies (§5). proposer: drafts behind committed
+    tokens. rectifier: ends a chunk after a rejection; without one the target decodes on. boundary: chooses between the
+    sides of a hybrid proposer. skip: executes a retrieved chunk without verification.
     """
 
     acceptance: Acceptance | None = None  # None: strict
@@ -43,13 +43,17 @@ class Parts:
 
 
 class Decoder:
-    """A target and the parts of a method. One episode at a time, batch of one.
+    """Decodes chunks with one target and one method; one episode at a time, batch of one.
 
-    decode() times itself: from the observation handed in to the actions handed back, synchronised at both ends.
+    decode() times itself, from the observation to the actions, with the device synchronised at both ends.
     """
 
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
-        """chunk: H, control steps decoded at once; 0: as many as the target was trained for."""
+        """chunk: H, control steps decoded at once; 0: as many as the target was trained for.
+
+        Raises:
+            UsageError: a longer chunk, or an in-prefill draft that reads the target's states.
+        """
         self.target, self.parts = target, parts or Parts()
         draft = self.parts.prefill_draft
         if draft is not None and draft.needs_states:
@@ -117,7 +121,7 @@ class Decoder:
         )
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
-        """(steps, D) float32 in environment units, and how many of its numbers were predicted."""
+        """The chunk's actions (steps, D) float32 in environment units, and how many of their numbers were predicted."""
         space = self.target.actions
         if chunk.closed is None:
             return space.decode(np.array(chunk.tokens).reshape(-1, space.dofs)).astype(np.float32), 0
@@ -146,38 +150,34 @@ class Decoder:
         return chunk
 
     def prefill(self, chunk: Chunk, clock: Clock) -> None:
-        """The first forward: encodes the prompt and, with an in-prefill draft, verifies that too."""
+        """The first forward: the prompt and, where there is an in-prefill draft, the draft behind it, to verify it."""
         tree, prompt, target, draft = EMPTY, chunk.prompt, self.target, self.parts.prefill_draft
         if draft is not None and chunk.size > 1:
-            # as in a round: the bonus fills the last place
+            # one token less than the chunk has, as in a round: the bonus fills the last place
             tree = draft.propose(chunk, chunk.size - 1)
             clock.lap("propose")
-        length = chunk.prompt_length
-        chunk.cache.length = 0
-        if not len(tree):
-            hidden = target.forward(prompt, torch.arange(length, device=prompt.device), chunk.cache)
-            chunk.encoded(hidden)
-            token = int(target.head(hidden[:, -1]).argmax())
-            chunk.commit(Round("prefill", "none", 0, (), (token,), 0, 1, 0, ()), [token])
-            clock.lap("prefill")
-            return
-        x = torch.cat([prompt, target.embed(torch.tensor([tree.tokens], device=prompt.device))], 1)
+        length, x, seen = chunk.prompt_length, prompt, None
+        if len(tree):
+            x = torch.cat([prompt, target.embed(torch.tensor([tree.tokens], device=prompt.device))], 1)
+            seen = None if tree.is_chain else visible_in_prefill(tree, length)
         positions = torch.tensor([*range(length), *(length + d for d in tree.depths)], device=prompt.device)
-        seen = None if tree.is_chain else visible_in_prefill(tree, length)
-        hidden = target.forward(x, positions, chunk.cache, seen)
+        chunk.cache.length = 0
+        chunk.hidden = hidden = target.forward(x, positions, chunk.cache, seen)
         target_tokens = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
         clock.lap("prefill")
         path = self.accept(chunk, tree, target_tokens, draft)
         clock.lap("accept")
+        if not len(tree):
+            return
         slots = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
         chunk.cache.compact(length, slots)
-        chunk.encoded(torch.cat([hidden[:, :length], hidden[:, slots]], 1))
+        chunk.hidden = torch.cat([hidden[:, :length], hidden[:, slots]], 1)
         clock.lap("prefill")
         self.rectify(chunk)
         clock.lap("rectify")
 
     def round(self, chunk: Chunk, clock: Clock) -> None:
-        """One draft, one forward, one decision. Without a draft it decodes one token."""
+        """One round: propose, verify, accept, commit, rectify. Without a draft the forward decodes one token."""
         tree, proposer = EMPTY, self.parts.proposer
         if proposer is not None and chunk.left > 1:
             # one token less than is left: the bonus fills the last place whether or not everything is accepted
@@ -200,7 +200,7 @@ class Decoder:
             clock.lap("propose")
 
     def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:
-        """Forward [last committed token, tree] -> hidden (1, 1 + n, E) and the argmax behind each of them."""
+        """Forwards the last committed token and the tree's n nodes -> hidden (1, 1 + n, E), the 1 + n target tokens."""
         device = self.target.device
         at = chunk.prompt_length + len(chunk.tokens) - 1
         tokens = torch.tensor([[chunk.tokens[-1], *tree.tokens]], device=device)
@@ -212,11 +212,11 @@ class Decoder:
     def accept(
         self, chunk: Chunk, tree: TokenTree, target_tokens: Sequence[int], proposer: Proposer | None
     ) -> tuple[int, ...]:
-        """Commit the best accepted path and, where a place is left, the bonus; record the round -> the path's nodes."""
+        """Commits the best accepted path and, where a place is left, the bonus -> the path's nodes."""
         start = len(chunk.tokens)
         if not len(tree) or proposer is None:
             token = target_tokens[0]
-            chunk.commit(Round("decode", "none", start, (), (token,), 0, 1, 0, ()), [token])
+            chunk.commit(Round("decode" if start else "prefill", "none", start, (), (token,), 0, 1, 0, ()), [token])
             return ()
         acceptance, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
         accepted = acceptance.judge(tree, target_tokens, start, r)
@@ -241,7 +241,7 @@ class Decoder:
         return path
 
     def rectify(self, chunk: Chunk) -> None:
-        """After a rejection: let the rectifier end the chunk, if there is one and it can."""
+        """After a rejection: ends the chunk by the rectifier, if there is one and it can predict what is missing."""
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):
             return

@@ -1,4 +1,4 @@
-"""Proposers as the decode loop takes them: each turns what one room of `drafting/` knows into a token tree."""
+"""Proposers: each makes token trees for the decode loop from one module of `drafting/`."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.targets.protocol import ReadableTarget, Target
 
 EMPTY = TokenTree((), (), ())
-SURE = (
-    0.05  # odds from which no fallback draft is verified: of such chunks 89 % were accepted whole (mt10-vision, r = 9)
-)
+SURE = 0.05
+"""Estimate from which fallback sources do not draft: 89 % of such chunks were accepted whole (mt10-vision, r = 9)."""
 
 
 class Stateless:
-    """A proposer that reads nothing of the target but the committed tokens, and keeps nothing between rounds."""
+    """Base of proposers that need no hidden states and keep no state between rounds."""
 
     name = ""
     needs_states = False
     nodes = 0
 
     def begin(self, chunk: Chunk) -> None:
-        pass
+        """Nothing to prepare."""
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        pass
+        """Nothing to remember."""
 
     def is_sure(self, chunk: Chunk) -> bool:
+        """Never."""
         return False
 
 
@@ -43,26 +43,27 @@ class ChainProposer(Stateless):
     """A proposer whose draft is one chain of the chunk's remaining tokens."""
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """The first chain as a tree; empty where there is none."""
         chains = self.chains(chunk, depth)
         return TokenTree.chain(chains[0]) if chains else EMPTY
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """At most one chain of at most `depth` tokens."""
         raise NotImplementedError
 
 
 class PredictionProposer(ChainProposer):
-    """A kinematic prediction of the chunk (METHODS §3.1, §6: `hold`, `kalman_only`). Steps of the chunk that are
-    committed count as executed. Nothing is drafted before the predictor has its least history."""
+    """A kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman_only`). Committed steps of the
+    chunk count as executed. Drafts nothing while the history is shorter than the predictor's minimum."""
 
     def __init__(self, predictor: Predictor) -> None:
         self.name, self.predictor = predictor.name, predictor
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """The predicted tokens of the chunk's remaining places; none while the history is too short."""
         whole = len(chunk.tokens) // chunk.dofs
-        pending = chunk.space.values_of(np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64)).reshape(
-            whole, chunk.dofs
-        )
-        history = chunk.situation.history.values(pending)
+        pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
+        history = chunk.situation.history.values(chunk.space.values_of(pending))
         predicted = self.predictor.predict(history, chunk.steps - whole)
         if predicted is None:
             return []
@@ -71,7 +72,7 @@ class PredictionProposer(ChainProposer):
 
 
 class EarlyProposer(ChainProposer):
-    """The early drafter's chunk (METHODS §5), drafted once per observation."""
+    """The early drafter's chunk (docs/methods.md §5), drafted once per observation."""
 
     name = "early"
 
@@ -80,21 +81,23 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, list[int], float] | None = None
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
-        """Tokens, and the drafter's own odds that all of them are accepted."""
+        """The chunk's N tokens and the drafter's estimate (a product of probabilities) that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
             self._drafted = chunk, *self.early.drafted(self.target.pooled(chunk.prompt), history, radius)
         return self._drafted[1], self._drafted[2]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """The drafted tokens behind the committed ones."""
         return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
 
     def is_sure(self, chunk: Chunk) -> bool:
+        """Whether the estimate that the whole chunk is accepted reaches SURE."""
         return self.drafted(chunk)[1] >= SURE
 
 
 class RetrievalProposer(Stateless):
-    """The nearest stored chunks of the task, merged by kinematic group (METHODS §4.2)."""
+    """The nearest stored chunks of the task, merged by kinematic group (docs/methods.md §4.2)."""
 
     name = "retrieval"
 
@@ -103,27 +106,30 @@ class RetrievalProposer(Stateless):
         self._found: tuple[Chunk, Neighbours] | None = None
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
-        """Looked up once per chunk."""
+        """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
         if self._found is None or self._found[0] is not chunk:
             key = self.datastore.key(chunk.prompt, self.target)
             self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
-            chunk.looked_up(float(self._found[1].similarity[0]))
+            chunk.similarity = float(self._found[1].similarity[0])
         return self._found[1]
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """The neighbours' chunks as one tree, merged by kinematic group."""
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
         start = len(chunk.tokens)
         found: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
         return found
 
 
 class MergedProposer(Stateless):
-    """Whole drafts of several sources in one prefix tree, a branch each (METHODS §5).
+    """Merges the chains of several sources into one prefix tree (docs/methods.md §5). At most `nodes` nodes: the last
+    chains are dropped first.
 
-    fallback: sources that draft only where none of the others is sure of its chunk: every node costs time.
+    fallback: sources that draft only where none of the others is sure of its chunk, because every node costs time.
     """
 
     def __init__(self, sources: Sequence[DraftsChunks], nodes: int, fallback: Sequence[DraftsChunks] = ()) -> None:
@@ -132,6 +138,7 @@ class MergedProposer(Stateless):
         self.sources, self.fallback, self.nodes = sources, fallback, nodes
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback
@@ -146,7 +153,7 @@ class MergedProposer(Stateless):
 
 
 class HybridProposer:
-    """HeiSD: retrieval on one side of the boundary, the drafter on the other (METHODS §4.4)."""
+    """HeiSD: retrieval on one side of the boundary, the drafter on the other (docs/methods.md §4.4)."""
 
     needs_states = True
 
@@ -157,25 +164,29 @@ class HybridProposer:
 
     @property
     def name(self) -> str:
+        """Name of the side that drafts this chunk."""
         return self.chosen.name
 
     def begin(self, chunk: Chunk) -> None:
+        """Takes the side that the boundary chose for this chunk."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.chosen = self.sides[chunk.choice.mode]
         self.chosen.begin(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """The chosen side's tree."""
         return self.chosen.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """Tells the chosen side."""
         self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
 class JacobiProposer:
     """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
 
-    With strict acceptance the fixed point is AR's chunk. The first guess is what the verification of an in-prefill
-    draft left behind its first rejection, else the zero action. `depth`: tokens guessed at once; 0: all.
+    With strict acceptance the fixed point is AR's chunk. The first guess is the target tokens that the in-prefill
+    draft's verification gave behind its rejection, then zero actions. `depth`: tokens guessed at once; 0: all.
     """
 
     name = "jacobi"
@@ -187,19 +198,22 @@ class JacobiProposer:
         self.guess: list[int] = []
 
     def begin(self, chunk: Chunk) -> None:
+        """Makes the first guess."""
         known = chunk.rejection.target[: chunk.left]
         self.guess = [*known, *[chunk.space.tokens // 2] * (chunk.left - len(known))]
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """The present guess as a chain."""
         return TokenTree.chain(self.guess[: min(depth, self.depth or depth)])
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """The next guess: this round's target tokens behind the committed ones, then the old guess."""
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
 
 
 class DrafterProposer:
-    """EAGLE-style drafter with a dynamic tree (METHODS §2.2)."""
+    """EAGLE-style drafter with a dynamic tree (docs/methods.md §2.2)."""
 
     name = "drafter"
     needs_states = True
@@ -212,16 +226,19 @@ class DrafterProposer:
         self.state = DraftState(drafter.new_cache(1, capacity), torch.empty(0))
 
     def begin(self, chunk: Chunk) -> None:
+        """Feeds the drafter the prompt's states and embeddings."""
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
         observe(self.drafter, self.state, following, chunk.hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """A chain or dynamic tree of the settings' size."""
         return grow_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """Feeds the drafter the states of the newly committed positions."""
         following = self.embed(chunk.tokens[first + 1 :])
         observe(self.drafter, self.state, following, hidden, chunk.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
-        """(1, T, E)."""
+        """T tokens -> the target's embeddings (1, T, E)."""
         return self.target.embed(torch.tensor([tokens], device=self.target.device))

@@ -1,7 +1,6 @@
-"""What happened in one decode and in one episode, in frozen dataclasses.
+"""Records of a decode and of an episode, as frozen dataclasses. Rerun files, tables and plots are made from them alone.
 
-Rerun files, CSV tables and plots are three readers of these records; nothing else carries results.
-Notation (METHODS §0): D degrees of freedom, H control steps in a chunk, N = H·D tokens of a chunk.
+Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk, N = H·D tokens of a chunk.
 """
 
 from __future__ import annotations
@@ -12,17 +11,17 @@ import numpy as np
 
 from kerv_cli.spaces import ActionSpace
 
-PHASES = ("preprocess", "vision", "prefill", "propose", "verify", "accept", "rectify", "other")
-"""Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`."""
+PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
+"""Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a decode: a draft judged against the target's target_tokens.
+    """One round of a decode: a draft and the target tokens it was compared with.
 
-    `drafted` is the judged path: the accepted tokens followed, where there was a rejection, by the best rejected
-    candidate at the next position. `target_tokens` are the target's argmax tokens at the same positions and, when the
-    whole path was accepted and tokens remain, one more: the bonus.
+    `drafted` is the judged path: the accepted tokens followed, where there was a rejection, by the rejected candidate
+    that was nearest to the target token. `target_tokens` are the target's argmax tokens at the same positions and, when
+    the whole path was accepted and places are left, one more: the bonus.
     """
 
     mode: str  # "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward)
@@ -35,8 +34,13 @@ class Round:
     tree_size: int  # nodes verified
     threshold: tuple[int, ...]  # r per DoF, in bins; empty where no acceptance rule with a threshold ran
 
+    @property
+    def is_verification(self) -> bool:
+        """Whether the target verified a tree."""
+        return self.tree_size > 0 and self.mode != "skip"
+
     def without_bonus(self) -> Round:
-        """The same round when the verdict at the rejected position is not used."""
+        """This round without its bonus, for compensations that do not use the target token at the rejected position."""
         return replace(self, committed=self.accepted)
 
 
@@ -48,15 +52,15 @@ class DecodeRecord:
     actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps <= H
     forwards: int  # target forwards, prefill included
     rounds: tuple[Round, ...]
-    mode: str  # decode mode, for the state timeline: "ar", "drafter", "retrieval", "skip", "one_pass", "hold", ...
-    seconds: float  # inference time (METHODS §7), device synchronised at both ends
+    mode: str  # proposer of the first round that drafted; "skip": not verified; "ar": no draft; "expert"
+    seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
     size: int = 0  # N; 0: as many as `tokens`
     skipped: bool = False  # executed without a verification
-    variability: float | None = None  # K of this decode (METHODS §3.2), normalised action units
+    variability: float | None = None  # K of this decode (§3.2), normalised action units
     similarity: float | None = None  # best retrieval similarity, where one was looked up
-    metric: float | None = None  # fused hybrid-boundary metric F (METHODS §4.4)
+    metric: float | None = None  # fused hybrid-boundary metric F (§4.4)
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
 
     @property
@@ -67,14 +71,14 @@ class DecodeRecord:
 
     @property
     def verifications(self) -> int:
-        """Rounds in which a tree was judged by the target."""
-        return sum(1 for r in self.rounds if r.tree_size > 0 and r.mode != "skip")
+        """Rounds in which the target verified a tree."""
+        return sum(r.is_verification for r in self.rounds)
 
     @property
     def first_rejected(self) -> int | None:
         """Index in the chunk of the first rejected token of the first verification; N if none; None if no tree."""
         for r in self.rounds:
-            if r.tree_size > 0 and r.mode != "skip":
+            if r.is_verification:
                 return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
         return None
 
@@ -95,7 +99,7 @@ class EpisodeRecord:
     actions: np.ndarray  # (T, D) float32, executed, environment units, within the space's limits
     path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
     gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
-    initial_state: np.ndarray  # (n,) float64, with the task it tells this episode's start from others
+    initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that begin alike
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
     wall_seconds: float = 0.0  # whole episode, simulation and rendering included
 
@@ -106,4 +110,5 @@ class EpisodeRecord:
 
     @property
     def forwards(self) -> int:
+        """Target forwards of the episode."""
         return sum(d.forwards for d in self.decodes)

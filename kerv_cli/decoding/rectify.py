@@ -1,4 +1,4 @@
-"""What happens after a rejection (METHODS §3.1): decode on, or fill what is missing with a prediction."""
+"""What happens after a rejection (docs/methods.md §3.1): decode on, or fill the missing DoFs with a prediction."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.parts import CompensateSettings
 
 DRAFT = "draft"
-"""The one filling that no predictor of `drafting/kinematics.py` gives."""
+"""`rectifier.predictor` that fills from the rejected draft instead of from a kinematic predictor."""
 
 
 class Compensation:
     """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
 
-    With `use_target_token` (ours) the target's token at the rejected position is kept too: it is there and free.
-    `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) what the rejected draft
-    had behind the rejected token goes before the prediction: it was drafted with the observation in view.
-    After a compensation the filter rests for `rest` decodes.
+    With `use_target_token` (ours) the target token at the rejected position is kept too; the verification has computed
+    it already. `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) the rejected
+    draft's remaining tokens fill first and the prediction only what they lack: unlike a filter, the draft knows the
+    observation. After a compensation there is none for `rest` decodes.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -36,7 +36,7 @@ class Compensation:
         self.resting = max(0, self.resting - 1)
 
     def close(self, chunk: Chunk) -> bool:
-        """A draft was rejected; end the chunk if a prediction can. False: decode on."""
+        """Ends the chunk after a rejection, if a prediction can fill what is missing -> whether it did."""
         if self.resting:
             return False
         tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
@@ -45,7 +45,7 @@ class Compensation:
         if values is None or 0 <= self.settings.max_dropped < chunk.steps - len(values):
             return False
         chunk.close(values, self.settings.use_target_token)
-        # one more than the rest, because the decode that compensated ends too
+        # + 1, because `next_decode` also counts the decode that compensated
         self.resting = self.settings.rest + 1
         return True
 
@@ -69,10 +69,12 @@ def assemble(
     values = chunk.space.values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
     flat = np.full(steps * dofs, np.nan)
     flat[: len(values)] = values
-    flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan  # held, whoever drafted
     actions: np.ndarray = flat.reshape(steps, dofs)
+    history = chunk.situation.history.values(actions[:whole])
+    if len(history):  # strict DoFs are held, whoever drafted; without a last value the draft's is the best there is
+        flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
     if np.isnan(actions).any():
-        predicted = predictor.predict(chunk.situation.history.values(actions[:whole]), steps - whole)
+        predicted = predictor.predict(history, steps - whole)
         if predicted is None:
             return None
         gap = np.isnan(actions[whole:])

@@ -1,5 +1,4 @@
-"""How far a draft may be from the verdict (METHODS §3.2). r is a number of bins; a threshold keeps it as a real number
-and rounds it for use."""
+"""The acceptance radius r in bins (docs/methods.md §3.2). Thresholds keep r as a real number and round it for use."""
 
 from __future__ import annotations
 
@@ -8,6 +7,8 @@ from typing import Protocol
 
 
 class Threshold(Protocol):
+    """Gives the acceptance radius r of every decode, from the variability K of the decodes before it."""
+
     def reset(self) -> None:
         """A new episode begins."""
 
@@ -19,17 +20,20 @@ class Threshold(Protocol):
 
 
 class Fixed:
+    """The same r in every decode (Spec-VLA)."""
+
     def __init__(self, r: int) -> None:
         self.r = r
 
     def reset(self) -> None:
-        pass
+        """Nothing to reset."""
 
     def radius(self) -> int:
+        """r."""
         return self.r
 
     def update(self, variability: float | None) -> None:
-        pass
+        """K is not used."""
 
 
 class Kinematic:
@@ -43,6 +47,7 @@ class Kinematic:
         self.reset()
 
     def reset(self) -> None:
+        """r as after a decode with K = K_S."""
         self.r = self.level(self.k_s)
 
     def level(self, variability: float) -> float:
@@ -50,32 +55,29 @@ class Kinematic:
         return falling(self.r_min, self.r_max, variability / self.k_s, self.phi)
 
     def radius(self) -> int:
+        """r rounded to the nearest bin."""
         return nearest(self.r)
 
     def update(self, variability: float | None) -> None:
+        """Sets r from K; a decode without K leaves it."""
         if variability is not None:
             self.r = self.level(variability)
 
 
-class Change:
-    """r shrinks when K grows and grows when it shrinks (ablation):
+class Change(Kinematic):
+    """Ablation: r shrinks when K grows and grows when K shrinks.
 
     r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max), Δ = K_t − K_{t−1} over decodes
     that compared something. An episode begins where `Kinematic` does, with K_{t−1} = K_S.
     """
 
-    def __init__(self, r_min: int, r_max: int, phi: float, k_s: float) -> None:
-        self.r_min, self.r_max, self.phi, self.k_s = r_min, r_max, phi, k_s
-        self.reset()
-
     def reset(self) -> None:
-        self.r = falling(self.r_min, self.r_max, 1.0, self.phi)
+        """r as after a decode with K = K_S, which is also the K to compare with."""
+        super().reset()
         self.last = self.k_s
 
-    def radius(self) -> int:
-        return nearest(self.r)
-
     def update(self, variability: float | None) -> None:
+        """Moves r against the change of K; a decode without K leaves it."""
         if variability is None:
             return
         change = (variability - self.last) / self.k_s
@@ -87,7 +89,7 @@ class Change:
 class Schedule:
     """r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ), t decodes into the episode: open loop.
 
-    KERV's public code has 3 + 12 · exp(−(t / τ)^3): r_min 3, r_max 15, φ 3, as conf/threshold/schedule.yaml.
+    KERV's public code has 3 + 12 · exp(−(t / τ)^3): r_min 3, r_max 15, φ 3, the defaults here.
     """
 
     def __init__(self, r_min: int, r_max: int, phi: float, tau: float) -> None:
@@ -95,17 +97,20 @@ class Schedule:
         self.reset()
 
     def reset(self) -> None:
+        """Starts again at t = 0."""
         self.decodes = 0
 
     def radius(self) -> int:
+        """r(t) rounded to the nearest bin."""
         return nearest(falling(self.r_min, self.r_max, self.decodes / self.tau, self.phi))
 
     def update(self, variability: float | None) -> None:
+        """t grows by one; K is not used."""
         self.decodes += 1
 
 
 def falling(low: float, high: float, x: float, phi: float) -> float:
-    """From `high` at x = 0 down to `low`: low + (high − low) · exp(−x^φ), x ≥ 0."""
+    """low + (high − low) · exp(−x^φ): `high` at x ≤ 0, falling to `low`."""
     if x <= 0:
         return float(high)
     power = math.exp(min(700.0, phi * math.log(x)))  # x^φ without overflow; exp(−e^700) is zero
@@ -113,5 +118,5 @@ def falling(low: float, high: float, x: float, phi: float) -> float:
 
 
 def nearest(r: float) -> int:
-    """To the nearest bin, halves up."""
+    """r rounded to the nearest bin, halves up."""
     return math.floor(r + 0.5)

@@ -1,4 +1,4 @@
-"""When a draft is executed without a verification (METHODS §4.3; HeiSD's verify-skip)."""
+"""When a draft is executed without a verification (docs/methods.md §4.3, §6)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from kerv_cli.parts import SimilaritySkipSettings
 
 @dataclass(frozen=True)
 class SkipLevels:
-    """The task's least similarity s_min, and the bounds that feedback moves it within; cosines."""
+    """The task's least similarity s_min and the bounds within which feedback moves it; cosines.
+
+    Raises:
+        UsageError: they are not in order.
+    """
 
     low: float
     s_min: float
@@ -34,12 +38,12 @@ class Skip(Protocol):
         """An episode ended."""
 
     def take(self, chunk: Chunk) -> bool:
-        """Complete the chunk with a draft's tokens, if it may be executed unverified."""
+        """Completes the chunk with a draft's tokens, if it may be executed unverified."""
 
 
 class AlwaysSkip:
-    """Every draft is executed unverified: what a method costs and loses without verification (§6). Where the source has
-    no whole chunk yet, the target decodes."""
+    """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
+    whole chunk yet, the target decodes."""
 
     def __init__(self, source: DraftsChunks) -> None:
         self.source = source
@@ -60,12 +64,12 @@ class AlwaysSkip:
 
 
 class VerifySkip:
-    """Similarity of the best neighbour ≥ s_min: its chunk is the decode.
+    """Executes the best neighbour's chunk without verification where its similarity is at least s_min.
 
-    At most `max_skips` decodes in a row; where a boundary decides, only on retrieval's side; and once a stored
-    episode's end was reached, nothing more of that episode is executed unverified. With `up` or `down` above 0 s_min
-    outlives the episode: it rises by `up` of the calibrated range after a failure and falls by `down` after a success,
-    so that results depend on the order of episodes and on the evaluator's flag.
+    At most `max_skips` decodes in a row; where a boundary decides, only on retrieval's side; and after a stored episode
+    was followed to its end, none of its chunks is executed unverified again in this episode. With `up` or `down` above
+    0 s_min carries over between episodes: after a failure it rises by `up` times the calibrated range, after a success
+    it falls by `down` times it. Results then depend on the order of episodes and on the evaluator's flag.
     """
 
     def __init__(self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:
@@ -86,7 +90,7 @@ class VerifySkip:
         self.s_min = min(self.levels.high, max(self.levels.low, moved))
 
     def take(self, chunk: Chunk) -> bool:
-        """Complete the chunk with the best neighbour's tokens, if it may be executed unverified."""
+        """Fills the chunk with the best neighbour's tokens if it may be executed unverified -> whether it did."""
         if chunk.choice is not None and chunk.choice.mode != "retrieval":
             self.in_a_row = 0
             return False

@@ -1,10 +1,11 @@
-"""Retrieval: the demonstrations' action chunks, found by what the target itself sees (docs/methods.md §4; HeiSD).
+"""Retrieval: action chunks of the demonstrations, searched by the target's own encoding of the observation
+(docs/methods.md §4.1, §4.2; HeiSD).
 
 The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
 normalised again; optionally projected onto the directions that hold nearly all of the keys. The default is the scene
-segment alone, which holds the vision encoder's object and goal positions together with hand and gripper. Measured on
-MT10, nearest neighbour in another episode, its chunks agree best; pooled patch tokens agree worse and lower the
-agreement of what they are added to. The payload is the expert's next H actions as tokens.
+segment alone, which holds the vision encoder's object and goal positions together with hand and gripper. On MT10 the
+nearest neighbour by this key in another episode has the most similar chunk; adding pooled patch tokens makes the
+agreement worse. The payload is the expert's next H actions as tokens.
 
 On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `projection.npy` where keys are projected, and
 `manifest.json`; rows by task, seed, step.
@@ -27,7 +28,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli import registry
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.environments import spec_of
@@ -40,7 +41,7 @@ from kerv_cli.targets.protocol import ReadableTarget
 
 FORMAT = 2
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
-CROSS = 0.1  # probability that a path leaves the neighbours that it has followed
+CROSS = 0.1  # probability that a path changes to other neighbours
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
 
@@ -55,7 +56,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Manifest:
-    """`manifest.json`: what the entries are, whom they were made for, and proof of the seeds.
+    """`manifest.json`: the entries' keys and sizes, the target they were made for, and their seeds.
 
     key: parts of the prompt that are pooled. width: numbers of a key. chunk: H. actions: the target's action space.
     target, demos, files: SHA-256 of the target's weights, the demonstrations and the files beside this one.
@@ -83,7 +84,7 @@ class Manifest:
 
     @property
     def content(self) -> str:
-        """SHA-256 of what retrieval finds: it survives a rebuild from the same target and demonstrations."""
+        """SHA-256 over keys, chunks and target: the same after a rebuild from the same target and demonstrations."""
         text = json.dumps([self.key, self.chunk, self.target, sorted(self.files.items())])
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -114,7 +115,8 @@ def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
-    """Prove that training and evaluation share no world: seeds per task, all of them training seeds.
+    """Checks that all seeds (per task) are training seeds, so that no stored episode has the initial state of an
+    evaluation episode.
 
     Raises:
         CheckpointError: one is not.
@@ -125,7 +127,7 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
         if shared:
             raise CheckpointError(
                 f"{where} holds seed {shared[0]} of {task}: seeds from {training.stop} on are for selection and "
-                "evaluation, retrieval would know the worlds it is judged on; build it from training demonstrations"
+                "evaluation, retrieval would have seen the episodes it is evaluated on; build it from training ones"
             )
 
 
@@ -155,7 +157,7 @@ class Datastore:
     left: np.ndarray
     shards: dict[str, slice]
     projection: np.ndarray | None = None  # (pooled numbers, d)
-    index: Index | None = None  # who searches; None: ExactIndex
+    index: Index | None = None  # the search; None: ExactIndex
 
     def __post_init__(self) -> None:
         if self.index is None:
@@ -165,8 +167,7 @@ class Datastore:
     def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
         """The datastore in `folder`, made for the target described.
 
-        search: settings of who searches (registry kind datastore), None for exact search; every one finds the same
-        neighbours.
+        search: settings of the search (registry kind datastore), None for exact search; each finds the same neighbours.
 
         Raises:
             CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
@@ -184,7 +185,7 @@ class Datastore:
 
     @property
     def content(self) -> str:
-        """SHA-256 of what is found in it."""
+        """As `Manifest.content`."""
         return self.manifest.content
 
     def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
@@ -209,7 +210,7 @@ class Datastore:
 
 
 def _read(folder: Path, manifest: Manifest) -> dict[str, Any]:
-    """The arrays of a datastore's files, checked against each other."""
+    """Reads a datastore's files and checks them against its manifest."""
     try:
         vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
         payload = _read_payload(folder / PAYLOAD)
@@ -227,7 +228,7 @@ def _read(folder: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a datastore whose files are as they were written and whose seeds are training seeds.
+    """The manifest of a datastore; checks that its files are unchanged and its seeds training seeds.
 
     Raises:
         CheckpointError: missing, damaged, of another format, or from evaluation seeds.
@@ -244,21 +245,14 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def check_target(manifest: Manifest, description: TargetDescription, folder: Path) -> None:
-    """Refuse a datastore whose keys or tokens mean something else to this target.
+    """Refuses a datastore that was made for another target, chunk length or action space.
 
     Raises:
         CheckpointError: another chunk length, action space or action statistics, other weights.
     """
-    where = f"the datastore in {folder}"
-    manifest.actions.check_same(description.actions, where, "the target", statistics=True)
-    if manifest.chunk != description.chunk:
-        raise CheckpointError(
-            f"{where} holds chunks of {manifest.chunk} steps, the target decodes {description.chunk}: {AGAIN}"
-        )
-    if manifest.target != description.sha256:
-        raise CheckpointError(
-            f"{where} was built for target {manifest.target[:12]}, not for {description.sha256[:12]}: {AGAIN}"
-        )
+    own = MadeFor(description.sha256, description.actions, description.chunk)
+    made_for = MadeFor(manifest.target, manifest.actions, manifest.chunk)
+    made_for.check_same(own, f"the datastore in {folder}", "built", AGAIN)
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
@@ -291,14 +285,14 @@ def neighbour_tree(
     depth: int | None = None,
     cross: float = CROSS,
 ) -> TokenTree:
-    """The neighbours' chunks behind `start` committed tokens as one tree, merged by kinematic group (METHODS §4.2).
+    """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
 
     chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
-    neighbour's next one, but a gripper's group always comes from a neighbour that gave the group before it, too. The
-    tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
+    neighbour's next one, but a group of strict DoFs always comes from a neighbour that has the group before it, too.
+    The tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
 
-    Which groups are kept is *ours*: the most probable ones, when the i-th neighbour has weight 1 / i and a path leaves
-    the neighbours that it has followed with probability `cross`; 0 keeps to the neighbours' own chunks.
+    Within `nodes` the most probable groups are kept (*ours*): the i-th neighbour weighs 1 / i, and a path changes to
+    other neighbours with probability `cross`; 0 merges whole chunks only.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     ways = _Ways(chunks.tolist(), list(space.segments(start, stop)), cross)
@@ -328,7 +322,7 @@ def neighbour_tree(
 
 
 class _Weights(dict[int, float]):
-    """Of a set of neighbours, bit i for the i-th: the sum of their weights 1 / i, counted from 1."""
+    """Bit set of neighbours -> sum of their weights; the i-th neighbour, counted from 1, weighs 1 / i."""
 
     def __missing__(self, members: int) -> float:
         weight = sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
@@ -337,27 +331,27 @@ class _Weights(dict[int, float]):
 
 
 class _Ways:
-    """The groups that a path may go on with. Behind a path lie two sets of neighbours: those that gave its last group,
-    and those of them that gave the groups before it, too."""
+    """The groups that may follow a path. A path is described by two sets of neighbours: `gave`, those that have its
+    last group, and `followed`, those among them that have all its groups."""
 
     def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
         self.everyone = (1 << len(rows)) - 1
         self.cross, self.weights = cross, _Weights()
         self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
-        for first, last, gripper in cuts:
+        for first, last, strict in cuts:
             givers: dict[tuple[int, ...], int] = {}
             for i, row in enumerate(rows):
                 group = tuple(row[first:last])
                 givers[group] = givers.get(group, 0) | 1 << i
-            self.levels.append((gripper, list(givers.items())))
+            self.levels.append((strict, list(givers.items())))
 
     def on(self, level: int, gave: int, followed: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
-        """Minus the logarithm of its probability, tokens, and the two sets behind the path then. Best giver first."""
+        """Yields (−log probability, the group's tokens, the two sets of the lengthened path), best neighbour first."""
         if level == len(self.levels):
             return
-        gripper, givers = self.levels[level]
+        strict, givers = self.levels[level]
         pool = self.everyone
-        if gripper:
+        if strict:
             pool = gave
             givers = [(group, given & gave) for group, given in givers if given & gave]
             givers.sort(key=lambda way: way[1] & -way[1])
@@ -371,7 +365,7 @@ class _Ways:
 
 
 def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
-    """How many of the group's first tokens are in the tree already."""
+    """Number of the group's leading tokens that the tree already has below `node`."""
     for depth, token in enumerate(group):
         if (node, token) not in children:
             return depth

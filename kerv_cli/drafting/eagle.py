@@ -1,8 +1,9 @@
 """The EAGLE-style drafter and its dynamic tree (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
 
-Input at position i: concat(embedding of what stands at i + 1, the target's last hidden state at i) → width → decoder
-layers → predicted hidden state of i + 1; the target's frozen head turns it into logits for position i + 2. The prompt,
-vision tokens included, is in the drafter's cache. Position i is rotated by i, in training and at inference.
+Input at position i: concat(embedding of the token at i + 1, the target's last hidden state at i), mapped to the model's
+width; the decoder layers predict the hidden state at i + 1, from which the target's frozen head gives the logits for
+position i + 2. The prompt, vision tokens included, is in the drafter's cache. Rotary positions count from the prompt's
+beginning, in training and at inference.
 """
 
 from __future__ import annotations
@@ -15,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
@@ -36,7 +36,7 @@ class Drafter(LayerStack):
 
     @classmethod
     def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> Drafter:
-        """A fresh one for `target`."""
+        """A fresh drafter of the target's width, heads and feed-forward width."""
         return cls(settings, target.width, target.heads, target.feed_forward)
 
     def forward(
@@ -56,16 +56,16 @@ class Drafter(LayerStack):
 
 @dataclass
 class DraftState:
-    """What the drafter carries from round to round: its cache holds every committed position but the last, and
-    `hidden` (E,) is its prediction behind the last committed token."""
+    """The drafter's state between rounds. cache: every committed position but the last. hidden: (E,) predicted state
+    from which the first draft token follows."""
 
     cache: Cache
     hidden: Tensor
 
 
 def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
-    """Feed true states: hidden (1, T, E) of the target at positions first, first + 1, … and what follows each of them
-    (1, T, E). Entries of an earlier draft tree behind `first` are dropped."""
+    """Feeds the target's own states: hidden (1, T, E) at positions first, first + 1, … and the embedding of the token
+    after each of them (1, T, E). Cache entries from `first` on (the last draft's) are overwritten."""
     state.cache.length = first
     tokens = hidden.shape[1]
     positions = torch.arange(first, first + tokens, device=hidden.device)
@@ -74,7 +74,7 @@ def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tens
 
 def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> TokenTree:
     """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
-    `nodes` of all. A child is never more probable than its parent, so what is kept is a tree.
+    `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree.
     """
     if top_k == 1:
         return TokenTree.chain(draft_chain(drafter, target, state, min(depth, nodes)))
@@ -107,7 +107,7 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
 
 
 def draft_chain(drafter: Drafter, target: Target, state: DraftState, depth: int) -> list[int]:
-    """The greedy draft: the tree of one branch, without probabilities, ranks or masks."""
+    """The `depth` greedy draft tokens, without the bookkeeping of a tree."""
     base = state.cache.length
     positions = torch.arange(base, base + depth, device=state.hidden.device).split(1)
     hidden = state.hidden[None, None]
@@ -140,7 +140,7 @@ class DrafterDescription(Description):
 def save_drafter(
     folder: Path, drafter: Drafter, target: Target, target_sha256: str, provenance: dict[str, Any], half: bool = False
 ) -> str:
-    """Write the drafter of `target` -> sha256 of its weights: a drafter imitates exactly one target."""
+    """Writes the drafter and its description, which names its target by hash -> sha256 of the drafter's weights."""
     description = {
         "settings": asdict(drafter.settings),
         "target": target_sha256,
@@ -151,18 +151,15 @@ def save_drafter(
 
 
 def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> DrafterDescription:
-    """Its description. actions: the target's.
+    """The description of the drafter in `folder`. actions: the target's.
 
     Raises:
         CheckpointError: none there, a damaged one, one of another target or action space.
     """
     description = read_description(folder, "drafter", DrafterDescription)
-    description.actions.check_same(actions, f"the drafter in {folder}", "the target", statistics=True)
-    if description.target != target_sha256:
-        raise CheckpointError(
-            f"the drafter in {folder} was trained for target {description.target[:12]}, not for "
-            f"{target_sha256[:12]}: train one with 'kerv train drafter policy.target=…'"
-        )
+    made_for, again = MadeFor(description.target, description.actions), "'kerv train drafter policy.target=…'"
+    own = MadeFor(target_sha256, actions)
+    made_for.check_same(own, f"the drafter in {folder}", "trained", f"train one with {again}")
     return description
 
 

@@ -1,8 +1,9 @@
-"""The early drafter: the whole chunk from the prompt alone, before the target's trunk runs (docs/methods.md §5, ours).
+"""The early drafter: drafts the whole chunk from the encoded prompt, before the target's trunk runs (docs/methods.md
+§5, ours).
 
-It reads what the target encodes anyway (scene, proprioception, pooled words and vision tokens) and the last executed
-actions: a residual network of which every token gets a few features, and one head turns features into bins. Nothing is
-autoregressive, so a chunk costs one small pass.
+It reads the pooled prompt (scene, proprioception, words and vision tokens) and the last executed actions: a residual
+network gives every token a few features, and one head turns features into bins. Nothing is autoregressive, so a chunk
+costs one small pass.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
@@ -27,7 +28,7 @@ from kerv_cli.targets.protocol import ReadableTarget
 
 def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.ndarray]:
     """history (m, D), oldest first -> its newest `length` actions (length, D) and which of them are known (length,),
-    both float32; what an episode's start lacks is zero and stands in front."""
+    both float32; at an episode's start the missing actions are zeros in front."""
     actions, known = np.zeros((length, dofs), np.float32), np.zeros(length, np.float32)
     newest = history[max(0, len(history) - length) :]
     if len(newest):
@@ -36,7 +37,7 @@ def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.
 
 
 class Block(nn.Module):
-    """Residual SwiGLU block, pre-norm; measured better than a plain one of as many weights."""
+    """Residual SwiGLU block, pre-norm; in a comparison better than a plain MLP block with as many weights."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -46,14 +47,18 @@ class Block(nn.Module):
         nn.init.zeros_(self.down.weight)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, W) -> (B, W)."""
         gate, up = self.gate_up(self.norm(x)).chunk(2, -1)
         return x + self.down(F.silu(gate) * up)
 
 
 class EarlyDrafter(nn.Module):
-    """A residual network from (pooled prompt, last actions) to the logits of all N tokens.
+    """A residual network from (pooled prompt (F,), h past actions (h, D)) to the logits (N, V) of all tokens.
 
-    actions: whose tokens it drafts; chunk: H; features: F, numbers of a pooled prompt.
+    actions: the action space of its tokens; chunk: H; features: F.
+
+    Raises:
+        UsageError: a width, rank, number of layers or history out of range.
     """
 
     mean: Tensor
@@ -78,11 +83,11 @@ class EarlyDrafter(nn.Module):
 
     @classmethod
     def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> EarlyDrafter:
-        """A fresh one for `target`."""
+        """A fresh early drafter for the target's action space, H and F."""
         return cls(settings, target.actions, target.chunk, target.pooled_width)
 
     def standardise(self, features: Tensor) -> None:
-        """Remember mean and spread of the training features (n, F)."""
+        """Takes mean and spread from the training features (n, F)."""
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
@@ -97,9 +102,8 @@ class EarlyDrafter(nn.Module):
 
     @torch.inference_mode()
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
-        """features (1, F), history (m, D) normalised executed actions, oldest first -> the chunk's N tokens, and how
-        likely the drafter holds it that every one of them is accepted. radius: how far from the target's token a draft
-        token is accepted, see `choose`."""
+        """features (1, F), history (m, D) normalised executed actions, oldest first -> all N draft tokens, and the
+        drafter's estimate that all are accepted (see `acceptance_odds`). radius: r in bins, see `choose`."""
         weight = self.head.weight
         shown = padded(history, self.settings.history, self.actions.dofs)
         actions, known = (torch.from_numpy(x).to(device=weight.device, dtype=weight.dtype)[None] for x in shown)
@@ -111,9 +115,9 @@ class EarlyDrafter(nn.Module):
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
     """logits (B, N, V), strict (N,) bool -> tokens (B, N): the bins that are most likely to be accepted at `radius`.
 
-    The most probable bin is not the one with the most probability within ±radius. Inside a wide window many bins are
-    equally good; a third of the radius and the bin itself count a little, so that what is kept stays close to the
-    target's token. Where `strict`, a token must equal the target's: it is always the most probable one.
+    The most probable bin is not the one with the most probability within ±radius. Many bins tie within a wide radius;
+    probabilities within a third of it and of the bin itself break the tie, so that accepted tokens stay near the target
+    token. Where `strict`, a token must equal the target's: it is always the most probable one.
     """
     best = logits.argmax(-1)
     if not radius:
@@ -125,8 +129,8 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
 
 def acceptance_odds(logits: Tensor, tokens: Tensor, radius: int, strict: Tensor) -> Tensor:
     """logits (B, N, V), tokens (B, N), strict (N,) bool -> (B,): probability that each token lies within `radius` of
-    the target's, the strict ones exactly on it, if the tokens were independent. They are not, and soft labels keep the
-    drafter unsure: the number is far too low, but it orders chunks well."""
+    the target's, the strict ones exactly on it, if the tokens were independent. They are not, and training on soft
+    labels keeps probabilities low: use the number to compare chunks, not as a probability."""
     probability = logits.float().softmax(-1)
     exact = probability.gather(-1, tokens[..., None])[..., 0]
     near = _within(probability, radius).gather(-1, tokens[..., None])[..., 0]
@@ -154,7 +158,7 @@ class EarlyDescription(Description):
 def save_early(
     folder: Path, early: EarlyDrafter, target_sha256: str, provenance: dict[str, Any], half: bool = False
 ) -> str:
-    """Write it -> sha256 of its weights. The description names the target by the hash of its weights."""
+    """Writes the early drafter and its description, which names its target by hash -> sha256 of its own weights."""
     description = {
         "settings": asdict(early.settings),
         "target": target_sha256,
@@ -166,22 +170,19 @@ def save_early(
 
 
 def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:
-    """Its description.
+    """The description of the early drafter in `folder`.
 
     Raises:
         CheckpointError: none there, a damaged one, one of another target, chunk or action space.
     """
+    again = "run 'kerv train drafter drafter=early policy.target=…'"
     if not (folder / "early.json").is_file():
-        raise CheckpointError(f"no early drafter in {folder}: run 'kerv train drafter drafter=early policy.target=…'")
-    description = read_description(folder, "early", EarlyDescription)
-    description.actions.check_same(target.actions, f"the early drafter in {folder}", "the target", statistics=True)
-    if (description.target, description.chunk) != (target.sha256, target.chunk):
-        raise CheckpointError(
-            f"the early drafter in {folder} was trained for target {description.target[:12]} and chunks of "
-            f"{description.chunk}, not for {target.sha256[:12]} and {target.chunk}: train one with "
-            "'kerv train drafter drafter=early policy.target=…'"
-        )
-    return description
+        raise CheckpointError(f"no early drafter in {folder}: {again}")
+    own = read_description(folder, "early", EarlyDescription)
+    made_for = MadeFor(own.target, own.actions, own.chunk)
+    wanted = MadeFor(target.sha256, target.actions, target.chunk)
+    made_for.check_same(wanted, f"the early drafter in {folder}", "trained", again)
+    return own
 
 
 def load_early(

@@ -1,7 +1,7 @@
-"""Kinematic prediction of the next actions from the last ones (METHODS §3.1, KERV §3).
+"""Kinematic prediction of the next actions from the last ones (docs/methods.md §3.1, KERV §3).
 
-Every predictor here is linear in its window: for fixed noise and window length its output is a fixed weight per past
-action and step ahead. The weights are computed once, so that predicting is one small dot product in the control loop.
+Every predictor here is a fixed linear function of its window for given noise and window length. The weights are
+computed once; predicting is one small matrix product.
 Actions are normalised to [-1, 1], one control step is the unit of time.
 """
 
@@ -28,13 +28,6 @@ class ActionHistory:
         self.dofs = dofs
         self._actions: deque[np.ndarray] = deque(maxlen=window)
 
-    def __len__(self) -> int:
-        return len(self._actions)
-
-    def reset(self) -> None:
-        """A new episode begins."""
-        self._actions.clear()
-
     def append(self, action: np.ndarray) -> None:
         """An action (D,) in [-1, 1] was executed.
 
@@ -49,8 +42,8 @@ class ActionHistory:
     def values(self, pending: np.ndarray | None = None) -> np.ndarray:
         """(m, D), oldest first, m ≤ window.
 
-        pending: (k, D) steps of the present chunk that are known but not yet executed. They take the newest places, so
-        that what follows them is one step ahead instead of k + 1.
+        pending: (k, D) steps of the present chunk that are known but not yet executed. They are appended as if
+        executed, so that the next step is one step ahead instead of k + 1.
         """
         known = [*self._actions, *(() if pending is None else np.asarray(pending, dtype=np.float64))]
         known = known[-(self._actions.maxlen or 0) :]
@@ -59,11 +52,14 @@ class ActionHistory:
 
 @dataclass(frozen=True)
 class Noise:
-    """What a Kalman filter assumes of each DoF; the entries of held DoFs are not used.
+    """Noise of a Kalman filter per DoF; entries of strict DoFs are not used, because those are held.
 
     q: variance of the random acceleration (order 2) or change of acceleration (order 3) in one step. r: variance of
     the observation. Only their ratio matters, because the prior is scaled by r. damping: share of the velocity that is
     left after one step; 1 is the paper's constant velocity, less is *ours*.
+
+    Raises:
+        UsageError: a number out of range, or another count of numbers.
     """
 
     q: tuple[float, ...]
@@ -80,6 +76,7 @@ class Noise:
 
     @classmethod
     def uniform(cls, dofs: int, q: float, r: float = 1.0, damping: float = 1.0) -> Noise:
+        """The same q, r and damping for all DoFs."""
         return cls((q,) * dofs, (r,) * dofs, (damping,) * dofs)
 
 
@@ -130,7 +127,7 @@ def kalman_weights(q: float, r: float, window: int, horizon: int, order: int = 2
 
 
 class Predictor:
-    """Predicts the next actions from the last ones; held DoFs (a gripper) keep their last value."""
+    """Predicts the next actions from the last ones; strict DoFs are held at their last value."""
 
     name = ""
     least = 1  # actions without which the weights are not defined
@@ -174,8 +171,8 @@ class Predictor:
     def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
         """(B, m, D) with m ≥ `minimum` -> (B, steps, D)."""
         if not 0 <= steps <= self.horizon or histories.shape[-1] != self.dofs:
-            raise ValueError(f"{self.name}: {steps} steps of {histories.shape[-1]} DoFs; weights are for "
-                             f"{self.horizon} of {self.dofs}")  # fmt: skip
+            asked = f"{steps} steps of {histories.shape[-1]} DoFs"
+            raise ValueError(f"{self.name}: {asked}; weights are for {self.horizon} of {self.dofs}")
         past = histories[:, -self.window :]
         table = self.tables[past.shape[1]][:, :steps]
         predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
@@ -195,6 +192,7 @@ class Hold(Predictor):
     name = "hold"
 
     def weights(self, dof: int, window: int) -> np.ndarray:
+        """(horizon, window), all weight on the newest action."""
         return hold_weights(window, self.horizon)
 
 
@@ -205,6 +203,7 @@ class Linear(Predictor):
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
+        """(horizon, window): 1 + h on the newest action, −h on the one before, for h steps ahead."""
         ahead = np.arange(1, self.horizon + 1)
         weights = np.zeros((self.horizon, window))
         weights[:, -1], weights[:, -2] = 1 + ahead, -ahead
@@ -212,7 +211,7 @@ class Linear(Predictor):
 
 
 class Kalman(Predictor):
-    """A Kalman filter per DoF (METHODS §3.1), run from the window's first action; see `kalman_weights`."""
+    """A Kalman filter per DoF (docs/methods.md §3.1), run from the window's first action; see `kalman_weights`."""
 
     name = "kalman"
     least = 2
@@ -230,12 +229,13 @@ class Kalman(Predictor):
         super().__init__(held, minimum, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
+        """(horizon, window) of the filter with this DoF's noise, see `kalman_weights`."""
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
         return kalman_weights(q, r, window, self.horizon, self.order, damping)
 
 
 class Damped(Kalman):
-    """Kalman filter whose velocity fades: actions are bounded, so no slope lasts (*ours*)."""
+    """Kalman filter whose velocity is damped in every step (*ours*): actions are bounded, so no slope lasts."""
 
     name = "damped"
 

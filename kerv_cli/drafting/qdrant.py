@@ -1,8 +1,8 @@
-"""Search by Qdrant (METHODS §4.1): its engine in this process, or a server. The extra: pip install 'kerv[qdrant]'.
+"""Search by Qdrant (docs/methods.md §4.1): its engine in this process, or a server. The extra: kerv[qdrant].
 
-Qdrant searches exactly within a task. What it finds is ranked by the rule of every backend, so the neighbours are the
-same. The engine's files lie in a folder that goes with this process; a server's collection is named by the datastore's
-hash, and the next process finds it there.
+Qdrant searches exactly within a task. Its results are ranked again by `search.best`, so that the neighbours equal those
+of exact search. The engine keeps its files in a temporary folder of this process; a server's collection is named by the
+datastore's hash and is reused by later processes.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from kerv_cli.errors import StorageError, UsageError
 from kerv_cli.parts import QdrantSearchSettings
 
 BATCH = 131_072  # numbers sent at once: below a server's limit for one request
-SPARE = 8  # rows asked for beyond k, so that rounding and ties at the k-th seldom need a second search
+MARGIN = 8  # rows requested beyond k, so that ties at the k-th place seldom need a second search
 TIMEOUT = 10  # s, of a server
 
 
 class Engine(Protocol):
-    """Where the points are: point i is row i, with payload task and seed."""
+    """A Qdrant engine or server. Point i is row i of the datastore, with payload task and seed."""
 
     def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
-        """Store rows first, first + 1, …"""
+        """Stores rows first, first + 1, …: vectors (n, d), one payload each."""
 
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
@@ -73,11 +73,12 @@ class QdrantIndex:
                 self.engine.put(first, self.vectors[rows], payloads)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """See `Index`. A second search where the last row found may tie with the k-th."""
+        """See `Index`. Searches again, with a score bound instead of a limit, where rows beyond the limit may tie with
+        the k-th."""
         sent, shard = key.tolist(), self.shards[task]
-        found = self.engine.search(sent, task, k + SPARE, without, None)
+        found = self.engine.search(sent, task, k + MARGIN, without, None)
         rows = np.sort(np.array([row for row, _ in found], dtype=np.int64))
-        if len(found) < k + SPARE:
+        if len(found) < k + MARGIN:
             return rows
         least = float(best(self.vectors, rows, key, k)[1][-1]) - slack(self.longest, key)
         if found[-1][1] < least:
@@ -119,6 +120,7 @@ class EmbeddedEngine:
         self.close = weakref.finalize(self, _discard, self.shard, folder)
 
     def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
+        """As `Engine.put`."""
         points = [
             self.q.Point(first + i, vector, payload)
             for i, (vector, payload) in enumerate(zip(vectors.tolist(), payloads, strict=True))
@@ -129,6 +131,7 @@ class EmbeddedEngine:
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
     ) -> list[tuple[int, float]]:
+        """As `Engine.search`."""
         q = self.q
         must = [q.FieldCondition("task", match=q.MatchValue(task))]
         passed = [] if without is None else [q.FieldCondition("seed", match=q.MatchValue(without))]
@@ -157,7 +160,7 @@ def _discard(shard: Any, folder: str) -> None:
 
 
 class ServerEngine:
-    """A Qdrant server. The collection is made where it is not there yet."""
+    """A Qdrant server; creates the collection where there is none."""
 
     def __init__(self, url: str, collection: str, width: int) -> None:
         from qdrant_client import QdrantClient, models
@@ -183,10 +186,12 @@ class ServerEngine:
             self.client.create_payload_index(self.collection, field, kind)
 
     def count(self) -> int:
+        """Points in the collection."""
         with self._asked():
             return self.client.count(self.collection, exact=True).count
 
     def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
+        """As `Engine.put`."""
         ids = list(range(first, first + len(vectors)))
         batch = self.models.Batch(ids=ids, vectors=vectors.tolist(), payloads=payloads)
         with self._asked():
@@ -195,6 +200,7 @@ class ServerEngine:
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
     ) -> list[tuple[int, float]]:
+        """As `Engine.search`."""
         m = self.models
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         passed = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]

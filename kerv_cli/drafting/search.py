@@ -1,8 +1,8 @@
-"""Exact search for the best scores among a task's vectors (METHODS §4.1).
+"""Exact search for the best scores among a task's vectors (docs/methods.md §4.1).
 
-In the control loop the target's weights push the vectors out of the cache, so a search that reads them all is as slow
-as the memory. `ExactIndex` reads an outline instead, a few numbers per row that bound its score from above, and of the
-vectors only those whose bound reaches the k-th best score found.
+Between two searches the target's weights displace the vectors from the processor's cache, so reading all of them costs
+memory bandwidth. `ExactIndex` first reads an outline: a few numbers per row that give an upper bound of its score. It
+then reads only the vectors whose bound reaches the k-th best score.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SAMPLE = 256  # rows that the directions are taken from
 
 
 class Index(Protocol):
-    """What finds rows. It may find more than were asked for: `best` ranks them."""
+    """Finds candidate rows; it may return more than k, `best` ranks them."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Rows, ascending, among which are the task's k best for key (d,) float32; `without`: seed passed over."""
@@ -37,17 +37,19 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
 
 
 def slack(longest: float, key: np.ndarray) -> float:
-    """How far apart rounding may put two float32 scores: `longest` vector of the shard, key (d,)."""
+    """Bound of the rounding error between two float32 scores. longest: norm of the longest vector. key: (d,)."""
     return ROUNDING * longest * math.sqrt(key @ key)
 
 
 def length_of_longest(vectors: np.ndarray) -> float:
+    """Largest Euclidean norm among the rows of vectors (n, d); 0 without rows."""
     return float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A shard in p orthonormal directions. v = inside + rest, so v · key <= inside · inside' + |rest| |rest'|."""
+    """A shard projected on p orthonormal directions: v = inside + rest, so v · key ≤ inside · inside' + |rest| |rest'|,
+    primes for the key's parts."""
 
     vectors: np.ndarray  # (n, d) float32
     directions: np.ndarray  # (d, p)
@@ -56,6 +58,7 @@ class Outline:
 
     @classmethod
     def of(cls, vectors: np.ndarray) -> Outline:
+        """Outline of vectors (n, d): directions from the SVD of an evenly spaced sample of rows."""
         sample = vectors[:: max(1, len(vectors) // SAMPLE)]
         directions = np.linalg.svd(sample, full_matrices=False)[2][:OUTLINE].T
         inside = vectors @ directions
@@ -64,7 +67,7 @@ class Outline:
         return cls(vectors, np.ascontiguousarray(directions), outline, length_of_longest(vectors))
 
     def candidates(self, key: np.ndarray, k: int, passed: np.ndarray | None) -> np.ndarray:
-        """passed: (n,) bool, rows passed over."""
+        """Rows, ascending, among which are the k best for key (d,). passed: (n,) bool, rows passed over."""
         inside = key @ self.directions
         rest = key - self.directions @ inside
         bounds = np.concatenate((inside, [math.sqrt(rest @ rest)]), dtype=np.float32) @ self.outline
@@ -92,6 +95,7 @@ class ExactIndex:
         self.outlines = {task: Outline.of(vectors[shard]) for task, shard in shards.items()}
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
+        """See `Index`; from the task's outline."""
         shard = self.shards[task]
         passed = None if without is None else self.seeds[shard] == without
         return self.outlines[task].candidates(key, k, passed) + shard.start

@@ -1,8 +1,8 @@
-"""TokenTree: what a proposer hands to the verification.
+"""TokenTree: a proposer's draft, and the attention masks that verify it.
 
 Node i has a token, a parent (−1: the last committed token) and a depth (0 for the first drafted position). Parents come
 before their children. A node at depth d behind `committed` tokens is chunk token committed + d, so its control step and
-DoF are known (METHODS §2).
+DoF are known (docs/methods.md §2).
 """
 
 from __future__ import annotations
@@ -17,11 +17,7 @@ ROOT = -1
 
 @dataclass(frozen=True)
 class TokenTree:
-    """tokens, parents and depths of n nodes, parent before child.
-
-    Raises:
-        ValueError: a parent at or behind its child.
-    """
+    """tokens, parents and depths of n nodes, parent before child."""
 
     tokens: tuple[int, ...]
     parents: tuple[int, ...]
@@ -29,6 +25,11 @@ class TokenTree:
 
     @classmethod
     def build(cls, tokens: Sequence[int], parents: Sequence[int]) -> TokenTree:
+        """A tree of n tokens with n parents; depths are derived.
+
+        Raises:
+            ValueError: a parent at or behind its child.
+        """
         depths: list[int] = []
         for i, parent in enumerate(parents):
             if not ROOT <= parent < i:
@@ -38,6 +39,7 @@ class TokenTree:
 
     @classmethod
     def chain(cls, tokens: Sequence[int]) -> TokenTree:
+        """A tree of one path: every token is the child of the one before it."""
         n = len(tokens)
         return cls(tuple(tokens), tuple(range(-1, n - 1)), tuple(range(n)))
 
@@ -46,6 +48,7 @@ class TokenTree:
 
     @property
     def is_chain(self) -> bool:
+        """Whether every node's parent is the node before it."""
         return self.parents == tuple(range(-1, len(self) - 1))
 
     def ancestors(self) -> np.ndarray:
@@ -57,7 +60,7 @@ class TokenTree:
         return seen
 
     def down_from(self, node: int) -> list[int]:
-        """`node` and what lies below it along first children, down to a leaf."""
+        """`node` and the nodes below it along first children, down to a leaf."""
         found = [node]
         for i in range(node + 1, len(self)):
             if self.parents[i] == found[-1]:

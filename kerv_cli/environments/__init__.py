@@ -1,6 +1,6 @@
-"""The environments that are registered, and the tasks and suites in them.
+"""The registered environments, their tasks and suites.
 
-Light until a spec is asked for: a spec brings numpy, a world its simulator.
+Imports nothing heavy until a spec is asked for: a spec imports numpy, a world its simulator.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NAMES = "names"
 
 
 def specs() -> Mapping[str, EnvironmentSpec]:
-    """Every registered environment by name."""
+    """Name -> specification of every registered environment."""
     return {name: load(part.build) for name, part in parts(KIND).items()}
 
 
@@ -46,7 +46,7 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 
     Raises:
         UnknownName: a name that is neither a task nor a suite.
-        UsageError: no name, or tasks of several environments: what is made from one action space does not fit another.
+        UsageError: no name, or tasks of several environments, whose action spaces may differ.
     """
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")
@@ -74,7 +74,7 @@ def task_names() -> Iterator[str]:
 
 
 def settled(world: WorldSettings, spec: EnvironmentSpec) -> WorldSettings:
-    """The settings with the environment's own camera and horizon where they leave them open.
+    """World settings with the environment's own camera and horizon where `world` leaves them open.
 
     Raises:
         UnknownName: the environment has no such camera. UsageError: a horizon that it cannot run.

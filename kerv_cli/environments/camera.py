@@ -29,8 +29,7 @@ _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 _PROBE = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
 _PROBE_SECONDS = 60.0
 
-_backend: str | None = None
-_refusal: str | None = None
+_chosen: str | RenderingUnavailable | None = None
 _open_cameras: weakref.WeakSet[Camera] = weakref.WeakSet()
 
 
@@ -39,7 +38,7 @@ class CameraConfig:
     """What a frame shows.
 
     Attributes:
-        name: of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.
+        name: one of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.
         fovy: vertical field of view in degrees; 45 doubles the pixels on hand and object that 60 gives.
         size: width and height of a frame in pixels.
         supersample: each pixel is the mean of supersample x supersample rendered ones.
@@ -69,11 +68,11 @@ def install_command() -> str:
 
 
 def choose_backend() -> str:
-    """Settles which OpenGL backend draws the frames; call it before mujoco is imported.
+    """Chooses the OpenGL backend that draws the frames; call it before mujoco is imported.
 
     `MUJOCO_GL` is respected where set; otherwise EGL, then OSMesa are tried, each in a process of its own, so that a
-    broken driver cannot harm this one. The answer is written to `MUJOCO_GL` and `PYOPENGL_PLATFORM`, where worker
-    processes inherit it, and remembered.
+    broken driver cannot harm this one. The choice is cached and written to `MUJOCO_GL` and `PYOPENGL_PLATFORM`, which
+    worker processes inherit.
 
     Returns:
         The backend's name: `egl`, `osmesa`, or what `MUJOCO_GL` says.
@@ -82,16 +81,15 @@ def choose_backend() -> str:
         RenderingUnavailable: nothing can draw here, `MUJOCO_GL` switches drawing off, or mujoco was already imported
             without a headless backend.
     """
-    global _backend, _refusal
-    if _refusal is not None:
-        raise RenderingUnavailable(_refusal)
-    if _backend is None:
+    global _chosen
+    if _chosen is None:
         try:
-            _backend = _find_backend()
+            _chosen = _find_backend()
         except RenderingUnavailable as error:
-            _refusal = str(error)
-            raise
-    return _backend
+            _chosen = error
+    if isinstance(_chosen, RenderingUnavailable):
+        raise RenderingUnavailable(str(_chosen))
+    return _chosen
 
 
 def _find_backend() -> str:
@@ -114,26 +112,21 @@ def _probe_backends() -> str:
     for backend in _HEADLESS:
         environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
         try:
-            probe = subprocess.run(
-                [sys.executable, "-c", _PROBE],
-                env=environment,
-                capture_output=True,
-                timeout=_PROBE_SECONDS,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
+            command = [sys.executable, "-c", _PROBE]
+            subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=True)
+        except subprocess.SubprocessError:  # it failed or hung
             continue
-        if probe.returncode == 0:
-            return backend
+        return backend
     raise RenderingUnavailable(f"no OpenGL backend can draw here: {install_command()}")
 
 
 def load_mujoco() -> None:
-    """Imports mujoco with a GL backend where there is one; physics alone works without."""
+    """Imports mujoco, with a GL backend where there is one. Without one physics works, and opening a Camera raises
+    RenderingUnavailable."""
     try:
         choose_backend()
     except RenderingUnavailable:
-        # Without this mujoco asks for glfw, which fails where no display is. A Camera raises the reason when opened.
+        # Without this mujoco asks for glfw, which fails without a display.
         os.environ.setdefault("MUJOCO_GL", "disable")
     import mujoco  # noqa: F401
 
@@ -142,7 +135,7 @@ class Camera:
     """Draws one view of one model. Drawing reads the physics and never changes it."""
 
     def __init__(self, model: mujoco.MjModel, config: CameraConfig, upside_down: bool = False) -> None:
-        """Opens an offscreen context for `model`. upside_down: its images come out rotated by 180 degrees.
+        """Opens an offscreen context for `model`. upside_down: the view's raw images are rotated by 180 degrees.
 
         Raises:
             RenderingUnavailable: the GL backend cannot open a context.
@@ -174,8 +167,8 @@ class Camera:
         """A frame of the state in `data`.
 
         Returns:
-            (size, size, 3) uint8 RGB, upright: views that are upside down are turned by 180 degrees (flipping one axis
-            would mirror the world).
+            (size, size, 3) uint8 RGB, upright: images of views that are upside down are turned by 180 degrees (flipping
+            one axis would mirror them).
 
         Raises:
             RenderingUnavailable: the camera was closed.
@@ -204,7 +197,7 @@ def _open_renderer(model: mujoco.MjModel, pixels: int) -> Any:
 
     class Renderer(mujoco.Renderer):
         def __del__(self) -> None:
-            # one that never opened fails again when it is collected, and would print a traceback of its own
+            # a renderer that failed to open fails again when it is collected, and would print a second traceback
             with contextlib.suppress(AttributeError):
                 super().__del__()
 

@@ -1,13 +1,13 @@
-"""What kerv knows of an environment, as data, and what it needs of a simulator: a world and an expert.
+"""The specification of an environment, as data, and the protocols of its simulator: a world and an expert.
 
-Imports nothing heavy, so that tables of tasks can be read for completion.
+Imports nothing heavy, so that completion can read the tables of tasks.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from kerv_cli.errors import UnknownName, UsageError
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Task:
     """One manipulation task.
 
-    name: unique over all environments. instruction: what the robot is told. difficulty: the group whose tasks are
+    name: unique over all environments. instruction: given to the policy. difficulty: the group of tasks that are
     averaged together.
     """
 
@@ -36,15 +36,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Three ranges of episode seeds, so that what is trained, what is tuned and what is reported never share a world.
+    """Three disjoint ranges of episode seeds, so that training, tuning and reported episodes never share an initial
+    state.
 
     Raises:
         ValueError: two ranges overlap.
     """
 
-    training: range
-    selection: range
-    evaluation: range
+    training: range = range(50_000)
+    selection: range = range(50_000, 100_000)
+    evaluation: range = range(100_000, 2**31)
 
     def __post_init__(self) -> None:
         ordered = sorted((self.training, self.selection, self.evaluation), key=lambda seeds: seeds.start)
@@ -52,7 +53,7 @@ class Seeds:
             raise ValueError(f"ranges of seeds overlap: {ordered}")
 
     def check(self, seeds: Iterable[int], purpose: str, what: str) -> None:
-        """Refuse seeds that are not for `purpose`: training, selection or evaluation. what: names them in the message.
+        """Refuses seeds that are not for `purpose`: training, selection or evaluation. what: their name in the message.
 
         Raises:
             UsageError: the first seed outside the range.
@@ -67,9 +68,9 @@ class Seeds:
 
 
 class World(Protocol):
-    """One task's simulator, reused over episodes; one per process, made after the process started.
+    """One task's simulator, reused over episodes. Open it in the process that uses it.
 
-    spec: its environment. task: full name. instruction: what the robot is told. camera: what `frame()` draws.
+    spec: its environment. task: full name. instruction: given to the policy. camera: the default view of `frame`.
     horizon: control steps per episode. steps: executed since the reset. success: the task's flag at this step; it may
     be lost again. succeeded: whether it was set at any step of this episode.
     """
@@ -84,7 +85,7 @@ class World(Protocol):
     succeeded: bool
 
     def reset(self, seed: int) -> Observation:
-        """Starts the episode that `seed` names: the same on every machine with the same simulator versions.
+        """Starts the episode of `seed`, the same on every machine with the same simulator versions.
 
         Raises:
             UsageError: a negative seed.
@@ -98,14 +99,14 @@ class World(Protocol):
         """
 
     def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
-        """(size, size, 3) uint8 RGB, upright, of the current state.
+        """(size, size, 3) uint8 RGB, upright, of the current state. camera: another view than the world's own.
 
         Raises:
             RenderingUnavailable: nothing can be drawn here.
         """
 
     def observe(self, cameras: Sequence[str]) -> Observation:
-        """The latest observation with an image of each of these cameras, drawn now; nothing else is drawn."""
+        """The latest observation with a new image of each of `cameras`; no other camera is drawn."""
 
     @property
     def observation(self) -> Observation:
@@ -117,7 +118,7 @@ class World(Protocol):
 
     @property
     def initial_state(self) -> NDArray[np.float64]:
-        """(n,) all that distinguishes this episode's start from others of the task, e.g. where the object lies."""
+        """(n,) numbers that, with the task, rebuild the episode's start, e.g. the object's position."""
 
     @property
     def end_effector(self) -> NDArray[np.float64]:
@@ -144,15 +145,15 @@ class Expert(Protocol):
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """An environment: everything about it that is not its simulator.
+    """The specification of an environment: all its constants, and where its simulator is.
 
     name: as registered. actions: with the environment's limits as normalisation. observation: the privileged state
     begins with the proprioception. tasks: by full name. suites: name in capitals -> full task names. difficulties:
     groups of tasks, in the order of tables. horizon: control steps of an episode, the most that the simulator runs.
     cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
     with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras
-    whose images come out rotated by 180 degrees. suffix: of all full task names, which may be left out. packages:
-    whose versions decide the physics.
+    whose raw images are rotated by 180 degrees. suffix: ending of all full task names, which users may leave out.
+    packages: those whose versions determine the physics.
     """
 
     name: str
@@ -163,12 +164,12 @@ class EnvironmentSpec:
     difficulties: tuple[str, ...]
     horizon: int
     cameras: tuple[str, ...]
-    seeds: Seeds
     world_class: str
     expert_class: str = ""
     upside_down: tuple[str, ...] = ()
     suffix: str = ""
     packages: tuple[str, ...] = ()
+    seeds: Seeds = Seeds()
 
     def full_name(self, task: str) -> str | None:
         """The task's full name; None when it is none of this environment's."""
@@ -192,7 +193,7 @@ class EnvironmentSpec:
         return suite or ((full,) if full else ())
 
     def camera_name(self, name: str = "") -> str:
-        """The camera itself, or the environment's first where none is named.
+        """`name`, or the environment's first camera where it is empty.
 
         Raises:
             UnknownName: the environment has no such camera.
@@ -202,9 +203,7 @@ class EnvironmentSpec:
         return name or self.cameras[0]
 
     def camera(self, config: CameraConfig | None = None) -> CameraConfig:
-        """The view with its camera named; raises as `camera_name`."""
-        from dataclasses import replace
-
+        """The view with `camera_name` filled in; raises as that."""
         from kerv_cli.environments.camera import CameraConfig
 
         config = config or CameraConfig()

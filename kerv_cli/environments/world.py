@@ -1,4 +1,4 @@
-"""What every world does alike: an environment writes its start, its step and its frame."""
+"""Bases of worlds: an environment implements the start, the step and the frame of its simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from kerv_cli.spaces import Observation
 
 
 class EpisodeWorld(ABC):
-    """The World protocol (`environments/spec.py`) but for the simulator itself. Not thread-safe."""
+    """Implements the protocol `World` except for the simulator. Not
+    thread-safe."""
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
@@ -26,10 +27,8 @@ class EpisodeWorld(ABC):
             UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
         """
         found = spec.task(task)
-        self.spec = spec
-        self.task, self.instruction = found.name, found.instruction
-        self.camera = spec.camera(camera)
-        self.horizon = spec.control_steps(horizon)
+        self.spec, self.task, self.instruction = spec, found.name, found.instruction
+        self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
         self.steps, self.success, self.succeeded = 0, False, False
         self._observation: Observation | None = None
 
@@ -47,29 +46,35 @@ class EpisodeWorld(ABC):
 
     @property
     @abstractmethod
-    def initial_state(self) -> NDArray[np.float64]: ...
+    def initial_state(self) -> NDArray[np.float64]:
+        """As `World.initial_state`."""
 
     @property
     def observation(self) -> Observation:
+        """The latest observation, without images. Raises KervError before the first reset."""
         if self._observation is None:
             raise KervError(f"{self.task}: reset the world before using it")
         return self._observation
 
     @property
     def done(self) -> bool:
+        """As `World.done`."""
         self.observation  # noqa: B018 - raises before the first reset
         return self.succeeded or self.steps >= self.horizon
 
     @property
     def end_effector(self) -> NDArray[np.float64]:
+        """The first three numbers of the proprioception, (3,) metres."""
         return self.observation.proprioception[:3].copy()
 
     @property
     def gripper(self) -> float:
+        """The number `gripper` of the proprioception; 1 without one."""
         names, felt = self.spec.observation.proprioception, self.observation.proprioception
         return float(felt[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
+        """As `World.reset`."""
         if seed < 0:
             raise UsageError(f"episode seed must be 0 or more, not {seed}")
         state = self._start(seed)
@@ -77,6 +82,7 @@ class EpisodeWorld(ABC):
         return self._told(state)
 
     def step(self, action: ArrayLike) -> Observation:
+        """As `World.step`."""
         executed = np.asarray(action, dtype=np.float64)
         space = self.spec.actions
         if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
@@ -97,14 +103,17 @@ class EpisodeWorld(ABC):
         return self._observation
 
     def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
+        """As `World.frame`."""
         self.observation  # noqa: B018 - raises before the first reset
         return self._draw(self.camera if camera is None else self.spec.camera(camera))
 
     def observe(self, cameras: Sequence[str]) -> Observation:
+        """As `World.observe`; images have the size of the world's own camera."""
         images = {name: self.frame(replace(self.camera, name=name)) for name in cameras}
         return self.observation.with_images(images)
 
     def close(self) -> None:
+        """As `World.close`."""
         self._observation = None
 
     def __enter__(self) -> Self:
@@ -115,7 +124,7 @@ class EpisodeWorld(ABC):
 
 
 class MujocoWorld(EpisodeWorld):
-    """A world with a MuJoCo model: each view gets a graphics context that is kept."""
+    """A world with a MuJoCo model. Each view has a graphics context, opened when it is first drawn."""
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
@@ -132,6 +141,7 @@ class MujocoWorld(EpisodeWorld):
         return self._cameras[camera].render(data)
 
     def close(self) -> None:
+        """As `World.close`."""
         for camera in self._cameras.values():
             camera.close()
         self._cameras.clear()

@@ -1,5 +1,5 @@
-"""Does a measure of curvature tell arcs from lines? Ours and the public code's, on paths whose radius is known
-(docs/methods.md §4.4)."""
+"""Does a measure of curvature tell arcs from lines? Ours and HeiSD's public code's, on paths whose radius is known
+(docs/methods.md §4.4): table and figure."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ _MEASURES = (
 
 
 def pseudo_radius(points: np.ndarray) -> float:
-    """The public code's measure (docs/methods.md §4.4): a constant times the mean speed of points (n, 3), metres."""
+    """The "radius" of HeiSD's public code (docs/methods.md §4.4): a constant times the mean speed of points (n, 3),
+    metres."""
     return 10.0 * path_length(points) / (len(points) - 1)
 
 
@@ -46,7 +47,7 @@ def known_paths(seed: int = 0) -> list[tuple[float, float, np.ndarray]]:
 
 
 def _path(radius: float, speed: float, rng: np.random.Generator) -> np.ndarray:
-    """Evenly spaced along the path: the way between two points is `speed`."""
+    """(WINDOW, 3) points at equal distances `speed` along an arc or a line, turned at random, with noise."""
     way = speed * np.arange(WINDOW)
     flat = np.zeros((WINDOW, 3))
     if math.isinf(radius):
@@ -58,7 +59,7 @@ def _path(radius: float, speed: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def radius_table() -> pd.DataFrame:
-    """One row per path: what it is, and both measures of it."""
+    """One row per path: its radius and speed, and both measures of it."""
     rows = [
         {
             "path": "line" if math.isinf(radius) else "arc",
@@ -75,7 +76,7 @@ def radius_table() -> pd.DataFrame:
 
 
 def radius_figure(table: pd.DataFrame) -> Figure:
-    """Measured against true radius, coloured by speed, ours beside the public code's."""
+    """Measured against true radius, coloured by speed; ours beside the public code's."""
     with mpl.rc_context(STYLE):
         figure = new_figure(11.0, 5.0)
         panels = figure.subplots(1, 2)

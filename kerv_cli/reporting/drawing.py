@@ -1,4 +1,4 @@
-"""What every figure shares: one style, no display, the same bytes for the same numbers."""
+"""Style, colours and files of all figures: no display, the same bytes for the same numbers."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def entitle(figure: Figure, title: str, about: str) -> None:
-    """Title and, in small print, what the figure is about, in a band of their own above the panels."""
+    """Writes the title and a small subtitle above the panels."""
     height, inch = figure.get_figheight(), 1.0 / figure.get_figheight()
     engine = figure.get_layout_engine()
     if isinstance(engine, ConstrainedLayoutEngine):
@@ -60,43 +60,44 @@ def entitle(figure: Figure, title: str, about: str) -> None:
 
 
 def colour(place: int) -> str:
-    """The colour of the n-th series; they come round again, so a series that may be many has dashes as well."""
+    """Colour of the n-th series. The palette repeats after seven; use `DASHES` too where there can be more."""
     return COLOURS[place % len(COLOURS)]
 
 
-_COLOURED = ("policy", "prefill_draft", "proposer")
-"""Kinds of parts whose colour a setting takes, by columns `<kind>.kind`."""
+_COLOURED = {"policy.kind": "policy", "prefill_draft.kind": "proposer", "proposer.kind": "proposer"}
+"""Columns whose parts give a setting its colour -> the kind of those parts."""
 
 
 def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
-    """A colour per setting, from its row of a study's table: the baseline's ink, that of the first of its parts that
-    has one which no setting before has taken, else the next of the palette."""
+    """A colour per setting, from its row of a study's table: ink for the baseline; for another the first free colour of
+    its parts, else of the palette."""
     taken: list[str] = []
     for row in rows:
         if row["label"] == row["baseline"]:
             taken.append(INK)
             continue
-        known = [parts(kind).get(str(row.get(f"{kind}.kind"))) for kind in _COLOURED]
+        names = {column: str(row.get(column)) for column in _COLOURED}
+        known = [parts(_COLOURED[column]).get(name) for column, name in names.items() if name != "none"]
         own = [f"#{part.colour:06x}" for part in known if part is not None and part.colour is not None]
         free = [shade for shade in (*own, *COLOURS) if shade not in taken]
         taken.append(free[0] if free else colour(len(taken)))
     return taken
 
 
-SVG_LIMIT = 100_000  # bytes; a larger one is a picture of many points, which a PNG holds better
+SVG_LIMIT = 100_000  # bytes; figures of many points become larger and are stored as PNG only
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure on disk, and the element that shows it in a page that stands alone."""
+    """A figure's files, and an HTML element that holds the figure itself."""
 
     files: tuple[Path, ...]
     html: str
 
 
 def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
-    """Writes `name`.png and, up to `SVG_LIMIT`, `name`.svg, atomically and without a date. An older SVG of a figure
-    that is too large now is removed.
+    """Writes `name`.png and, up to `SVG_LIMIT`, `name`.svg, atomically and without a date. An older `name`.svg is
+    removed where the new one would be too large.
 
     Raises:
         StorageError: the disk refused.
@@ -114,7 +115,7 @@ def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
 
 
 def _inline(svg: str, prefix: str) -> str:
-    """The <svg> element alone, its ids made unique: two figures in one page must not share clip paths."""
+    """The <svg> element, its ids made unique: two figures of one page must not share clip paths."""
     text = svg[svg.index("<svg") :]
     for before in ('id="', 'xlink:href="#', "url(#"):
         text = text.replace(before, before + prefix)

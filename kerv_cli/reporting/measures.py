@@ -1,10 +1,10 @@
-"""The quantities of docs/methods.md §7, from episodes."""
+"""The measures of docs/methods.md §7, from rows of episodes.parquet."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,11 +14,11 @@ from kerv_cli.reporting import statistics as stats
 from kerv_cli.reporting.statistics import Estimate
 
 MICRO = "micro over tasks"
-MARGIN = 0.03  # of success: a method is non-inferior where the difference's lower bound lies above -MARGIN
 MACRO = "macro over difficulty groups"
+MARGIN = 0.03  # of success: a method is non-inferior where the difference's lower bound lies above -MARGIN
 
-COMPARABLE = ("device", "device_name", "dtype", "threads")  # what times must agree in to be compared
-_SAME = (*COMPARABLE, "initial_state")  # what two episodes of a pair must agree in
+COMPARABLE = ("device", "device_name", "dtype", "threads")  # columns that must be equal for times to be comparable
+_SAME = (*COMPARABLE, "initial_state")  # columns that must be equal in the two episodes of a pair
 
 _RATIOS = {
     "AL": ("committed", "verifications"),
@@ -31,30 +31,19 @@ _RATIOS = {
     "retrieval_share": ("retrieval_decodes", "decodes"),
     "deviation": ("deviation_sum", "deviation_count"),
 }
-"""Quotients of sums over episodes; NaN where there was nothing to divide by."""
+"""Quotients of sums over episodes; NaN where the denominator is 0."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """One setting over some episodes."""
-
-    values: dict[str, float]  # every measure but those below
-    success: Estimate  # Wilson interval
-    speedup: Estimate  # of time per step; bootstrap interval; NaN without pairs, and where no target decodes
-    episode_speedup: Estimate  # of time per episode, likewise: methods also change how long episodes are
-    counts: stats.PairedCounts
-    mcnemar_p: float  # NaN without pairs
-    difference: Estimate  # of success, method minus baseline, over all pairs
-    pairs_to_settle: float  # about how many pairs would show non-inferiority at MARGIN
-    same_run: bool  # all pairs were measured in one run
-    same_block: float  # share of the pairs that were measured in one block, in turn; NaN without pairs
-
-
-def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Measured:
+def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> dict[str, Any]:
     """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
 
+    success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
+    (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs and where no
+    target decodes. mcnemar_p is NaN without pairs. same_run: all pairs were measured in one run. same_block: share of
+    the pairs that were measured in one block, in turn.
+
     MACRO takes each measure within every difficulty group and then the unweighted mean of the groups; the speedup is
-    the ratio of the two macro means. Paired counts and p are no averages: they are those of all pairs.
+    the ratio of the two macro means. Paired counts and p are those of all pairs in either case.
 
     Args:
         episodes: the setting's, columns of rows.EPISODE_SCHEMA, decode_seconds, difficulty, run and those of `_SAME`.
@@ -62,21 +51,34 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> M
     """
     pairs = paired(episodes, baseline)
     macro = averaging == MACRO
-    once = pairs[pairs["repeat"] == 0]  # a repeat of an episode is another time, not another world
-    counts = stats.paired_counts(once["success_baseline"].to_numpy(), once["success_method"].to_numpy())
+    worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
+    counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
+    difference = stats.paired_difference(counts)
+    once = episodes[episodes["repeat"] == 0]
     decodes = _decodes(episodes)
-    return Measured(
-        values=_by_group(episodes, _means) if macro else _means(episodes),
-        success=_success(episodes[episodes["repeat"] == 0], macro),
-        speedup=_speedup(pairs, "time", macro) if decodes else stats.NO_ESTIMATE,
-        episode_speedup=_speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE,
-        counts=counts,
-        mcnemar_p=stats.mcnemar(counts) if len(pairs) else math.nan,
-        difference=stats.paired_difference(counts),
-        pairs_to_settle=stats.pairs_to_settle(counts, MARGIN),
-        same_run=bool(len(pairs) and pairs["same_run"].all()),
-        same_block=float(pairs["same_block"].mean()) if len(pairs) else math.nan,
-    )
+    return {
+        "successes": int(once["success"].sum()),
+        **_columns("success", _success(once, macro)),
+        **_columns("speedup", _speedup(pairs, "time", macro) if decodes else stats.NO_ESTIMATE),
+        **_columns("episode_speedup", _speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE),
+        **(_by_group(episodes, _means) if macro else _means(episodes)),
+        "pairs": sum(counts),
+        **counts._asdict(),
+        "mcnemar_p": stats.mcnemar(counts) if len(pairs) else math.nan,
+        **_columns("difference", difference),
+        "margin": MARGIN,
+        "non_inferior": bool(difference.low > -MARGIN),
+        "pairs_to_settle": stats.pairs_to_settle(counts, MARGIN),
+        "same_run": bool(len(pairs) and pairs["same_run"].all()),
+        "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
+        "steps": int(episodes["steps"].sum()),
+        "decodes": int(episodes["decodes"].sum()),
+        "deviation_samples": int(episodes["deviation_count"].sum()),
+    }
+
+
+def _columns(name: str, estimate: Estimate) -> dict[str, float]:
+    return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
 
 
 def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
@@ -100,7 +102,7 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
 
 
 def _decodes(episodes: pd.DataFrame) -> bool:
-    """Whether a target decodes at all. The scripted expert's time is no speedup of any decoding method."""
+    """Whether a target decodes at all; a scripted expert has no decoding time to compare."""
     return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
 
 
@@ -137,7 +139,7 @@ def _latencies(decode_seconds: pd.Series) -> dict[str, float]:
 
 
 def _by_group(episodes: pd.DataFrame, measure_of: Callable[[pd.DataFrame], dict[str, float]]) -> dict[str, float]:
-    """Unweighted mean over difficulty groups; a group that has no value of a measure is left out of its mean."""
+    """Unweighted means over difficulty groups; groups without a value of a measure are left out of its mean."""
     groups = pd.DataFrame([measure_of(group) for _, group in episodes.groupby("difficulty", sort=True)])
     return {str(name): float(value) for name, value in groups.mean().items()}
 

@@ -1,10 +1,9 @@
-"""Figures of a study, from its table. Drawn without a display; the same table gives the same file."""
+"""Figures of a study from its table: measures along an axis or by setting, and time by phase."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -17,9 +16,9 @@ from kerv_cli.decoding.record import PHASES
 from kerv_cli.reporting.drawing import COLOURS, DASHES, INK, MUTED, STYLE, entitle, new_figure, setting_colours
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.scatter import tradeoff_figure
-from kerv_cli.reporting.tables import is_number
+from kerv_cli.reporting.tables import is_number, rows_of
 
-_PHASE_COLOURS = ("#b8c4d0", "#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
+_PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
 _PANELS = (
     ("speedup", "Speedup", "time per step, baseline ÷ setting", 1.0),
     ("success", "Success", "episodes, % and 95 % interval", 100.0),
@@ -62,14 +61,14 @@ def _is_baseline(rows: pd.DataFrame) -> pd.Series:
 def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
     """Rows by everything that varies besides the axis: legend text -> rows along the axis, with its number as `x`.
 
-    A row on which the axis has no number is a series of its own. The baseline is left out, unless it is one point of a
-    series of others.
+    A row without a number on the axis is a series of its own. The baseline is only included where it is a point of
+    another series.
     """
     own = rows[~_is_baseline(rows)]
     varying = _varying(own, axis)
     numbers = axis_numbers(own, axis)
     series: dict[str, pd.DataFrame] = {}
-    keys = [own[name].astype(str) for name in varying] + [own["label"].where(numbers.isna(), "")]
+    keys = [own[name].map(str) for name in varying] + [own["label"].where(numbers.isna(), "")]
     for _, group in own.groupby(keys, sort=False):
         stems = {_stem(str(label), axis) for label in group["label"]}
         name = str(group["label"].iloc[0]) if len(group) == 1 else stems.pop()
@@ -85,11 +84,11 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
 def _varying(own: pd.DataFrame, axis: str) -> list[str]:
     first, last = list(own.columns).index("overrides") + 1, list(own.columns).index("horizon")
     candidates = ["method", *own.columns[first:last]]
-    return [name for name in candidates if name != axis and own[name].astype(str).nunique() > 1]
+    return [name for name in candidates if name != axis and own[name].map(str).nunique() > 1]
 
 
 def axis_numbers(rows: pd.DataFrame, axis: str) -> pd.Series:
-    """The axis's values; NaN where they are no numbers (text, switches, nothing)."""
+    """The axis's values; NaN for text, booleans and missing values."""
     values = rows[axis] if axis in rows else pd.Series(math.nan, index=rows.index)
     values = values.map(lambda value: math.nan if isinstance(value, bool | np.bool_) else value)
     return pd.to_numeric(values, errors="coerce")
@@ -108,7 +107,7 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
     axes = figure.subplots(1, len(_PANELS))
     ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
     others = [group[~_is_baseline(group)].iloc[0] for group in series.values()]
-    shades = setting_colours({str(k): v for k, v in row.items()} for row in others)
+    shades = setting_colours(rows_of(pd.DataFrame(others)))
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
         for place, (label, group) in enumerate(series.items()):
             _draw_series(panel, group, measure, scale, shades[place], DASHES[place % len(DASHES)], label)
@@ -126,7 +125,7 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
 def _draw_series(
     panel: Axes, group: pd.DataFrame, measure: str, scale: float, shade: str, dashes: Any, label: str
 ) -> None:
-    if len(group) == 1:  # a setting that the axis does not touch: a level to compare with
+    if len(group) == 1:  # a setting without a number on the axis: a level
         level = group[measure].iloc[0] * scale
         if is_number(level):
             panel.axhline(level, color=shade, linestyle=dashes, linewidth=1.4, label=label)
@@ -150,7 +149,7 @@ def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) 
 
 
 def _limit(panel: Axes, measure: str) -> None:
-    """Success on its whole scale; ratios on theirs, which has no meaningful zero, with room above."""
+    """Axis limits: success from 0 to 104 %, ratios by their values with a margin."""
     if measure == "success":
         panel.set_ylim(0, 104)
     else:
@@ -160,10 +159,9 @@ def _limit(panel: Axes, measure: str) -> None:
 def _by_setting(rows: pd.DataFrame) -> Figure:
     figure = new_figure(12.0, 2.0 + 0.38 * len(rows))
     axes = figure.subplots(1, len(_PANELS), sharey=True)
-    places = range(len(rows))
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
-        for place, row in zip(places, rows.to_dict("records"), strict=True):
-            _draw_dot(panel, place, {str(k): v for k, v in row.items()}, measure, scale)
+        for place, row in enumerate(rows_of(rows)):
+            _draw_dot(panel, place, row, measure, scale)
         reference = rows[_is_baseline(rows)]
         if len(reference) and measure != "AL":
             level = 1.0 if measure == "speedup" else reference.iloc[0][measure] * scale
@@ -173,9 +171,15 @@ def _by_setting(rows: pd.DataFrame) -> Figure:
         if measure == "speedup":
             _draw_ceilings(panel, rows)
         panel.set_xlim(0, 104 if measure == "success" else 1.08 * panel.get_xlim()[1])
-    axes[0].set_yticks(list(places), list(rows["label"]), color=INK)
-    axes[0].set_ylim(len(rows) - 0.5, -0.5)
+    _name_rows(axes[0], rows["label"])
     return figure
+
+
+def _name_rows(panel: Axes, names: pd.Series) -> None:
+    """Names along y, the first on top."""
+    panel.set_yticks(range(len(names)), list(names), color=INK)
+    panel.set_ylim(len(names) - 0.5, -0.5)
+    panel.grid(axis="y", visible=False)
 
 
 def _draw_ceilings(panel: Axes, rows: pd.DataFrame) -> None:
@@ -209,23 +213,16 @@ def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale:
 def _phases(rows: pd.DataFrame) -> Figure:
     figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
     panel = figure.subplots()
-    places = list(range(len(rows)))
-    left = [0.0] * len(rows)
-    for phase, shade in zip(PHASES, _phase_colours(len(PHASES)), strict=True):
-        widths = rows[f"ms.{phase}"].fillna(0.0).to_list()
-        if any(widths):
+    places, left = np.arange(len(rows)), np.zeros(len(rows))
+    for phase, shade in zip(PHASES, _PHASE_COLOURS, strict=True):
+        widths = rows[f"ms.{phase}"].fillna(0.0).to_numpy()
+        if widths.any():
             panel.barh(places, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
-        left = [a + b for a, b in zip(left, widths, strict=True)]
-    for place, total in zip(places, rows["time_per_step_ms"], strict=True):
+        left = left + widths
+    for place, total in enumerate(rows["time_per_step_ms"]):
         panel.text(total, place, f"  {total:.3g}", va="center", fontsize=9)
-    panel.set_yticks(places, list(rows["label"]), color=INK)
-    panel.set_ylim(len(rows) - 0.5, -0.5)
+    _name_rows(panel, rows["label"])
     panel.set(title="Inference time by phase", xlabel="ms per control step")
-    panel.grid(axis="y", visible=False)
     panel.margins(x=0.08)
     figure.legend(loc="outside lower center", ncols=len(PHASES))
     return figure
-
-
-def _phase_colours(count: int) -> Sequence[str]:
-    return [_PHASE_COLOURS[i % len(_PHASE_COLOURS)] for i in range(count)]

@@ -1,5 +1,5 @@
-"""How well the Kalman filter predicts the next actions, beside holding the last one and prolonging the last two: the
-errors that `kerv calibrate` measured on held-out demonstrations (docs/methods.md §3.1)."""
+"""Errors of the kinematic predictors on held-out demonstrations, as `kerv calibrate` measured them
+(docs/methods.md §3.1): table and figure."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class Predictions:
 
     @property
     def name(self) -> str:
-        """Of its files; a target that is given as a folder is called by the folder's last names."""
+        """Stem of the report's files: prediction_<target>, with a folder's path made a file name."""
         return "prediction_" + re.sub(r"[^A-Za-z0-9_.-]+", "-", self.target.removesuffix("/target")).strip("-.")
 
 
 def read_predictions(results: Path, target: str) -> Predictions | None:
-    """The errors of the target `target`; None where there is no such target, or nothing calibrated for it. The target
-    may be another since: the errors are the demonstrations'.
+    """The errors in a target's calibration; None without such a target or calibration. They are those of the
+    demonstrations, so the target's weights may have changed since.
 
     Raises:
         CheckpointError: the calibration is damaged or of another format.
@@ -64,12 +64,12 @@ def calibrated_targets(results: Path) -> list[str]:
 
 
 def predicting_targets(settings: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The targets of those settings whose method predicts: to fill what was rejected, or to draft."""
+    """The targets of those settings whose method uses a kinematic predictor: for drafts or for compensation."""
     return list(dict.fromkeys(s["policy"]["target"] for s in settings if _predicts(s)))
 
 
 def _predicts(settings: Mapping[str, Any]) -> bool:
-    drafting = [settings[kind] for kind in ("prefill_draft", "proposer")]
+    drafting = [settings.get(kind, {"kind": "none"}) for kind in ("prefill_draft", "proposer")]
     named = {name for part in drafting for name in (part["kind"], *part.get("sources", ()), *part.get("fallback", ()))}
     return bool(named & set(PREDICTORS) or settings["rectifier"]["kind"] == "compensate")
 
@@ -99,17 +99,16 @@ def prediction_table(predictions: Predictions) -> pd.DataFrame:
 
 def _against(error: float, hold: list[float]) -> dict[str, float]:
     reference = hold[0] if hold else math.nan
-    ratio = error / reference if reference else math.nan  # the gripper is held by all of them, often without an error
+    ratio = error / reference if reference else math.nan  # a gripper's error is often 0
     return {"error": error, "hold_error": reference, "ratio_to_hold": ratio}
 
 
 def predicted_dofs(table: pd.DataFrame) -> list[str]:
-    """The DoFs that the predictors predict: all but those, a gripper, which every one of them holds."""
-    others = table[table["predictor"] != REFERENCE]
-    differs = others[others["error"] != others["hold_error"]]
-    return [dof for dof in dict.fromkeys(table["dof"]) if dof in set(differs["dof"])] or list(
-        dict.fromkeys(table["dof"])
-    )
+    """The DoFs in which some predictor differs from holding the last action (strict DoFs are held by all of them); all
+    DoFs if there is none."""
+    differs = set(table.loc[table["error"] != table["hold_error"], "dof"])
+    dofs = list(dict.fromkeys(table["dof"]))
+    return [dof for dof in dofs if dof in differs] or dofs
 
 
 def predicted_means(table: pd.DataFrame) -> pd.DataFrame:
@@ -119,8 +118,8 @@ def predicted_means(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Texts: one row per predictor, the mean error over the predicted DoFs and all tasks by steps ahead; beside it, as
-    a share of hold's."""
+    """One row per predictor, as text: by steps ahead the mean error over `predicted_dofs` and all tasks, and its share
+    of hold's error."""
     means = predicted_means(table).groupby(["predictor", "steps_ahead"], sort=False)["error"].mean().reset_index()
     errors = {(str(p), int(s)): float(e) for p, s, e in means.itertuples(index=False)}
     rows: dict[str, dict[str, str]] = {}

@@ -1,4 +1,4 @@
-"""Tables, plots and one self-contained page per study, regenerated from its cells."""
+"""Writes the tables, plots and self-contained page of each study from its stored cells."""
 
 from __future__ import annotations
 
@@ -13,28 +13,19 @@ from matplotlib.figure import Figure
 
 from kerv_cli.errors import UsageError
 from kerv_cli.files import atomic_path
+from kerv_cli.reporting import prediction
 from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
 from kerv_cli.reporting.measures import MACRO, MICRO
 from kerv_cli.reporting.plots import study_figures
-from kerv_cli.reporting.prediction import (
-    Predictions,
-    calibrated_targets,
-    predicted_dofs,
-    predicting_targets,
-    prediction_figure,
-    prediction_summary,
-    prediction_table,
-    read_predictions,
-)
 from kerv_cli.reporting.summary import summary_frame
 from kerv_cli.reporting.tables import StudyData, load_study, per_task_table, study_table, write_csv
-from kerv_cli.studies.store import StudyStore, list_studies
+from kerv_cli.studies.store import StudyStore, begun_studies
 
 
 @dataclass(frozen=True)
 class Report:
-    """files: what was written, in order. tables: study -> its `study_table`."""
+    """files: those written, in order. tables: study -> its `study_table`."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
@@ -43,9 +34,9 @@ class Report:
 def report(results: Path | str, study: str | None = None) -> Report:
     """Writes a study's files, or those of every study that has a complete cell and of every calibration.
 
-    results/tables/<study>.csv and <study>_per_task.csv, results/plots/<study>*.png and, where small, .svg,
-    results/studies/<study>/report.html; where a study's methods predict actions, prediction_<target>, where they
-    choose by curvature, boundary_radius among the tables and plots. The same cells give the same bytes.
+    tables/<study>.csv and <study>_per_task.csv, plots/<study>*.png and, where small, .svg, and
+    studies/<study>/report.html. Tables and plots of prediction_<target> are added for a study whose methods predict
+    actions, and of boundary_radius for one that compares boundaries. The same cells give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
@@ -56,30 +47,30 @@ def report(results: Path | str, study: str | None = None) -> Report:
     if study:
         reporter.report_study(study)
         return reporter.report
-    names = [s.name for s in list_studies(results) if s.complete]
-    calibrated = calibrated_targets(Path(results))
+    names = begun_studies(results)
+    calibrated = prediction.calibrated_targets(Path(results))
     if not names and not calibrated:
         raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=NAME`")
     for name in names:
         reporter.report_study(name)
     for target in calibrated:
-        reporter.prediction(target)
-    reporter.curvature()
+        reporter.prediction_section(target)
+    reporter.curvature_section()
     return reporter.report
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page that is not about the study's own cells."""
+    """An extra section of the page: prediction errors, curvature."""
 
     title: str
     note: str
     figure: str  # an HTML element
-    table: pd.DataFrame | None = None  # texts
+    table: pd.DataFrame | None = None  # of text
 
 
 class _Reporter:
-    """Writes what is asked for; what several studies share is computed and written once."""
+    """Writes the files of studies; sections that several of them share are computed and written once."""
 
     def __init__(self, results: Path) -> None:
         self.results = results
@@ -97,34 +88,34 @@ class _Reporter:
         figures = study_figures(whole, data.plan.axis, data.plan.title or name)
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
-        sections = [self.prediction(target) for target in predicting_targets(settings)]
+        sections = [self.prediction_section(target) for target in prediction.predicting_targets(settings)]
         if _varies_boundary(settings):
-            sections.append(self.curvature())
+            sections.append(self.curvature_section())
         page = store.root / "report.html"
         with atomic_path(page) as temporary:
             shown = [section for section in sections if section is not None]
             temporary.write_text(_page(store, data, whole, per_task, drawn, shown), encoding="utf-8")
         self.report.files.append(page)
 
-    def prediction(self, target: str) -> Section | None:
+    def prediction_section(self, target: str) -> Section | None:
         """Writes a target's prediction errors; None where it was not calibrated."""
         if target not in self._sections:
-            found = read_predictions(self.results, target)
-            self._sections[target] = None if found is None else self._prediction(found)
+            found = prediction.read_predictions(self.results, target)
+            self._sections[target] = None if found is None else self._predictions(found)
         return self._sections[target]
 
-    def _prediction(self, found: Predictions) -> Section:
-        table = prediction_table(found)
+    def _predictions(self, found: prediction.Predictions) -> Section:
+        table = prediction.prediction_table(found)
         self._save_table(table, found.name)
         return Section(
             title=f"Prediction of the next actions, {found.target}",
             note=_prediction_note(found, table),
-            figure=self._save_plot(prediction_figure(found, table), found.name),
-            table=prediction_summary(table),
+            figure=self._save_plot(prediction.prediction_figure(found, table), found.name),
+            table=prediction.prediction_summary(table),
         )
 
-    def curvature(self) -> Section:
-        """Writes what the boundary's radius and the public code's measure on known paths."""
+    def curvature_section(self) -> Section:
+        """Writes table and plot of the boundary's radius on known paths, ours and the public code's."""
         name = "boundary_radius"
         section = self._sections.get(name)
         if section is None:
@@ -141,25 +132,25 @@ class _Reporter:
         self.report.files.append(write_csv(table, self.results / "tables" / f"{name}.csv"))
 
     def _save_plot(self, figure: Figure, name: str) -> str:
-        """The element that shows it."""
+        """The figure's HTML element."""
         plot = save_plot(figure, self.results / "plots", name)
         self.report.files.extend(plot.files)
         return plot.html
 
 
-def _prediction_note(predictions: Predictions, table: pd.DataFrame) -> str:
+def _prediction_note(predictions: prediction.Predictions, table: pd.DataFrame) -> str:
     return (
-        f"Mean absolute error on held-out demonstrations, mean of {', '.join(predicted_dofs(table))} over the tasks, "
-        "in normalised action units; brackets: share of the error of holding the last action. "
+        "Mean absolute error on held-out demonstrations, mean over the tasks of "
+        f"{', '.join(prediction.predicted_dofs(table))}, in normalised action units; "
+        "brackets: share of the error of holding the last action. "
         f"Calibration {predictions.sha256[:12]}, predicted from the last {predictions.calibration.window} steps; "
         f"per task and DoF: tables/{predictions.name}.csv."
     )
 
 
 def _varies_boundary(settings: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether the study compares boundaries; `always` is the absence of one."""
-    boundaries = [s.get("boundary") or {"kind": "always"} for s in settings]
-    return len({str(b) for b in boundaries if b["kind"] != "always"}) > 1
+    """Whether the study compares boundaries; `always` stands for none."""
+    return len({str(s["boundary"]) for s in settings if s["boundary"]["kind"] != "always"}) > 1
 
 
 def _page(
@@ -203,7 +194,7 @@ def _page(
 
 
 def _as_texts(table: pd.DataFrame) -> pd.DataFrame:
-    """Values as the CSV file writes them."""
+    """The table as text, with the digits of the CSV file."""
     return pd.DataFrame(
         {name: [f"{v:.6g}" if isinstance(v, float) else "" if v is None else v for v in table[name]] for name in table}
     ).replace("nan", "")

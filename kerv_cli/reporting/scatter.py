@@ -1,4 +1,4 @@
-"""Success against speedup, every setting a labelled point."""
+"""Figure of success against speedup: every setting is a labelled point."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
 from kerv_cli.reporting.drawing import INK, MUTED, entitle, new_figure, setting_colours
-from kerv_cli.reporting.tables import is_number
+from kerv_cli.reporting.tables import is_number, rows_of
 
 _DISTANCES = (9.0, 14.0, 21.0, 30.0, 40.0, 52.0, 66.0, 82.0, 100.0)  # points from the marker, tried in turn
 _ANGLES = tuple(math.radians(a) for a in (45, -45, 135, -135, 90, -90, 20, -20, 160, -160, 65, -65, 115, -115))
@@ -27,10 +27,10 @@ _POINT = 72.0  # per inch
 
 def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
     """Speedup on x, success on y, bars for the 95 % intervals. A setting without a speedup, such as the scripted
-    expert, is a level of success."""
+    expert, is a dashed level of success."""
     figure = new_figure(11.0, 6.4)
     panel = figure.subplots()
-    drawn = [{str(k): v for k, v in row.items()} for row in rows.to_dict("records")]
+    drawn = rows_of(rows)
     points = [row for row in drawn if is_number(row["speedup"])]
     shades = setting_colours(points)
     for row, shade in zip(points, shades, strict=True):
@@ -41,6 +41,7 @@ def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
     panel.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
     panel.set(xlabel="speedup: time per step, baseline ÷ setting", ylabel="success, % of episodes")
     panel.margins(x=0.14)
+    panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
     low = min((100 * row["success_low"] for row in drawn if is_number(row["success_low"])), default=0.0)
     panel.set_ylim(max(-2.0, min(low, 60.0) - 8.0), 106)
     panel.set_title("Success against speedup")
@@ -77,10 +78,10 @@ def _draw_level(panel: Axes, row: dict[str, Any]) -> None:
 def place_labels(
     figure: Figure, panel: Axes, labels: Sequence[tuple[float, float, str]], shades: Sequence[str]
 ) -> list[Annotation]:
-    """Writes every label near its point (x, y in data units), clear of the others, of all markers and of the frame.
+    """Writes every label near its point (x, y in data units), clear of other labels, markers and the frame.
 
-    Greedy, from the most crowded point on: the first of some places around a point, near ones first, where nothing is
-    covered; where there is none, the place that covers least. A thin line leads from a label that is far away.
+    Greedy, the most crowded point first: candidate places around the point are tried from near to far; the first that
+    covers nothing is taken, else the one that covers least. A thin line joins a distant label to its point.
     """
     renderer = _settled(figure)
     scale = figure.dpi / _POINT  # pixels per point
@@ -97,7 +98,7 @@ def place_labels(
             (0, 0),
             textcoords="offset points",
             fontsize=9,
-            color=shades[number],  # in a crowd the colour says whose it is
+            color=shades[number],
             ha="center",
             va="center",
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
@@ -113,7 +114,7 @@ def place_labels(
 
 
 def _settled(figure: Figure) -> Any:
-    """The renderer, after the layout found every panel's place."""
+    """The renderer, after the layout has placed every panel."""
     figure.draw_without_rendering()
     canvas = figure.canvas
     assert isinstance(canvas, FigureCanvasAgg)

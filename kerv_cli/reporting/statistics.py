@@ -1,4 +1,4 @@
-"""Intervals and tests of docs/methods.md §7. Numbers in, numbers out: no tables here."""
+"""Intervals and tests of docs/methods.md §7, on plain arrays."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ BOOTSTRAP_SEED = 20_260_301  # fixed: the same cells give the same table
 
 
 class Interval(NamedTuple):
+    """A 95 % interval."""
+
     low: float
     high: float
 
@@ -109,11 +111,11 @@ def pairs_to_settle(counts: PairedCounts, margin: float, z: float = 1.96) -> flo
     # one discordant pair at least: none so far does not prove that there are none
     discordant = max(1, counts.only_method + counts.only_baseline) / pairs
     room = margin + difference
-    return math.ceil(z**2 * (discordant - difference**2) / room**2) if room > 0 else math.inf
+    return max(1, math.ceil(z**2 * (discordant - difference**2) / room**2)) if room > 0 else math.inf
 
 
 def mcnemar(counts: PairedCounts) -> float:
-    """Exact two-sided p of McNemar's test: are the discordant pairs a fair coin? 1 without discordant pairs."""
+    """Exact two-sided p of McNemar's test, that discordant pairs favour either side equally; 1 without such pairs."""
     discordant = counts.only_baseline + counts.only_method
     if discordant == 0:
         return 1.0
@@ -132,10 +134,9 @@ def speedup(
 ) -> Estimate:
     """Ratio of mean times, baseline over method, with a paired bootstrap 95 % interval.
 
-    Within every stratum (the task) blocks are drawn with replacement, then within each drawn block its pairs, both
-    times of a pair together, and the ratio of the means is taken of every draw. So the interval knows that what was
-    measured in one block shares the machine's state. With pairs that are independent of their block it is wider than it
-    need be, never narrower.
+    Within every stratum (the task) blocks are drawn with replacement, then pairs within each drawn block, both times of
+    a pair together; every draw gives a ratio of means. So the interval takes into account that the episodes of a block
+    share the machine's state. Where pairs do not depend on their block, it is wider than necessary, never narrower.
 
     Args:
         baseline: (pairs,) time of the baseline's episodes, any unit.
@@ -162,7 +163,7 @@ def speedup(
     means = np.zeros((resamples, 2))
     for stratum in range(int(members.max()) + 1):
         rows = np.flatnonzero(members == stratum)
-        # a stratum lies in one group, so its pairs weigh the same
+        # a stratum lies within one group, so its pairs have equal weights
         means += _resampled_means(times[rows], blocked[rows], resamples, generator) * weights[rows].sum()
     low, high = np.quantile(means[:, 0] / means[:, 1], [0.025, 0.975])
     return Estimate(value, float(low), float(high))
@@ -179,7 +180,7 @@ def _resampled_means(
     drawn_sizes = sizes[drawn]  # (resamples, blocks)
     within = generator.random((resamples, sizes.size, int(sizes.max())))
     places = first[drawn][..., None] + (within * drawn_sizes[..., None]).astype(np.int64)
-    used = np.arange(sizes.max()) < drawn_sizes[..., None]  # a small block gives fewer pairs
+    used = np.arange(sizes.max()) < drawn_sizes[..., None]  # as many pairs as the block has
     sums = np.einsum("rbpk,rbp->rk", sorted_times[np.where(used, places, 0)], used)
     means: np.ndarray = sums / drawn_sizes.sum(axis=1, keepdims=True)
     return means

@@ -1,4 +1,4 @@
-"""The few columns that people read first, as text: for the terminal and for the report."""
+"""The main columns of a table as text, for the terminal and the report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from kerv_cli.reporting.measures import MICRO
-from kerv_cli.reporting.tables import is_number
+from kerv_cli.reporting.tables import is_number, rows_of
 
 APART = "*"
 
@@ -41,7 +41,7 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     for name in frame.columns:
         left = name == "setting"
         head = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
-        interval = name in ("success %", "speedup")  # better a label in two lines than an interval
+        interval = name in ("success %", "speedup")  # labels wrap, intervals do not
         printed.add_column(head, justify="left" if left else "right", overflow="fold", no_wrap=interval)
     for row in frame.itertuples(index=False):
         printed.add_row(*(escape(str(value)) for value in row))
@@ -49,7 +49,7 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
 
 
 def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
-    """Without what only a wide page has room for; the shares of decodes in one column."""
+    """Fewer columns, for a terminal: drops AFEP, lost/won and deviation, and joins the shares of decodes in one."""
     frame = frame.drop(columns=["AFEP", "lost/won", "deviation"], errors="ignore")
     shares = [name for key, name in _WHERE_USED.items() if key in _PERCENT and name in frame]
     if shares:
@@ -59,11 +59,12 @@ def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
-    """The same as texts: 95 % intervals in brackets, `–` where a value does not exist, unused columns left out."""
-    rows = table[table["averaging"] == averaging].to_dict("records")
+    """The rows of one averaging as text: 95 % intervals in brackets, `–` for missing values; columns that no row uses
+    are left out."""
+    rows = rows_of(table, averaging)
     used = {key: name for key, name in _WHERE_USED.items() if any(is_number(row[key]) and row[key] for row in rows)}
     limited = any(is_number(row["ceiling"]) for row in rows)
-    return pd.DataFrame([_cells({str(k): v for k, v in row.items()}, _ALWAYS | used, limited) for row in rows])
+    return pd.DataFrame([_cells(row, _ALWAYS | used, limited) for row in rows])
 
 
 def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) -> dict[str, str]:
@@ -81,7 +82,7 @@ def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) ->
 
 
 def _apart(row: Mapping[str, Any]) -> str:
-    """The mark of a speedup whose two sides were measured at different times."""
+    """The mark of a speedup of which not all pairs were measured in one run."""
     return APART if is_number(row["speedup"]) and not row["same_run"] else ""
 
 
@@ -100,7 +101,7 @@ def _interval(row: Mapping[str, Any], name: str, scale: float, digits: int) -> s
 
 
 def number(value: float) -> str:
-    """Three significant digits, never an exponent for what occurs here."""
+    """Three significant digits without an exponent; `–` for a missing value."""
     if not is_number(value):
         return "–"
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"

@@ -1,10 +1,10 @@
-"""From cells to tables, CSV files and the summary on the terminal."""
+"""Tables of a study from its stored cells: per task and aggregated, as data frames and CSV files."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +21,14 @@ from kerv_cli.reporting.ceiling import (
     is_autoregressive,
     verifies_in_prefill,
 )
-from kerv_cli.reporting.measures import COMPARABLE, MACRO, MARGIN, MICRO, Measured, measure
-from kerv_cli.studies.plan import OBSERVATION, Cell, seeds_text
+from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, measure
+from kerv_cli.settings import MODEL
+from kerv_cli.studies.plan import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, OBSERVATION, Cell, seeds_text, without
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
 
-_STATUS_COLUMNS = (
-    "executor",
-    "workers",
-    "device_name",
-    "host",
-    *(f"{name}_version" for name in PACKAGES),
-    "python_version",
-    "git_commit",
-    "run",
-)
-_RUNTIME_ELSEWHERE = frozenset({"workers", "executor", "executor_options"})
-_SETTINGS_ELSEWHERE = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
+_PLACE = ("executor", "workers", "device_name", "host")
+_STATUS_COLUMNS = (*_PLACE, *(f"{name}_version" for name in PACKAGES), "python_version", "git_commit", "run")
 
 
 @dataclass(frozen=True)
@@ -51,7 +42,7 @@ class StudyData:
 
 
 def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
-    """What a study has; with `cells`, only those of its cells.
+    """The study's plan and complete cells; with `cells`, a plan of only those cells.
 
     Raises:
         UsageError: no such study, or no complete cell.
@@ -59,7 +50,7 @@ def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyD
     """
     plan = store.read_plan()
     if cells is not None:
-        plan = StudyPlan(plan.name, plan.title, plan.baseline, plan.axis, tuple(cells))
+        plan = replace(plan, cells=tuple(cells))
     found, absent = store.read_cells(plan.cells)
     frames = [_labelled(cell, found[cell.id]) for cell in plan.cells if cell.id in found]
     return StudyData(plan, found, pd.concat(frames, ignore_index=True), absent)
@@ -97,11 +88,11 @@ def study_table(data: StudyData) -> pd.DataFrame:
 
 
 Sections = list[dict[str, Any]]
-"""One row, in the order of its columns. Settings differ in what they have; what they share stays together."""
+"""One row of a table as sections of columns; settings with different parts share the columns before each section."""
 
 
 def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
-    """Rows as a table: within a section, columns that only later rows have come behind those of the first."""
+    """Rows as a table; within each section, columns that only later rows have are appended."""
     columns = [name for parts in zip(*rows, strict=True) for part in parts for name in part]
     merged = [{name: value for part in row for name, value in part.items()} for row in rows]
     return pd.DataFrame(merged, columns=list(dict.fromkeys(columns)))
@@ -132,13 +123,13 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "episodes": len(episodes),
         "baseline": data.plan.baseline,
     }
-    measured = measure(episodes, baseline, averaging)
     best = _ceiling(data, cells[0], episodes, averaging)
-    return [head, _measured(measured, best, episodes), *_origin(data, cells)]
+    return [head, {**measure(episodes, baseline, averaging), **best.columns()}, *_origin(data, cells)]
 
 
 def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:
-    """Against autoregressive decoding of the same target on the same device: the baseline, or else the first one."""
+    """The ceiling against autoregressive decoding of the same target on the same device: the baseline if it is that,
+    else the first such label."""
     if is_autoregressive(cell.settings):
         return NONE
     target = cell.identity.get("target")
@@ -153,49 +144,14 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
     return ceiling(episodes, reference, verifies_in_prefill(cell.settings), chunks, averaging == MACRO)
 
 
-def _measured(found: Measured, best: Ceiling, episodes: pd.DataFrame) -> dict[str, Any]:
-    phases = {name: value for name, value in found.values.items() if name.startswith("ms.")}
-    rest = {name: value for name, value in found.values.items() if name not in phases}
-    limit = best.columns()
-    return {
-        "successes": int(episodes.loc[episodes["repeat"] == 0, "success"].sum()),
-        "success": found.success.value,
-        "success_low": found.success.low,
-        "success_high": found.success.high,
-        "speedup": found.speedup.value,
-        "speedup_low": found.speedup.low,
-        "speedup_high": found.speedup.high,
-        "episode_speedup": found.episode_speedup.value,
-        "episode_speedup_low": found.episode_speedup.low,
-        "episode_speedup_high": found.episode_speedup.high,
-        "ceiling": limit.pop("ceiling"),
-        **rest,
-        "pairs": sum(found.counts),
-        **found.counts._asdict(),
-        "mcnemar_p": found.mcnemar_p,
-        "difference": found.difference.value,
-        "difference_low": found.difference.low,
-        "difference_high": found.difference.high,
-        "margin": MARGIN,
-        "non_inferior": bool(found.difference.low > -MARGIN),
-        "pairs_to_settle": found.pairs_to_settle,
-        "same_run": found.same_run,
-        "same_block": found.same_block,
-        "steps": int(episodes["steps"].sum()),
-        "decodes": int(episodes["decodes"].sum()),
-        "deviation_samples": int(episodes["deviation_count"].sum()),
-        **phases,
-        **limit,
-    }
-
-
 def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
-    """Settings, weights and provenance of a row, the same for all its cells or joined by semicolons."""
+    """Settings, weights and provenance of a row; where its cells differ, the values are joined by semicolons."""
     settings, policy = cells[0].settings, cells[0].settings["policy"]
     world, runtime = settings["world"], settings["runtime"]
     statuses = [data.cells[cell.id].status for cell in cells]
-    parts = {key: value for key, value in settings.items() if key not in {*_SETTINGS_ELSEWHERE, "world", "runtime"}}
+    parts = without(settings, {*NOT_DETERMINING, "world", "runtime"})
     weights = {
+        "policy.kind": policy.get("kind", MODEL),
         "target": policy["target"],
         "drafter": policy.get("drafter"),
         "early": policy.get("early"),
@@ -205,8 +161,8 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
     surroundings = {
         "horizon": world["horizon"],
         "camera": world["camera"]["name"],
-        **flatten({"camera": {k: v for k, v in world["camera"].items() if k != "name"}}),
-        **{key: value for key, value in runtime.items() if key not in _RUNTIME_ELSEWHERE},
+        **flatten({"camera": without(world["camera"], {"name"})}),
+        **without(runtime, NOT_DETERMINING_RUNTIME),
         **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),
     }
@@ -245,5 +201,11 @@ def write_csv(table: pd.DataFrame, path: Path) -> Path:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a table's value is there: neither None nor NaN."""
+    """Whether a value exists: neither None nor NaN."""
     return value is not None and not math.isnan(value)
+
+
+def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[dict[str, Any]]:
+    """The table's rows, or those of one averaging, as dicts by column."""
+    rows = table if averaging is None else table[table["averaging"] == averaging]
+    return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]

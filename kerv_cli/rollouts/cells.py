@@ -1,4 +1,4 @@
-"""A sweep's cell -> its episodes, and the load gauge beside them. Runs in whatever process the executor chose."""
+"""Runs the episodes of a study's cell, and gauges the machine's load, in the process that the executor chose."""
 
 from __future__ import annotations
 
@@ -21,28 +21,37 @@ _TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on
 
 
 class CellLike(Protocol):
-    """What of a study's cell an episode needs; studies lie above rollouts."""
+    """The attributes of a study's cell that are used here; a protocol, because `studies` imports `rollouts`."""
 
     @property
-    def id(self) -> str: ...
+    def id(self) -> str:
+        """Hash that names the cell."""
+
     @property
-    def label(self) -> str: ...
+    def label(self) -> str:
+        """Name of its setting in the study."""
+
     @property
-    def task(self) -> str: ...
+    def task(self) -> str:
+        """Full task name."""
+
     @property
-    def repeat(self) -> int: ...
+    def repeat(self) -> int:
+        """Number of the study's repeat, from 0."""
+
     @property
-    def settings(self) -> dict[str, Any]: ...
+    def settings(self) -> dict[str, Any]:
+        """RolloutSettings as plain values."""
 
 
 @dataclass(frozen=True)
 class CellRunner:
-    """Makes cells ready. Picklable. rollouts: folder of the .rrd files, one per recorded episode."""
+    """Prepares cells for their episodes; picklable. rollouts: folder of the .rrd files, one per recorded episode."""
 
     rollouts: Path
 
     def __call__(self, cell: CellLike) -> Callable[[int], EpisodeRecord]:
-        """The function that runs a seed's episode, its setting ready. Repeats are not recorded again."""
+        """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
         settings = settings_from(cell.settings)
         runner = Runner(settings, cell.task)
 
@@ -59,8 +68,8 @@ class CellRunner:
 
 
 def reference_decode(device: str) -> float:
-    """Seconds of a small fixed workload with a decode's shape, a chain of products of few tokens with one matrix. It
-    is the same always and everywhere, so its changes are the machine's: how loaded it is, how fast it clocks."""
+    """Seconds of a fixed workload like a decode, a chain of products of few tokens with one matrix. It never changes,
+    so that a change of its time is one of the machine's load or clock."""
     x, weights = _reference(device)
     begin = time.perf_counter()
     _chain(x, weights)

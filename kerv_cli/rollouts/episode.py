@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -15,34 +14,27 @@ from kerv_cli.spaces import Observation
 
 
 class ActionDecoder(Protocol):
-    """What an episode needs of a decoder."""
+    """The interface of a decoder to an episode."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the images that decode() reads; no others are drawn for it."""
+        """Names of the cameras whose images decode() reads; no others are drawn for it."""
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """A new episode begins, with the end effector at (3,) metres: histories are cleared."""
+        """Begins an episode: clears histories."""
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """What is known now, with the images of `cameras` -> the actions to execute and all that happened."""
+        """The present observation, with the images of `cameras` -> the actions to execute and their record."""
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """An action (D,) was executed and the end effector is now at (3,) metres."""
+        """Told after each executed action (D,), in environment units; end_effector (3,) is its position now, metres."""
 
     def finish(self, success: bool) -> None:
-        """The episode ended."""
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What of an episode is kept besides its record: frames of every step at this camera, or nothing."""
-
-    camera: CameraConfig | None = None
+        """Told at the end of the episode."""
 
 
 class _Trace:
-    """What the loop gathers step by step: executed actions, positions, gripper and logged frames."""
+    """Collects executed actions, end-effector positions, gripper openings and frames, step by step."""
 
     def __init__(self, world: World, camera: CameraConfig | None) -> None:
         self.world, self.camera = world, camera
@@ -53,7 +45,7 @@ class _Trace:
         self._look()
 
     def add(self, action: np.ndarray) -> None:
-        """Executes `action` and keeps what followed."""
+        """Executes `action` and stores the result."""
         self.world.step(action)
         space = self.world.spec.actions
         self.actions.append(np.clip(action, space.low, space.high).astype(np.float32))
@@ -66,15 +58,16 @@ class _Trace:
             self.frames[len(self.actions)] = self.world.frame(self.camera)
 
 
-def run_episode(world: World, decoder: ActionDecoder, seed: int, recording: Recording | None = None) -> EpisodeRecord:
-    """One episode, closed loop: decode a chunk, execute it whole, until success or the horizon.
+def run_episode(world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None) -> EpisodeRecord:
+    """One closed-loop episode: decodes a chunk, executes it whole, until success or the horizon.
 
-    Simulation and rendering lie outside the decoder and so outside inference time.
+    Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
+    record keeps, one per control step; None: none.
     """
     began = time.perf_counter()
     world.reset(seed)
     decoder.reset(world.task, seed, world.end_effector)
-    trace = _Trace(world, recording.camera if recording else None)
+    trace = _Trace(world, camera)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     while not world.done:

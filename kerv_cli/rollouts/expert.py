@@ -1,4 +1,4 @@
-"""The scripted expert in the policy's place: what success tables are read against (docs/methods.md §6)."""
+"""The scripted expert as a policy: the reference of success tables (docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ MODE = "expert"
 
 
 class ExpertDecoder:
-    """The environment's scripted controller of the episode's task, asked anew at every control step.
+    """The environment's scripted controller of the episode's task; it decodes one control step at a time.
 
-    It reads the whole state, object and goal included: privileged, as `observation=state` is. It has no target, so its
-    records have no forwards, rounds and tokens, and what is measured per verification is undefined for it. Its time is
-    a few scalar formulas': no speedup of any decoding method.
+    It reads the privileged state, as `observation=state` does. Without a target its records have no forwards, rounds
+    and tokens, and measures per verification are undefined. Its time is that of a few scalar formulas and is not
+    compared with a decoding method's.
     """
 
     cameras: tuple[str, ...] = ()
@@ -31,7 +31,7 @@ class ExpertDecoder:
         self.dofs = 0
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Raises UnknownName for a task that no environment has."""
+        """Begins an episode. Raises UnknownName for a task that no environment has."""
         if self.expert is None or task != self.task:
             spec = spec_of(task)
             self.task, self.expert, self.dofs = task, spec.expert(task), spec.actions.dofs
@@ -40,7 +40,7 @@ class ExpertDecoder:
         """The state -> one control step's action (1, D) in environment units.
 
         Raises:
-            KervError: before the first reset, or a state whose answer is not D finite numbers.
+            KervError: before the first reset, or the answer is not D finite numbers.
         """
         if self.expert is None:
             raise KervError("the expert does not know its task yet: reset it before decoding")

@@ -1,4 +1,4 @@
-"""The policy of a rollout: whether its parts and files fit together, its identity, and the decoder that acts."""
+"""The policy of a rollout: checks that its parts and files fit together, its identity, and its decoder."""
 
 from __future__ import annotations
 
@@ -23,22 +23,26 @@ from kerv_cli.spaces import Observation
 
 WARM_UP_DECODES = 6
 OBSERVATION = "observation"
-"""The identity's one entry that is no hash: what the target is shown. The target's hash implies it."""
+"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
 
 def artifacts_of(settings: RolloutSettings) -> Artifacts:
-    """The policy's files; loaded objects are shared by all settings of this process."""
+    """The policy's files on its device; all settings of this process share the loaded objects."""
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
 def is_expert(settings: RolloutSettings) -> bool:
-    """Whether the environment's scripted policy acts in the target's place."""
+    """Whether the policy is the environment's scripted expert."""
     return settings.policy.kind == EXPERT
 
 
 def identity_of(settings: RolloutSettings) -> dict[str, str]:
-    """Hashes of everything that determines a result besides the settings, without loading weights."""
+    """Hashes of everything that determines a result besides the settings, without loading weights.
+
+    Raises:
+        CheckpointError: as `check`.
+    """
     if is_expert(settings):
         return {"target": "", OBSERVATION: "state (privileged)"}
     artifacts = artifacts_of(settings)
@@ -47,14 +51,14 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
 
 
 def shown_to(target: Mapping[str, object]) -> str:
-    """What a target of these settings is shown, for every row: one that is given the scene must not pass for one that
-    sees it."""
+    """What a target of these settings observes, `vision` or `state (privileged)`; stands in every row, so that a
+    privileged policy is recognised."""
     kind = str(target.get(OBSERVATION, "vision"))
     return "state (privileged)" if kind == "state" else kind
 
 
 def check(settings: RolloutSettings) -> None:
-    """Refuse what cannot run before anything heavy starts.
+    """Refuses settings that cannot run, before anything heavy starts.
 
     Raises:
         UsageError: a number out of range, training seeds, a camera that the policy was not trained on, parts that do
@@ -107,24 +111,25 @@ def _check_expert(settings: RolloutSettings) -> None:
 
 
 class Sampled:
-    """A decoder that, every so many decodes, also asks AR about the same observation, outside the timing."""
+    """A decoder that also decodes every `every`-th observation autoregressively, outside the timing, and records the
+    deviation."""
 
     def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
         self.decoder, self.reference, self.every, self.count = decoder, reference, every, 0
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """As the decoder's."""
+        """Those of the decoder."""
         return self.decoder.cameras
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """A new episode begins."""
+        """Begins an episode of both decoders."""
         self.count = 0
         self.decoder.reset(task, seed, end_effector)
         self.reference.reset(task, seed, end_effector)
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """The decoder's record; every `every`-th with its deviation from AR, in normalised action units."""
+        """The decoder's record; every `every`-th with the mean deviation from AR, in normalised action units."""
         record = self.decoder.decode(observation)
         self.count += 1
         if self.count % self.every:
@@ -135,16 +140,20 @@ class Sampled:
         return dataclasses.replace(record, deviation=float(gap.mean()))
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """An action was executed; AR needs no history."""
+        """Tells the decoder; AR needs no history."""
         self.decoder.observe(action, end_effector)
 
     def finish(self, success: bool) -> None:
-        """The episode ended."""
+        """Tells the decoder."""
         self.decoder.finish(success)
 
 
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
-    """What acts in the episodes of one setting on one task, warmed up."""
+    """The decoder of one setting on one task, warmed up.
+
+    Raises:
+        UsageError, CheckpointError: as `check`.
+    """
     spec = spec_of(task)
     if is_expert(settings):
         decoder: ActionDecoder = ExpertDecoder()
@@ -159,8 +168,8 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
 
 
 def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: int) -> None:
-    """First calls allocate, choose kernels and fault pages in: they are no part of any inference time. The hand moves,
-    so that parts which wait for a history or a path take their turn."""
+    """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
+    so that parts that need a history or a path run too. pixels: size of the images."""
     images = {name: np.zeros((pixels, pixels, 3), dtype=np.uint8) for name in decoder.cameras}
     space = spec.observation
     still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)

@@ -13,23 +13,24 @@ from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
-from kerv_cli.rollouts.episode import Recording, run_episode
+from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.policy import decoder_for
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
 from kerv_cli.targets.protocol import Target
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:
-    """The view that these settings describe."""
+    """The camera of these settings. Raises UsageError for impossible numbers."""
     return CameraConfig(**dataclasses.asdict(settings))
 
 
 _WORLDS = 4  # kept open per process: fifty would take 1.2 GB
-_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the one used last at the end
+_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the most recently used one is last
 
 
 def open_world(task: str, settings: WorldSettings) -> World:
-    """This process's world for a task, camera and horizon; all settings that agree in them share it."""
+    """This process's world for a task, camera and horizon, shared by all settings that agree in them. The worlds used
+    last stay open."""
     key = task, camera_config(settings.camera), settings.horizon
     if key not in _opened:
         _opened[key] = spec_of(task).open_world(*key)
@@ -46,8 +47,8 @@ def close_worlds() -> None:
 
 
 class Runner:
-    """One setting on one task, ready: its decoder is built and warmed up. Episodes may alternate with those of other
-    runners; what a decoder learns from an episode stays its own.
+    """One setting on one task, with its decoder built and warmed up. Episodes may alternate with those of other
+    runners: no state is shared between decoders.
 
     Raises:
         UsageError, CheckpointError: the setting cannot run; see `policy.check`.
@@ -56,30 +57,29 @@ class Runner:
     def __init__(self, settings: RolloutSettings, task: str) -> None:
         self.settings, self.task = settings, task
         self.decoder = decoder_for(settings, task)
-        self._recording = Recording(
-            dataclasses.replace(camera_config(settings.world.camera), size=settings.record_size, supersample=1)
-        )
+        camera = camera_config(settings.world.camera)
+        self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
-        """The episode of a seed; with its frames where it is recorded."""
+        """Runs the episode of a seed; its record has frames where it is recorded."""
         world = open_world(self.task, self.settings.world)  # another runner may have closed it since
         return run_episode(world, self.decoder, seed, self._recording if recorded else None)
 
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
-    """One setting on one task, seed by seed. The first `settings.record` episodes keep frames for their .rrd."""
+    """Runs one setting on one task, seed by seed; `is_recorded` says which episodes keep frames."""
     runner = Runner(settings, task)
     for seed in seeds:
         yield runner.episode(seed, is_recorded(settings, seed))
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
-    """Whether the episode of a seed keeps its frames."""
+    """Whether the episode of a seed keeps its frames: the first `settings.record`, or all for a negative number."""
     return settings.record < 0 or seed - settings.seed < settings.record
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Share of successful AR episodes over tasks and seeds."""
+    """Share in [0, 1] of successful episodes, decoded autoregressively, over tasks and seeds. Closes the worlds."""
     decoder = Decoder(target)
     outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
     close_worlds()

@@ -1,8 +1,9 @@
-"""A block, run in one process: its settings take turns episode by episode, and every cell is written when its last
-episode is done."""
+"""Runs a block in one process: its settings take turns, episode by episode, and a cell is written after its last
+episode."""
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import traceback
@@ -23,7 +24,7 @@ RunEpisode = Callable[[int], EpisodeRecord]
 """Runs the episode of a seed."""
 
 Prepare = Callable[[Cell], RunEpisode]
-"""Makes a cell's setting ready on its task, warmed up. Picklable; keeps what it loaded between calls in its module."""
+"""Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls."""
 
 Gauge = Callable[[str], float]
 """Seconds of a fixed workload on a device. Picklable."""
@@ -39,7 +40,7 @@ class CellResult:
     reason: str = ""  # empty: complete
     reused: bool = False  # another sweep completed it meanwhile
     trace: str = ""
-    storage: bool = False  # the disk refused: no other cell could be written either
+    storage: bool = False  # the disk refused the cell: no other cell could be written either
 
 
 def failed(error: BaseException) -> CellResult:
@@ -49,9 +50,9 @@ def failed(error: BaseException) -> CellResult:
 
 @dataclass(frozen=True)
 class BlockRun:
-    """One attempt to run a block: what a worker does. Picklable.
+    """One attempt to run a block, the function that an executor calls. Picklable.
 
-    name: unique among all attempts. run: the sweep's. status: what every cell's status.json says of the sweep.
+    name: unique among all attempts. run: id of the sweep. status: the sweep's entries in every cell's status.json.
     """
 
     block: Block
@@ -99,7 +100,7 @@ class BlockRun:
 
 
 class _Turn:
-    """One cell's part in a block. Its calls return the cell's result once there is one: it failed, or is complete."""
+    """One cell's part in a block. Its methods return the cell's result as soon as it has failed or is complete."""
 
     def __init__(self, cell: Cell, work: BlockRun) -> None:
         self.cell, self.work = cell, work
@@ -108,7 +109,7 @@ class _Turn:
         self.seconds = 0.0
 
     def prepare(self) -> CellResult | None:
-        """Makes the setting ready, unless the cell is complete."""
+        """Builds the setting, unless the cell is complete."""
         clock = time.perf_counter()
         try:
             if self.work.store.has_cell(self.cell.id):
@@ -124,9 +125,9 @@ class _Turn:
         """Runs one episode; writes the cell after its last one."""
         try:
             note_running(self.work.store.claims, self.cell, self.work.name)
-            at = Circumstances(self.work.name, order, datetime.now(UTC).isoformat(timespec="milliseconds"))
-            if self.work.gauge is not None:
-                at = Circumstances(at.block, order, at.started, self.work.gauge(self._device))
+            started = datetime.now(UTC).isoformat(timespec="milliseconds")
+            load = self.work.gauge(self._device) if self.work.gauge is not None else math.nan
+            at = Circumstances(self.work.name, order, started, load)
             clock = time.perf_counter()
             self.records.append(self.run_episode(seed))
             self.circumstances.append(at)
@@ -148,7 +149,7 @@ class _Turn:
 
 
 def one_line(error: BaseException) -> str:
-    """An error for a summary: kerv's own message, or type, message and place of a foreign one."""
+    """An error in one line: the message of a KervError; type, message and place in the source of any other."""
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
         return text

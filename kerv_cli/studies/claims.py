@@ -1,7 +1,7 @@
-"""Sweeps that share a study: who computes a cell claims it first, so that no two compute the same.
+"""Claims on cells: sweeps that share a study claim a cell before they compute it, so that no two compute the same.
 
-claims/<cell id>.json     who computes the cell: run, block, host, pid, started
-claims/<block>.running    id of the block's cell that runs now; its age is the time since that episode began
+claims/<cell id>.json     the process that computes the cell: run, block, host, pid, started
+claims/<block>.running    id of the block's cell that runs now; the file's age is the time since that episode began
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from kerv_cli.files import storage_errors, write_json
 from kerv_cli.studies.plan import Cell
 
 EXPIRES_HOURS = 6.0
-"""A claim under which no episode began for so long is void: another machine cannot be asked whether a process lives."""
+"""A claim is void when no episode began under it for so long: whether a process of another machine lives is unknown."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """run: of the sweep. block: of this run of a block, the same in all its claims."""
+    """The process that computes a cell. run: id of the sweep. block: name of this attempt at a block, the same in all
+    its claims."""
 
     run: str
     block: str
@@ -37,7 +38,7 @@ class Claim:
 
 
 def claim(folder: Path, cells: Sequence[Cell], run: str, block: str) -> bool:
-    """Claims all cells for this process, or none where one of them is somebody else's.
+    """Claims all cells for this process -> True; claims none where another process has one of them -> False.
 
     Raises:
         StorageError: the disk refused.
@@ -62,7 +63,7 @@ def is_claimed(folder: Path, cell: Cell) -> bool:
 
 
 def note_running(folder: Path, cell: Cell, block: str) -> None:
-    """Notes which cell of a block runs now: what kills this process fails that one."""
+    """Notes which cell of a block runs now: if this process is killed, that cell has failed."""
     path = folder / f"{block}.running"
     temporary = path.with_suffix(".next")
     with storage_errors(path):
@@ -71,7 +72,7 @@ def note_running(folder: Path, cell: Cell, block: str) -> None:
 
 
 def running_cell(folder: Path, cells: Sequence[Cell], block: str) -> Cell | None:
-    """The cell that this run of the block noted last."""
+    """The cell that this attempt at the block noted last; None before its first episode."""
     try:
         name = (folder / f"{block}.running").read_text(encoding="utf-8")
     except OSError:
@@ -80,7 +81,7 @@ def running_cell(folder: Path, cells: Sequence[Cell], block: str) -> Cell | None
 
 
 def release(folder: Path, cells: Sequence[Cell], block: str) -> None:
-    """Removes what this run of a block claimed and noted."""
+    """Removes the claims and the note of this attempt at a block."""
     for path in (folder / f"{cell.id}.json" for cell in cells):
         found = _read(path)
         if found is not None and found.block == block:
@@ -91,7 +92,7 @@ def release(folder: Path, cells: Sequence[Cell], block: str) -> None:
 def _read(path: Path) -> Claim | None:
     try:
         return Claim(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):  # none, or none of ours: no claim
+    except (OSError, ValueError, TypeError):  # missing, or not a claim
         return None
 
 
@@ -115,8 +116,8 @@ def is_alive(pid: int) -> bool:
 
 @contextlib.contextmanager
 def write_lock(path: Path) -> Iterator[None]:
-    """One writer at a time changes `path`; readers need no lock. The lock file beside it stays empty, and a link in
-    its place is refused instead of followed.
+    """Lets one process at a time change `path`; readers need no lock. The lock is an empty file beside `path`; a link
+    in its place is refused.
 
     Raises:
         StorageError: the disk refused, or the lock is a link.

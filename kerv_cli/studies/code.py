@@ -1,7 +1,8 @@
-"""Which code computes a cell: a hash of its source, so that what older code computed is not reused silently."""
+"""Which code computes a cell: a hash of what its source means, so that what other code computed is not reused."""
 
 from __future__ import annotations
 
+import ast
 import functools
 import hashlib
 import importlib.util
@@ -17,13 +18,24 @@ _COMPUTING = ("decoding", "drafting", "targets", "environments", "rollouts")
 
 @functools.cache
 def code_hash() -> str:
-    """Hex SHA-256 over the names and contents of the files that compute an episode: kerv's own, and those of parts
-    that are registered from outside. Read once per process."""
+    """Hex SHA-256 over the names and syntax trees of the files that compute an episode: kerv's own, and those of parts
+    that are registered from outside. Comments, docstrings and layout do not count. Computed once per process."""
     digest = hashlib.sha256()
     for name, path in [*_own(), *_outside()]:
-        digest.update(f"{name}\0".encode())
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
+        content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
+        digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
     return digest.hexdigest()
+
+
+def _meaning(source: bytes) -> bytes:
+    """The syntax tree as text, without strings that stand alone: docstrings."""
+    return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else node
 
 
 def _own() -> Iterator[tuple[str, Path]]:

@@ -1,4 +1,4 @@
-"""How long a plan will take, from what the study measured before."""
+"""How long a plan will take, from the study's stored episodes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from kerv_cli.studies.store import StudyStore
 
 @dataclass(frozen=True)
 class TimeEstimate:
-    """How long a plan will take."""
+    """Time for the cells of a plan that are not complete."""
 
-    seconds: float
+    seconds: float  # wall time
     to_run: int  # cells
     reused: int
     measured: bool  # False: a guess from `prior_seconds`
-    source: str  # for people
+    source: str  # of the figure, in words
 
 
 def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:

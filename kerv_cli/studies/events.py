@@ -1,4 +1,4 @@
-"""What happens while cells run, as values: a sweep emits them, a progress display reads them."""
+"""Events of a running sweep: `execute` emits them, the progress display shows them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from kerv_cli.studies.plan import Block, Cell
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A cell that did not complete, and why in one line."""
+class CellFailed:
+    """A cell failed, with the reason in one line; the rest of its block goes on."""
 
     cell: Cell
     reason: str
@@ -18,17 +18,17 @@ class Failure:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The end of a sweep. Every asked-for cell is in exactly one of the three lists."""
+    """The result of a sweep. Every asked-for cell is in exactly one of the three lists."""
 
     done: list[Cell] = field(default_factory=list)  # run now
     reused: list[Cell] = field(default_factory=list)  # complete before
-    failed: list[Failure] = field(default_factory=list)
+    failed: list[CellFailed] = field(default_factory=list)
     seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class SweepStarted:
-    """total: cells to run. workers: blocks that run at the same time."""
+    """The sweep begins. total: cells to run. workers: blocks that run at the same time."""
 
     total: int
     reused: int
@@ -44,27 +44,19 @@ class BlockStarted:
 
 @dataclass(frozen=True)
 class BlockWaits:
-    """Another sweep computes cells of the block; it is looked at again later."""
+    """Another sweep computes cells of the block; `execute` looks at it again later."""
 
     block: Block
 
 
 @dataclass(frozen=True)
 class CellDone:
-    """seconds: wall time of its episodes, with what it took to prepare them."""
+    """A cell completed and is stored. seconds: wall time of its episodes and of preparing its setting."""
 
     cell: Cell
     episodes: int
     successes: int
     seconds: float
-
-
-@dataclass(frozen=True)
-class CellFailed:
-    """A cell did not complete; the rest of its block goes on."""
-
-    cell: Cell
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -76,7 +68,7 @@ class CellReused:
 
 @dataclass(frozen=True)
 class SweepFinished:
-    """The last event."""
+    """Every cell is done, reused or failed: the last event."""
 
     outcome: Outcome
 

@@ -1,6 +1,6 @@
-"""Run a study's blocks through an executor: resume, isolate failures, share the work, tell what happens.
+"""Runs a study's blocks through an executor: resumes, isolates failures, shares work with other sweeps, emits events.
 
-The process that runs a block also writes its cells, so whatever dies loses at most what was running.
+The process that runs a block also writes its cells, so a crash loses at most the running cells.
 """
 
 from __future__ import annotations
@@ -16,25 +16,14 @@ from typing import Any
 from kerv_cli.errors import CheckpointError, StorageError
 from kerv_cli.provenance import git_commit
 from kerv_cli.settings import RuntimeSettings
+from kerv_cli.studies import events
 from kerv_cli.studies.block import BlockRun, CellResult, Gauge, Prepare, failed
 from kerv_cli.studies.claims import is_claimed, release, running_cell
-from kerv_cli.studies.events import (
-    BlockStarted,
-    BlockWaits,
-    CellDone,
-    CellFailed,
-    CellReused,
-    Failure,
-    OnEvent,
-    Outcome,
-    SweepFinished,
-    SweepStarted,
-)
 from kerv_cli.studies.executors import Executor, WorkerLost, check_executor, open_executor
 from kerv_cli.studies.plan import Block, Cell, blocks_of
 from kerv_cli.studies.store import StudyStore
 
-_POLL_SECONDS = 1.0  # between two looks at what another sweep computes
+_POLL_SECONDS = 1.0  # between two looks at blocks that another sweep computes
 
 
 def execute(
@@ -42,9 +31,9 @@ def execute(
     prepare: Prepare,
     store: StudyStore,
     runtime: RuntimeSettings | None = None,
-    on_event: OnEvent = lambda event: None,
+    on_event: events.OnEvent = lambda event: None,
     gauge: Gauge | None = None,
-) -> Outcome:
+) -> events.Outcome:
     """Runs the cells that are not complete yet, block by block; cells of one id run once.
 
     A cell that raises, or whose worker is killed, is reported as failed and the rest of its block goes on. Cells that
@@ -52,7 +41,7 @@ def execute(
     KeyboardInterrupt the workers are stopped; completed cells stay.
 
     Raises:
-        StorageError: the disk refused a result; going on would compute what cannot be kept.
+        StorageError: the disk refused a result; further results could not be stored either.
         UsageError: the executor cannot be used.
     """
     runtime = runtime or RuntimeSettings()
@@ -64,25 +53,30 @@ def execute(
     threads = max((cell.settings["runtime"]["threads"] for cell in cells), default=1)
     executor = open_executor(runtime, threads, store.jobs) if blocks else None
     total = sum(len(block.cells) for block in blocks) + len(damaged)
-    on_event(SweepStarted(total, len(sweep.outcome.reused), runtime.workers))
+    on_event(events.SweepStarted(total, len(sweep.outcome.reused), runtime.workers))
     for cell, result in damaged:
         sweep.note(cell, result)
     if executor is not None:
         sweep.run(blocks, executor)
     found = sweep.outcome
-    outcome = Outcome(found.done, found.reused, found.failed, time.perf_counter() - clock)
-    on_event(SweepFinished(outcome))
+    outcome = events.Outcome(found.done, found.reused, found.failed, time.perf_counter() - clock)
+    on_event(events.SweepFinished(outcome))
     return outcome
 
 
 class _Sweep:
-    """What one call of `execute` knows while it runs."""
+    """State of one call of `execute`."""
 
     def __init__(
-        self, prepare: Prepare, store: StudyStore, runtime: RuntimeSettings, on_event: OnEvent, gauge: Gauge | None
+        self,
+        prepare: Prepare,
+        store: StudyStore,
+        runtime: RuntimeSettings,
+        on_event: events.OnEvent,
+        gauge: Gauge | None,
     ) -> None:
         self.prepare, self.store, self.on_event, self.gauge = prepare, store, on_event, gauge
-        self.outcome = Outcome()
+        self.outcome = events.Outcome()
         self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
         self.status = {"workers": runtime.workers, "executor": runtime.executor, "git_commit": git_commit()}
         self.waiting: deque[Block] = deque()
@@ -90,7 +84,7 @@ class _Sweep:
         self.running: dict[Future[Any], BlockRun] = {}
 
     def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
-        """Blocks of what is to be run, and the cells that are damaged; complete ones are added to the outcome."""
+        """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
         damaged: dict[str, tuple[Cell, CellResult]] = {}
         for cell in (cell for block in blocks_of(cells) for cell in block.cells):
             try:
@@ -122,7 +116,7 @@ class _Sweep:
     def _start(self, block: Block, executor: Executor) -> None:
         name = f"{self.run_id}-{secrets.token_hex(4)}"
         attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
-        self.on_event(BlockStarted(block))
+        self.on_event(events.BlockStarted(block))
         self.running[executor.submit(attempt)] = attempt
 
     def _settle(self, attempt: BlockRun, future: Future[dict[str, CellResult] | None]) -> None:
@@ -137,7 +131,7 @@ class _Sweep:
             return
         if results is None:
             self.elsewhere.append(block)
-            self.on_event(BlockWaits(block))
+            self.on_event(events.BlockWaits(block))
         else:
             self._note_all(block, results)
 
@@ -147,13 +141,13 @@ class _Sweep:
                 self.note(cell, results[cell.id])
 
     def _lost(self, attempt: BlockRun, result: CellResult) -> None:
-        """The cell that ran when the worker ended has failed; what it had completed is done, the rest runs again."""
+        """After a worker's end: the cell that ran has failed, complete cells are done, the block's others run again."""
         cells = attempt.block.cells
         guilty = running_cell(self.store.claims, cells, attempt.name)
         release(self.store.claims, cells, attempt.name)
         results = {} if guilty is None else {guilty.id: result}
         for cell in cells:
-            if guilty is None:  # nothing says that another attempt would come further
+            if guilty is None:  # it ended before any cell ran: so would another attempt
                 results[cell.id] = result
             elif self.store.has_cell(cell.id):
                 stored = self.store.read_cell(cell.id)
@@ -165,7 +159,7 @@ class _Sweep:
             self.waiting.append(rest)
 
     def _look_elsewhere(self) -> None:
-        """When nothing else is left, takes up the blocks that no other sweep computes any more."""
+        """When nothing else is left to do, queues the blocks that no other sweep computes any more."""
         if self.waiting or self.running or not self.elsewhere:
             return
         claimed = [any(is_claimed(self.store.claims, cell) for cell in block.cells) for block in self.elsewhere]
@@ -176,17 +170,17 @@ class _Sweep:
         self.elsewhere = [block for block, theirs in zip(self.elsewhere, claimed, strict=True) if theirs]
 
     def note(self, cell: Cell, result: CellResult) -> None:
-        """Adds a cell's end to the outcome and tells it."""
+        """Adds a cell's result to the outcome and emits its event."""
         if result.storage:
             raise StorageError(result.reason)
         if result.reason:
             self.store.write_failure(cell.id, f"{cell.label} on {cell.task}\n\n{result.trace}")
-            self.outcome.failed.append(Failure(cell, result.reason))
-            self.on_event(CellFailed(cell, result.reason))
+            self.outcome.failed.append(events.CellFailed(cell, result.reason))
+            self.on_event(self.outcome.failed[-1])
         elif result.reused:
             self.outcome.reused.append(cell)
-            self.on_event(CellReused(cell))
+            self.on_event(events.CellReused(cell))
         else:
             self.store.clear_failure(cell.id)
             self.outcome.done.append(cell)
-            self.on_event(CellDone(cell, result.episodes, result.successes, result.seconds))
+            self.on_event(events.CellDone(cell, result.episodes, result.successes, result.seconds))

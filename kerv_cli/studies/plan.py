@@ -1,4 +1,4 @@
-"""From settings and tasks to cells and blocks; a cell's id is the hash of what determines its result."""
+"""Cells and blocks of a study; a cell's id is the hash of everything that determines its result."""
 
 from __future__ import annotations
 
@@ -12,33 +12,30 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import RolloutSettings
+from kerv_cli.settings import MODEL, RolloutSettings
 from kerv_cli.studies.code import code_hash
 
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
 
 OBSERVATION = "observation"
-"""The identity's one entry that is no hash: what the target is shown. The target's hash implies it."""
+"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
-# Of RolloutSettings, what leaves an episode's result as it is: where it is written, what is recorded of it, how it is
-# called. Task and seeds enter the id as the cell's own, the policy through its hashes. A field that is not named here
-# counts, so a setting that is added later makes new cells instead of being overlooked.
-_NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
-_NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
-_NOT_DETERMINING_POLICY = frozenset({"target", "drafter", "early"})
+# Fields of RolloutSettings that do not change an episode's result (where it is written, how much of it is recorded,
+# names), or that enter the id otherwise (task and seeds as the cell's own, the policy by its hashes). All other fields
+# count, so that a new setting makes new cells instead of being overlooked.
+NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
+NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One setting on one task and a block of seeds, once: the unit that is stored and reused.
-
-    Two labels that resolve to the same result share one id.
-    """
+    """One setting on one task and a block of seeds, in one repeat: the unit that is stored and reused. Two labels with
+    the same settings share one id."""
 
     id: str  # 16 hex digits, see `cell_id`
     label: str  # the setting's name in the study
-    overrides: str  # what the user wrote to get it
+    overrides: str  # of the configuration, as the user wrote them
     task: str
     seeds: tuple[int, ...]  # one episode each
     settings: dict[str, Any]  # plain RolloutSettings with task = [task]
@@ -48,36 +45,39 @@ class Cell:
 
 @dataclass(frozen=True)
 class Block:
-    """Cells of one task, the same seeds and one repeat: the unit that is run. All its settings take turns in one
-    process, episode by episode, so that what is compared is measured side by side."""
+    """Cells of one task, the same seeds and one repeat: the unit that an executor runs. Its settings take turns in one
+    process, episode by episode, so that compared episodes are measured one after the other."""
 
     cells: tuple[Cell, ...]  # at least one; each id once
 
     @property
     def task(self) -> str:
+        """Full task name of its cells."""
         return self.cells[0].task
 
     @property
     def seeds(self) -> tuple[int, ...]:
+        """Seeds of its episodes."""
         return self.cells[0].seeds
 
     @property
     def repeat(self) -> int:
+        """Which of the study's repeats, from 0."""
         return self.cells[0].repeat
 
     @property
     def name(self) -> str:
-        """For people, e.g. `reach-v3 100000-100004`."""
+        """Task, seeds and repeat, e.g. `reach-v3 100000-100004`."""
         return f"{self.task} {seeds_text(self.seeds)}" + (f" repeat {self.repeat}" if self.repeat else "")
 
     def order(self, seed: int) -> list[int]:
-        """In which order its cells (indices) run the episode of `seed`: a permutation drawn from task, seed and
-        repeat."""
+        """Indices of its cells in the order in which they run the episode of `seed`: a permutation drawn from task,
+        seed and repeat."""
         drawn = hashlib.sha256(f"{self.task} {seed} {self.repeat}".encode()).digest()
         return [int(i) for i in np.random.default_rng(list(drawn)).permutation(len(self.cells))]
 
     def without(self, names: Collection[str]) -> Block | None:
-        """The block without the cells of those ids; None where nothing is left."""
+        """The block without the cells of those ids; None if no cell is left."""
         left = tuple(cell for cell in self.cells if cell.id not in names)
         return Block(left) if left else None
 
@@ -86,8 +86,8 @@ def cell_id(identity: Mapping[str, Any]) -> str:
     """First 16 hex digits of the SHA-256 of canonical JSON.
 
     Raises:
-        ValueError: NaN or infinity, which JSON has not.
-        TypeError: a value that is not plain.
+        ValueError: NaN or infinity, which JSON lacks.
+        TypeError: a value that is not JSON's.
     """
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
@@ -96,14 +96,14 @@ def cell_id(identity: Mapping[str, Any]) -> str:
 def determinants(
     settings: Mapping[str, Any], identity: Identity, task: str, seeds: Sequence[int], repeat: int, code: str
 ) -> dict[str, Any]:
-    """Everything that determines a cell's result, from plain RolloutSettings; the argument of `cell_id`. code: hash of
-    the code that computes it."""
-    kept = {key: value for key, value in settings.items() if key not in _NOT_DETERMINING}
-    kept["runtime"] = _without(settings["runtime"], _NOT_DETERMINING_RUNTIME)
-    policy = _without(settings["policy"], _NOT_DETERMINING_POLICY)
+    """Everything that determines a cell's result, from plain RolloutSettings; the argument of `cell_id`. code: as
+    `code_hash`."""
+    kept = without(settings, NOT_DETERMINING)
+    kept["runtime"] = without(settings["runtime"], NOT_DETERMINING_RUNTIME)
+    hashes = {f"{name}_sha256": value for name, value in identity.items() if name != OBSERVATION}
     return {
         "settings": kept,
-        "policy": {**policy, **{f"{name}_sha256": value for name, value in identity.items() if name != OBSERVATION}},
+        "policy": {"kind": settings["policy"].get("kind", MODEL), **hashes},
         "task": task,
         "seeds": list(seeds),
         "repeat": repeat,
@@ -111,8 +111,9 @@ def determinants(
     }
 
 
-def _without(settings: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key not in set(names)}
+def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """The settings without those keys."""
+    return {key: value for key, value in settings.items() if key not in names}
 
 
 def make_cell(
@@ -183,8 +184,8 @@ def _seed_blocks(settings: RolloutSettings, size: int) -> Iterator[range]:
 
 
 def blocks_of(cells: Iterable[Cell]) -> list[Block]:
-    """The cells by task, seeds, repeat and threads (which belong to the process), in the order of their first cells;
-    cells of one id once."""
+    """The cells grouped by task, seeds, repeat and threads (a process has one number of them), in the order of their
+    first cells; each id once."""
     found: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in unique_cells(cells):
         key = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
@@ -193,7 +194,7 @@ def blocks_of(cells: Iterable[Cell]) -> list[Block]:
 
 
 def unique_cells(cells: Iterable[Cell]) -> list[Cell]:
-    """The first cell of every id, in order: what has to be run."""
+    """The first cell of every id, in order."""
     first: dict[str, Cell] = {}
     for cell in cells:
         first.setdefault(cell.id, cell)

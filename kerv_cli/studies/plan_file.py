@@ -1,8 +1,8 @@
-"""plan.yaml: what a study compares, for people and for `kerv report`."""
+"""plan.yaml: a study's settings and cells."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import yaml
@@ -67,7 +67,7 @@ def plan_from_text(text: str) -> StudyPlan:
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
-    """`new`, preceded by the cells of `old` that have its settings and seeds but a task that it does not name."""
+    """`new`, preceded by those cells of `old` that have its settings and seeds and a task that it does not name."""
     if (old.name, old.baseline) != (new.name, new.baseline):
         return new
     tasks = {cell.task for cell in new.cells}
@@ -78,7 +78,7 @@ def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
         for cell in old.cells
         if cell.task not in tasks and _key(cell) in wanted and cell.id == _moved(wanted[_key(cell)], cell.task)
     )
-    return StudyPlan(new.name, new.title, new.baseline, new.axis, kept + new.cells)
+    return replace(new, cells=kept + new.cells)
 
 
 def _key(cell: Cell) -> tuple[str, tuple[int, ...], int]:

@@ -1,4 +1,4 @@
-"""Events on a terminal: a progress bar, or plain lines where there is no terminal. Lives in the parent process."""
+"""Shows a sweep's events: a progress bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -16,28 +16,19 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from kerv_cli.studies.events import (
-    BlockStarted,
-    BlockWaits,
-    CellDone,
-    CellFailed,
-    CellReused,
-    Event,
-    SweepFinished,
-    SweepStarted,
-)
+from kerv_cli.studies import events
 from kerv_cli.studies.plan import Block, Cell
 
 
 class ProgressDisplay:
-    """Context manager whose instances are `on_event` callbacks."""
+    """The `on_event` callback of `execute`; a context manager that ends the bar."""
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self._bar: Progress | None = None
         self._task = TaskID(0)
         self._total = self._finished = 0
-        self._running: dict[str, Block] = {}  # by name, with what is left of them
+        self._running: dict[str, Block] = {}  # by name, without their ended cells
 
     def __enter__(self) -> ProgressDisplay:
         return self
@@ -48,28 +39,24 @@ class ProgressDisplay:
         if self._bar is not None:
             self._bar.stop()
 
-    def __call__(self, event: Event) -> None:
-        if isinstance(event, SweepStarted):
+    def __call__(self, event: events.Event) -> None:
+        if isinstance(event, events.SweepStarted):
             self._start(event)
-        elif isinstance(event, BlockStarted):
+        elif isinstance(event, events.BlockStarted):
             self._running[event.block.name] = event.block
-        elif isinstance(event, BlockWaits):
+        elif isinstance(event, events.BlockWaits):
             self._running.pop(event.block.name, None)
             self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
-        elif isinstance(event, CellDone):
+        elif isinstance(event, events.CellDone):
             rate = event.seconds / max(1, event.episodes)
-            result = f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode"
-            self._finish(event.cell, f"{escape(event.cell.label)} on {event.cell.task}: {result}")
-        elif isinstance(event, CellFailed):
-            line = f"{escape(event.cell.label)} on {event.cell.task}: [red]failed[/red]: {escape(event.reason)}"
-            self._finish(event.cell, line)
-        elif isinstance(event, CellReused):
-            self._finish(event.cell, f"{escape(event.cell.label)} on {event.cell.task}: completed by another sweep")
-        elif isinstance(event, SweepFinished) and self._bar is not None:
-            self._bar.stop()
+            self._finish(event.cell, f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode")
+        elif isinstance(event, events.CellFailed):
+            self._finish(event.cell, f"[red]failed[/red]: {escape(event.reason)}")
+        elif isinstance(event, events.CellReused):
+            self._finish(event.cell, "completed by another sweep")
         self._refresh()
 
-    def _start(self, event: SweepStarted) -> None:
+    def _start(self, event: events.SweepStarted) -> None:
         self._total = event.total
         if event.reused:
             self.console.print(f"{event.reused} cells are complete already")
@@ -87,7 +74,7 @@ class ProgressDisplay:
         self._task = self._bar.add_task("cells", total=event.total)
         self._bar.start()
 
-    def _finish(self, cell: Cell, line: str) -> None:
+    def _finish(self, cell: Cell, result: str) -> None:
         for name, block in list(self._running.items()):
             left = block.without({cell.id})
             if left is None:
@@ -95,8 +82,9 @@ class ProgressDisplay:
             else:
                 self._running[name] = left
         self._finished += 1
-        width = len(str(self._total))
-        self.console.print(f"[dim]{self._finished:{width}}/{self._total}[/dim] {line}", soft_wrap=True, highlight=False)
+        count = f"[dim]{self._finished:{len(str(self._total))}}/{self._total}[/dim]"
+        line = f"{count} {escape(cell.label)} on {cell.task}: {result}"
+        self.console.print(line, soft_wrap=True, highlight=False)
 
     def _refresh(self) -> None:
         if self._bar is None:

@@ -1,4 +1,4 @@
-"""A study's YAML and the command line -> one resolved setting per label."""
+"""Composes a study's settings from its YAML and the command line."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
 
 @dataclass(frozen=True)
 class ResolvedStudy:
+    """A study whose settings are composed and checked."""
+
     study: StudySettings
     settings: Mapping[str, RolloutSettings]  # by label, the study's order
     overrides: Mapping[str, str]  # by label, as written
 
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
-    """`study…` and `results` belong to the sweep, everything else to each of its settings.
+    """The chosen study; overrides of `study…` and `results` go to the sweep, all others to each of its settings.
 
     Raises:
         UsageError: an unknown key or name; a key on the command line that the study itself varies.
@@ -48,7 +50,7 @@ def _key(override: str) -> str:
 
 
 def _points(study: StudySettings) -> dict[str, list[str]]:
-    """Labels of a grid carry its values: `spec_vla r=3`."""
+    """Label -> override words; a grid's labels carry its values: `spec_vla r=3`."""
     written: dict[str, list[str]] = {}
     for label, text in study.settings.items():
         varied = swept_keys(text)

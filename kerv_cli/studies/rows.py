@@ -68,6 +68,8 @@ _ROUND = pa.struct(
     ]
 )
 _MEASURES = ("variability", "similarity", "metric", "deviation")
+_OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds")  # fields of EpisodeRecord
+_OF_DECODE = ("mode", "forwards", "seconds", "compensated", "skipped", *_MEASURES)  # fields of DecodeRecord
 
 DECODE_SCHEMA = pa.schema(
     [
@@ -91,7 +93,7 @@ DECODE_SCHEMA = pa.schema(
 
 @dataclass(frozen=True)
 class Circumstances:
-    """When an episode ran, beside what, and how loaded the machine was; the columns of episodes.parquet say more."""
+    """When and in which block an episode ran, and how loaded the machine was: columns of episodes.parquet."""
 
     block: str = ""
     order: int = 0
@@ -106,20 +108,15 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         ValueError: a decode names a phase that is not in PHASES.
     """
     decodes = record.decodes
-    judged = [r for d in decodes for r in d.rounds if _verifies(r)]
+    judged = [r for d in decodes for r in d.rounds if r.is_verification]
     first = [d.first_rejected for d in decodes if d.first_rejected is not None]
     deviations = [d.deviation for d in decodes if d.deviation is not None]
     accepted, committed = sum(r.accepted for r in judged), sum(r.committed for r in judged)
     phases = [_phase_seconds(d) for d in decodes]
     return {
-        "task": record.task,
-        "seed": record.seed,
-        "success": record.success,
-        "steps": record.steps,
+        **{name: getattr(record, name) for name in _OF_EPISODE},
         "decodes": len(decodes),
-        "seconds": record.seconds,
         **{name: sum(p[name] or 0.0 for p in phases) for name, _ in _PHASE_FIELDS},
-        "forwards": record.forwards,
         "verifications": len(judged),
         "tokens": sum(len(d.tokens) for d in decodes),
         "committed": committed,
@@ -135,17 +132,11 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         "retrieval_decodes": sum(any(r.proposer == "retrieval" for r in d.rounds) for d in decodes),
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),
-        "wall_seconds": record.wall_seconds,
         "initial_state": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
         "repeat": repeat,
         **asdict(at),
         "worker_pid": os.getpid(),
     }
-
-
-def _verifies(r: Round) -> bool:
-    """The same rounds that DecodeRecord.verifications counts."""
-    return r.tree_size > 0 and r.mode != "skip"
 
 
 def _phase_seconds(decode: DecodeRecord) -> dict[str, float | None]:
@@ -163,28 +154,22 @@ def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
             "seed": record.seed,
             "index": index,
             "step": step,
-            "mode": decode.mode,
-            "forwards": decode.forwards,
-            "seconds": decode.seconds,
+            **{name: getattr(decode, name) for name in _OF_DECODE},
             **_phase_seconds(decode),
             "tokens": list(decode.tokens),
             "actions": np.asarray(decode.actions, dtype=np.float32).tolist(),
             "rounds": [_round_row(r) for r in decode.rounds],
-            "compensated": decode.compensated,
-            "skipped": decode.skipped,
-            **{name: getattr(decode, name) for name in _MEASURES},
         }
         for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
     ]
 
 
 def _round_row(r: Round) -> dict[str, Any]:
-    row = {field.name: getattr(r, field.name) for field in _ROUND}
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in row.items()}
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(r).items()}
 
 
 def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
-    """Rows as the bytes of a parquet file. Written to memory first: the disk is the store's business.
+    """Rows as the bytes of a parquet file; the store writes them.
 
     Raises:
         ValueError: a row has a column that the schema does not know.

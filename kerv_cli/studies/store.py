@@ -4,7 +4,7 @@ results/studies/<name>/
     plan.yaml                     what was asked for
     cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
     failures/<id>.txt             traceback of the last attempt, until one succeeds
-    claims/<id>.json              who computes a cell now; see claims.py
+    claims/                       the cells that sweeps compute now; see claims.py
     rollouts/*.rrd
 """
 
@@ -31,7 +31,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, sync
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies import rows
@@ -43,28 +43,18 @@ from kerv_cli.studies.rows import Circumstances
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
 _TEMPORARY = re.compile(r"\.(?P<id>[0-9a-f]+)\.(?P<host>.+)\.(?P<pid>\d+)-[0-9a-f]+\.tmp")
-_OTHER_HOSTS_STALE_HOURS = 7 * 24.0  # whether a process of another machine lives cannot be asked
+_OTHER_HOSTS_STALE_HOURS = 7 * 24.0  # whether a process of another machine lives is unknown
 
 
 @dataclass(frozen=True)
 class StoredCell:
-    """A complete cell as read back."""
+    """A complete cell, read from its folder."""
 
     id: str
     folder: Path
-    config: dict[str, Any]  # study, label, overrides, task, seeds, identity, settings
+    config: dict[str, Any]  # the study's name and the fields of Cell
     status: dict[str, Any]  # provenance, run, seconds, sums
     episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA, and decode_seconds: per episode (decodes,) seconds
-
-
-@dataclass(frozen=True)
-class StudySummary:
-    """One line of a listing."""
-
-    name: str
-    title: str
-    planned: int  # cells of plan.yaml
-    complete: int
 
 
 class StudyStore:
@@ -87,10 +77,10 @@ class StudyStore:
         self.jobs = self.root / "jobs"  # an executor's own files
 
     def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
-        """Stores the plan; cells of an earlier plan stay where this one would hold them had it named their task.
+        """Writes plan.yaml -> the written plan. Cells of the stored plan are kept if they have the new plan's settings
+        and seeds and a task that it does not name.
 
-        So two sweeps that share the tasks of a study between them end in one report, and a changed setting or other
-        seeds replace what they change.
+        So sweeps of one study over different tasks end in one report, and changed settings or seeds replace old cells.
 
         Raises:
             StorageError: the disk refused.
@@ -119,13 +109,14 @@ class StudyStore:
             raise CheckpointError(f"{self.plan_path} is damaged ({why}): {self.how_to_run()} again") from error
 
     def how_to_run(self) -> str:
+        """The command that runs this study, for messages."""
         return f"run `kerv sweep study={self.name}`"
 
     def has_cell(self, name: str) -> bool:
-        """Whether the cell is there, whole and unchanged.
+        """Whether the cell is complete; its files are compared with their hashes.
 
         Raises:
-            CheckpointError: the folder is there but damaged; the message names it and the remedy.
+            CheckpointError: its folder is damaged; the message names it and the remedy.
         """
         folder = self.cells / name
         if not folder.exists():
@@ -134,7 +125,7 @@ class StudyStore:
         return True
 
     def _status(self, folder: Path) -> dict[str, Any]:
-        """status.json, after every file was compared with the hash that it holds."""
+        """status.json, after every other file was compared with the hash in it."""
         try:
             status = read_json(folder / _STATUS)
             for file in _CELL_FILES:
@@ -161,13 +152,13 @@ class StudyStore:
             cell: what ran.
             records: its episodes, in the order of `cell.seeds`.
             status: provenance, run and seconds, JSON values.
-            circumstances: of each record; unknown without.
+            circumstances: of each record; unknown if empty.
 
         Returns:
-            False where another process had completed the cell before: its result stays, this one is discarded.
+            False if another process completed the cell first; its result stays and this one is discarded.
 
         Raises:
-            StorageError: the disk refused; nothing is left of the cell.
+            StorageError: the disk refused; the cell is absent.
             ValueError: the records are not of this cell's task and seeds.
         """
         if [(r.task, r.seed) for r in records] != [(cell.task, seed) for seed in cell.seeds]:
@@ -192,17 +183,7 @@ class StudyStore:
         status: Mapping[str, Any],
         circumstances: Sequence[Circumstances],
     ) -> dict[str, bytes]:
-        config = {
-            "study": self.name,
-            "id": cell.id,
-            "label": cell.label,
-            "overrides": cell.overrides,
-            "task": cell.task,
-            "seeds": list(cell.seeds),
-            "repeat": cell.repeat,
-            "identity": cell.identity,
-            "settings": cell.settings,
-        }
+        config = {"study": self.name, **vars(cell), "seeds": list(cell.seeds)}
         episodes = [
             rows.episode_row(record, at, cell.repeat) for record, at in zip(records, circumstances, strict=True)
         ]
@@ -265,16 +246,17 @@ class StudyStore:
         return found, absent
 
     def write_failure(self, name: str, text: str) -> None:
-        """Keeps the traceback of a cell that failed, for people."""
+        """Stores the traceback of a cell that failed."""
         with atomic_path(self.failures / f"{name}.txt") as temporary:
             temporary.write_text(text, encoding="utf-8")
 
     def clear_failure(self, name: str) -> None:
+        """Removes the traceback of an earlier attempt that failed."""
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
 
     def clean_stale(self, hours: float = 6.0) -> list[Path]:
-        """Removes the temporary folders that killed processes left: older than `hours`, their process gone."""
+        """Removes temporary folders of processes that are gone, older than `hours` -> those removed."""
         removed: list[Path] = []
         for folder in sorted(self.cells.glob(".*.tmp")):
             named = _TEMPORARY.fullmatch(folder.name)
@@ -284,17 +266,15 @@ class StudyStore:
         return removed
 
 
-def list_studies(results: Path | str) -> list[StudySummary]:
-    """Every study with a readable plan, by name. Folders are counted, not verified."""
-    summaries = []
+def begun_studies(results: Path | str) -> list[str]:
+    """Names of the studies with a readable plan and the folder of at least one planned cell."""
+    names = []
     for path in sorted((Path(results) / "studies").glob("*/plan.yaml")):
         store = StudyStore(results, path.parent.name)
         with contextlib.suppress(CheckpointError):
-            plan = store.read_plan()
-            names = {cell.id for cell in plan.cells}
-            complete = sum((store.cells / name).exists() for name in names)
-            summaries.append(StudySummary(store.name, plan.title, len(names), complete))
-    return summaries
+            if any((store.cells / cell.id).exists() for cell in store.read_plan().cells):
+                names.append(store.name)
+    return names
 
 
 def _is_stale(folder: Path, host: str, pid: int, hours: float) -> bool:
@@ -315,7 +295,7 @@ def _write_synced(path: Path, content: bytes) -> None:
 
 
 def _rename_once(temporary: Path, folder: Path) -> bool:
-    """Renames a folder where none is yet; False where another process was first."""
+    """Renames `temporary` to `folder`; False if `folder` exists already."""
     try:
         os.rename(temporary, folder)
     except OSError as error:
@@ -324,6 +304,3 @@ def _rename_once(temporary: Path, folder: Path) -> bool:
         raise
     sync(folder.parent)
     return True
-
-
-__all__ = ["StorageError", "StoredCell", "StudyStore", "StudySummary", "list_studies"]

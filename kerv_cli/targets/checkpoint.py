@@ -27,7 +27,7 @@ WEIGHTS = "model.safetensors"
 
 @dataclass(frozen=True)
 class Description:
-    """What the JSON beside any weights holds. sha256: of the weights' file."""
+    """The fields that every JSON beside weights has. sha256: of the weights' file."""
 
     format: int
     kind: str
@@ -36,8 +36,8 @@ class Description:
 
 @dataclass(frozen=True)
 class TargetDescription(Description):
-    """A target's JSON. family: the registered kind of target that its `settings` are of. environment: whose
-    demonstrations it was trained on. cameras: whose images it reads. words: vocabulary of instructions."""
+    """A target's JSON. family: name of the registered target that reads `settings`. environment: that of the
+    demonstrations it was trained on. cameras: names of the images it reads. words: vocabulary of instructions."""
 
     family: str
     environment: str
@@ -58,17 +58,17 @@ T = TypeVar("T", bound=Description)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Atomic safetensors file."""
+    """Writes a safetensors file atomically. Raises StorageError: writing failed."""
     payload = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(payload)
 
 
 def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
-    """The tensors in a file.
+    """The tensors of a safetensors file. what: its name in messages.
 
     Raises:
-        CheckpointError: missing, damaged, or numbers that are not finite.
+        CheckpointError: it is missing, damaged, or holds numbers that are not finite.
     """
     if not path.is_file():
         raise CheckpointError(f"no {what} at {path}: train it, or name another with its folder")
@@ -83,8 +83,8 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
 
 
 def save_module(folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], half: bool = False) -> str:
-    """Write the weights and `<kind>.json` -> sha256 of the weights. The JSON is written last. half: in float16, which
-    `load_state` gives back as float32."""
+    """Writes the weights and, last, `<kind>.json` -> sha256 of the weights. half: store floats as float16, which
+    `load_state` converts back to float32."""
     folder.mkdir(parents=True, exist_ok=True)
     state = module.state_dict()
     if half:
@@ -96,10 +96,10 @@ def save_module(folder: Path, kind: str, module: nn.Module, description: Mapping
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """The JSON beside the weights, checked against its schema and them.
+    """The JSON beside the weights, checked against its schema and their hash.
 
     Raises:
-        CheckpointError: none there, one of another version, or damaged.
+        CheckpointError: it is missing, of another version, damaged, or of other weights.
     """
     path, weights = folder / f"{kind}.json", folder / WEIGHTS
     if not path.is_file():
@@ -116,7 +116,11 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
-    """Fill `module` with the folder's weights; a tensor of another name or shape is an error."""
+    """Loads the folder's weights into `module`.
+
+    Raises:
+        CheckpointError: a tensor is missing, unknown or of another shape.
+    """
     try:
         module.load_state_dict(load_tensors(folder / WEIGHTS, kind))
     except RuntimeError as error:
@@ -127,7 +131,7 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 def save_target(
     folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], half: bool = False
 ) -> str:
-    """Write a target -> sha256 of its weights. environment: whose demonstrations it was trained on."""
+    """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations."""
     description = {
         "family": "compact",
         "environment": environment,
@@ -150,7 +154,7 @@ def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.fl
     """The target in `folder`, ready for inference, built by its family, and its description.
 
     Raises:
-        CheckpointError: none there, a damaged one.
+        CheckpointError: it is missing or damaged.
         UnknownName: a family that is not registered.
     """
     description = read_target(folder)

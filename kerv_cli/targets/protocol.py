@@ -1,4 +1,4 @@
-"""What the decode loop needs of a target, and nothing else: implement it, and every method runs on your policy.
+"""The protocol of a target: every decoding method runs on a policy that implements it.
 
 Shapes: B batch (1 while decoding), P prompt tokens, T new tokens, S cached tokens, E width, V action tokens.
 """
@@ -16,7 +16,7 @@ from kerv_cli.spaces import ActionSpace, Observation
 
 
 class Cache(Protocol):
-    """The keys and values of what was forwarded, in buffers of one size.
+    """The keys and values of forwarded tokens, in buffers of `capacity` slots.
 
     Slots 0 … length − 1 are valid. `forward` writes its new tokens behind them.
     """
@@ -25,30 +25,36 @@ class Cache(Protocol):
     capacity: int
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Commit a path: move the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, …;
-        all others behind `start` are dropped."""
+        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
+        sets the length behind them."""
 
 
 class Target(Protocol):
-    """A policy that emits actions as tokens, one trunk forward per token when nothing is drafted.
-
-    actions: its action space, with its own normalisation. chunk: H, control steps it was trained to decode at once.
-    cameras: names of the images that `encode` reads; none are drawn otherwise. width: E. max_prompt: the longest prompt
-    that `encode` returns.
-    """
+    """A policy that decodes actions as tokens; without drafts every token takes one forward."""
 
     @property
-    def actions(self) -> ActionSpace: ...
+    def actions(self) -> ActionSpace:
+        """Action space with the policy's own normalisation."""
+
     @property
-    def chunk(self) -> int: ...
+    def chunk(self) -> int:
+        """H, control steps it was trained to decode at once."""
+
     @property
-    def cameras(self) -> tuple[str, ...]: ...
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras whose images `encode` reads; no others are drawn."""
+
     @property
-    def width(self) -> int: ...
+    def width(self) -> int:
+        """E."""
+
     @property
-    def max_prompt(self) -> int: ...
+    def max_prompt(self) -> int:
+        """Largest P that `encode` returns."""
+
     @property
-    def device(self) -> torch.device: ...
+    def device(self) -> torch.device:
+        """Device of the weights."""
 
     def encode(self, observation: Observation) -> Tensor:
         """The prompt's embeddings (1, P, E); P may differ from observation to observation. The state behind the
@@ -61,34 +67,40 @@ class Target(Protocol):
         """An empty cache for `capacity` tokens."""
 
     def forward(self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | None = None) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind what the cache holds: one
-        that `new_cache` gave, or None.
+        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind the cached ones. cache:
+        from `new_cache`, or None.
 
-        seen (T, T) bool says which of the new tokens each new token sees; all of them see everything that is cached.
-        None: each sees itself and the new ones before it.
+        seen (T, T) bool says which of the new tokens each new token attends to; all attend to every cached one. None:
+        the new tokens are causal.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
-        """(..., E) -> logits over the action tokens (..., V)."""
+        """hidden (..., E) -> logits over the action tokens (..., V)."""
 
 
 class ReadableTarget(Target, Protocol):
-    """What drafters and the datastore know of a target besides: the prompt's parts, and the layers' shapes.
-
-    segments: where the prompt's parts lie, by name. pooled_width: F. heads, feed_forward: of a layer. dtype: of the
-    weights.
-    """
+    """A target whose prompt has named parts and whose layers have known shapes; drafters and the datastore read
+    them."""
 
     @property
-    def segments(self) -> Mapping[str, slice]: ...
+    def segments(self) -> Mapping[str, slice]:
+        """Slice of the prompt by the name of its part."""
+
     @property
-    def pooled_width(self) -> int: ...
+    def pooled_width(self) -> int:
+        """F of `pooled`."""
+
     @property
-    def heads(self) -> int: ...
+    def heads(self) -> int:
+        """Attention heads of a layer."""
+
     @property
-    def feed_forward(self) -> int: ...
+    def feed_forward(self) -> int:
+        """Hidden width of a layer's feed-forward part."""
+
     @property
-    def dtype(self) -> torch.dtype: ...
+    def dtype(self) -> torch.dtype:
+        """Number format of the weights."""
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """prompt (B, P, E) -> (B, F): the prompt as one vector, which the early drafter reads."""
+        """prompt (B, P, E) -> (B, F): the prompt as one vector, the input of the early drafter."""

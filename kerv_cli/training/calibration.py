@@ -1,6 +1,6 @@
-"""Calibration on the training demonstrations (METHODS §3, §4): the noise of the kinematic predictors, their errors on
-held-out episodes, each task's reference level K_S of the kinematic variability, the ranges of the hybrid boundary and
-the similarities from which on a verification is skipped. One JSON holds all of it."""
+"""Calibration on the training demonstrations (docs/methods.md §3, §4). One JSON holds the noise of the kinematic
+predictors, their errors on held-out episodes, each task's reference level K_S of the kinematic variability, the ranges
+of the hybrid boundary and the similarities from which on a verification is skipped."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kerv_cli.artifacts import Artifacts
+from kerv_cli.artifacts import Artifacts, MadeFor
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.decoding.build import compose
 from kerv_cli.decoding.calibration_file import (
     BoundarySection,
-    CalibratedTarget,
     Calibration,
     Demonstrations,
     SkipSection,
@@ -25,13 +24,14 @@ from kerv_cli.decoding.calibration_file import (
     save_calibration,
 )
 from kerv_cli.drafting.kinematics import MINIMUM
-from kerv_cli.environments import resolve_tasks, spec_of
+from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.spaces import Observation, ObservationSpace
+from kerv_cli.training.observations import check_frames, check_spaces, instruction_of
 from kerv_cli.training.predictor_fit import (
     HISTORIES,
     Windows,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from kerv_cli.environments.demos.episode_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
-PRESAMPLED = 6  # episodes per task that pre-sampling spreads its decodes over, where there are so many
+PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
 
 
 def reference_level(levels: Sequence[float], bin_width: float) -> float:
@@ -56,7 +56,7 @@ def reference_level(levels: Sequence[float], bin_width: float) -> float:
         ValueError: no decode compared anything.
     """
     if not levels:
-        raise ValueError("no decode compared a draft with a verdict")
+        raise ValueError("no decode compared a draft with a target token")
     return max(float(np.median(levels)), bin_width)
 
 
@@ -65,7 +65,7 @@ def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, d
 
     The decoder sees every executed action in between, so that methods with a history have one.
     """
-    instruction, felt = spec_of(episode.task).tasks[episode.task].instruction, len(space.proprioception)
+    instruction, felt = instruction_of(episode.task), len(space.proprioception)
     chosen = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
     levels, seen = [], 0
     decoder.reset(episode.task, episode.seed, episode.end_effector[0])
@@ -83,21 +83,26 @@ def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, d
 
 @dataclass(frozen=True)
 class PathReader(DemoDataset):
-    """A dataset that keeps the end-effector path of every episode it loads, so that each file is read once."""
+    """A dataset that keeps the end-effector path of every episode it loads, so that each file is read only once."""
 
     paths: dict[int, np.ndarray] = field(default_factory=dict)  # index -> (T, 3) float32, metres
 
     def load(self, index: int) -> DemoEpisode:
+        """As `DemoDataset.load`; stores the episode's path."""
         episode = super().load(index)
         self.paths[index] = episode.end_effector.copy()
         return episode
 
 
 class CalibrationRun:
-    """`kerv calibrate`: `load`, then what there is to measure, then `finish`.
+    """`kerv calibrate`: call `load`, then `presample`, `boundary` and `skip` as wanted, then `finish`, which writes.
 
     Attributes:
-        notes: lines for the user: what could not be computed now, and whether an earlier run's figures were kept.
+        notes: lines for the user: sections that were not computed now, and whether an earlier run's were kept.
+
+    Raises:
+        UsageError: a number out of range, an unknown task. CheckpointError: no such target or demonstrations,
+            demonstrations of another environment, a datastore of another target.
     """
 
     def __init__(self, settings: CalibrateSettings) -> None:
@@ -114,9 +119,7 @@ class CalibrationRun:
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
-        self.dataset.manifest.actions.check_same(
-            self.described.actions, f"the demonstrations in {self.dataset.path}", "the target"
-        )
+        check_spaces(self.dataset, self.described.actions, self.described.observation, "the target")
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
         self.datastore = self.artifacts.place("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()
@@ -127,7 +130,7 @@ class CalibrationRun:
         self.notes: list[str] = []
 
     def plan(self) -> str:
-        """What would be done, in one line."""
+        """One line for --plan: what would be fitted, on what, and where it is written."""
         held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
         skip = f"skip levels from {self.datastore}" if self.stored else f"no skip levels: no datastore {self.datastore}"
         return (
@@ -163,7 +166,7 @@ class CalibrationRun:
         return BoundarySection(len(self.paths), found)
 
     def skip(self, progress: Progress) -> SkipSection | None:
-        """The tasks' skip levels, from the datastore beside the target; None where there is none."""
+        """Skip levels of the tasks, from the target's datastore; None without a datastore."""
         from kerv_cli.training.skip_levels import skip_section
 
         if not self.stored:
@@ -172,21 +175,24 @@ class CalibrationRun:
         return skip_section(store, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
 
     def presample(self, progress: Progress) -> dict[str, Variability]:
-        """task -> K_S and how K is spread, from decodes of training observations with the settings' method."""
+        """Task -> K_S and quartiles of K, from decodes of training observations with the settings' method; empty for
+        decodes=0.
+
+        Raises:
+            CheckpointError: frames of another size. KervError: no decode of a task compared a draft.
+        """
         if not self.settings.decodes:
             return {}
         decoder, space = self.decoder(), self.dataset.manifest.observation
-        pixels = self.described.settings.get("image_size")
+        pixels = self.described.settings.get("image_size", 0)
         share = math.ceil(self.settings.decodes / PRESAMPLED)
         found: dict[str, Variability] = {}
         for number, name in enumerate(self.tasks):
             levels: list[float] = []
             for index in self._training(name):
                 episode = self.dataset.load(index)
-                if decoder.cameras and episode.frames.shape[1] != pixels:
-                    raise CheckpointError(
-                        f"the demonstrations' frames have {episode.frames.shape[1]} pixels, not {pixels}"
-                    )
+                if decoder.cameras:
+                    check_frames(episode, pixels)
                 budget = min(share, self.settings.decodes - len(levels))
                 levels += presample(decoder, episode, space, budget)
                 if len(levels) >= self.settings.decodes:
@@ -201,7 +207,7 @@ class CalibrationRun:
         return [i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name]
 
     def decoder(self) -> Decoder:
-        """The decoder that pre-samples."""
+        """The decoder of pre-sampling: the settings' proposer, acceptance and threshold."""
         s = self.settings
         method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
         return compose(method.parts(), self.artifacts.target, self.artifacts.load)
@@ -209,8 +215,12 @@ class CalibrationRun:
     def finish(
         self, variability: dict[str, Variability], boundary: BoundarySection | None, skip: SkipSection | None
     ) -> Calibration:
-        """Fits, measures and writes the calibration. A section that is empty now keeps what the file holds for the
-        same target."""
+        """Fits the filters, measures the errors and writes the calibration. A section that is empty now keeps what the
+        file holds for the same target.
+
+        Raises:
+            StorageError: writing failed.
+        """
         assert self.windows is not None
         space, chunk = self.described.actions, self.described.chunk
         noise = fit_filters(self.windows, self.settings.fit_steps or chunk, space.is_strict)
@@ -221,7 +231,7 @@ class CalibrationRun:
         }
         sections, origins = self._kept({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target=CalibratedTarget(self.described.sha256, chunk, space),
+            target=MadeFor(self.described.sha256, space, chunk),
             demos=Demonstrations(self.dataset.sha256, self.windows.episodes),
             window=self.settings.window,
             noise=noise,
@@ -233,7 +243,8 @@ class CalibrationRun:
         return calibration
 
     def _kept(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The sections, empty ones as an earlier run left them, and the provenance of each that was taken over."""
+        """Replaces empty sections by those of an earlier calibration of the same target -> (sections, provenance of the
+        replaced ones)."""
         try:
             earlier = load_calibration(self.path, self.described)
         except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew

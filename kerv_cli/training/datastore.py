@@ -1,7 +1,9 @@
-"""Building a datastore: the demonstrations through the target's encoder, onto disk in one piece (METHODS §4.1)."""
+"""Builds a datastore: encodes the demonstrations with the target and writes them atomically (docs/methods.md §4.1)."""
 
 from __future__ import annotations
 
+import glob
+import io
 import os
 import secrets
 import shutil
@@ -36,12 +38,14 @@ from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import BuildDatastoreSettings
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.training.imitation import frames_and_steps, instruction_of
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.imitation import WITHIN
+from kerv_cli.training.observations import check_spaces, read_chunks, read_observations
+from kerv_cli.training.skip_levels import neighbours_elsewhere
 
 BATCH = 128  # observations encoded at once
-KEYS = ("vision", "scene", "proprioception")  # parts of the prompt; instructions are the same within a task
-WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
+KEYS = ("vision", "scene", "proprioception")
+"""Parts of the prompt that can be part of a key. The instruction is none: it is the same for all entries of a task."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +54,25 @@ class Entries:
 
     keys: np.ndarray  # (n, d) float32
     tokens: np.ndarray  # (n, N) uint8
-    steps: np.ndarray  # (n,) int64
-    left: np.ndarray  # (n,) int64
+    steps: np.ndarray  # (n,) int64, control steps since the start
+    left: np.ndarray  # (n,) int64, control steps until the success
 
 
 @torch.inference_mode()
 def entries_of(target: CompactTarget, episode: DemoEpisode, segments: Sequence[str], stride: int = 1) -> Entries:
-    """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions. A
-    chunk that begins near the end takes the labels recorded beyond the success: it never reaches into another episode.
+    """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions.
+
+    Raises:
+        CheckpointError: too few labels, or frames of another size than the target takes.
     """
-    frames, steps = frames_and_steps(episode, target.settings)
-    frames, steps = frames if frames is None else frames[::stride], steps[::stride]
-    words = target.words_of(instruction_of(episode.task))
+    seen = read_observations(episode, target.settings, target.observation, target.words, slice(None, None, stride))
+    steps = seen.steps.numpy()
+    tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
     keys = []
     for rows in np.array_split(np.arange(len(steps)), -(-len(steps) // BATCH)):
-        images = None if frames is None else torch.from_numpy(frames[rows]).permute(0, 3, 1, 2).to(target.device)
-        states = torch.from_numpy(episode.states[steps[rows]]).to(target.device)
-        felt = states[:, : len(target.observation.proprioception)]
-        inputs = Inputs(images, felt, states, words.expand(len(rows), -1))
-        keys.append(prompt_key(target.encode_batch(inputs)[0], target, segments))
-    chunks = np.stack([episode.labels[t : t + target.chunk] for t in steps])
-    tokens = target.actions.encode(chunks).reshape(len(steps), -1).astype(np.uint8)
-    return Entries(np.concatenate(keys), tokens, steps.astype(np.int64), (episode.steps - steps).astype(np.int64))
+        prompt, _ = target.encode_batch(seen.inputs(torch.from_numpy(rows), target.device))
+        keys.append(prompt_key(prompt, target, segments))
+    return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
 
 
 def directions(keys: np.ndarray, count: int) -> np.ndarray:
@@ -82,10 +83,11 @@ def directions(keys: np.ndarray, count: int) -> np.ndarray:
 
 
 class DatastoreBuild:
-    """`kerv build datastore`. What cannot be built is refused here, before anything heavy starts.
+    """`kerv build datastore`. The constructor checks that it can be built, before anything heavy starts.
 
     Raises:
-        CheckpointError: no such target or demonstrations, evaluation seeds among them, a task without an episode.
+        CheckpointError: no such target or demonstrations, demonstrations of another environment, evaluation seeds among
+            them, a task without an episode.
         UsageError: an unknown part of the prompt, a folder that holds something else.
     """
 
@@ -107,11 +109,11 @@ class DatastoreBuild:
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
-        self.dataset.manifest.actions.check_same(
-            self.artifacts.description.actions, f"the demonstrations in {self.dataset.path}", "the target"
-        )
+        described = self.artifacts.description
+        check_spaces(self.dataset, described.actions, described.observation, "the target")
         self.chosen = {name: self._episodes_of(name) for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
+        _recover(self.folder)
         _refuse_foreign(self.folder)
 
     def _episodes_of(self, name: str) -> list[int]:
@@ -128,6 +130,7 @@ class DatastoreBuild:
         return {name: [self.dataset.episodes[i].seed for i in chosen] for name, chosen in self.chosen.items()}
 
     def plan(self) -> str:
+        """One line for --plan: episodes, tasks, target and folder."""
         episodes = [i for chosen in self.chosen.values() for i in chosen]
         steps = sum(self.dataset.episodes[i].steps for i in episodes)
         return (
@@ -136,7 +139,11 @@ class DatastoreBuild:
         )
 
     def build(self, progress: Callable[[int, int], None] = lambda done, total: None) -> Datastore:
-        """Write the datastore; it appears complete or not at all, and replaces an older one as a whole."""
+        """Writes the datastore atomically, replacing an older one.
+
+        Raises:
+            CheckpointError: as `entries_of`. StorageError: writing failed.
+        """
         target: Any = self.artifacts.target
         total, parts, seeds, shards, rows = sum(map(len, self.chosen.values())), [], [], {}, 0
         for name, chosen in self.chosen.items():
@@ -154,7 +161,7 @@ class DatastoreBuild:
         return Datastore.open(self.folder, self.artifacts.description)
 
     def _arrays(self, parts: list[Entries], seeds: np.ndarray, shards: Mapping[str, Shard]) -> dict[str, Any]:
-        """File name -> what it holds."""
+        """File name -> its contents, an array or a table."""
         import pyarrow as pa
 
         keys, files = np.concatenate([p.keys for p in parts]), {}
@@ -176,7 +183,7 @@ class DatastoreBuild:
         return {**files, PAYLOAD: pa.table(columns)}
 
     def _write(self, folder: Path, files: Mapping[str, Any], shards: dict[str, Shard]) -> None:
-        """Every file, and last the manifest with their hashes."""
+        """Writes every file, and last the manifest with their hashes."""
         import pyarrow.parquet as pq
 
         for name, content in files.items():
@@ -184,9 +191,11 @@ class DatastoreBuild:
                 if name == PAYLOAD:
                     pq.write_table(content, temporary, compression="zstd")
                 else:
-                    with temporary.open("wb") as file:
-                        np.save(file, content)
+                    # np.save to a file reports a full disk without its errno
+                    np.save(buffer := io.BytesIO(), content)
+                    temporary.write_bytes(buffer.getbuffer())
         target = self.artifacts.description
+        made = {"command": "kerv build datastore", "settings": asdict(self.settings), **provenance(self.device)}
         manifest = Manifest(
             format=2,
             kind="datastore",
@@ -199,47 +208,42 @@ class DatastoreBuild:
             demos=self.dataset.sha256,
             files={name: sha256_of(folder / name) for name in files},
             tasks=shards,
-            provenance={
-                "command": "kerv build datastore",
-                "settings": asdict(self.settings),
-                **provenance(self.device),
-            },
+            provenance=made,
         )
         write_json(folder / "manifest.json", asdict(manifest))
 
 
 def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
-    """How well an entry's nearest neighbour in *another* episode predicts its chunk; `per_task` evenly spread entries
-    of each task. Shares of tokens, the median similarity, and the median seconds of a search for five neighbours."""
+    """How well the nearest neighbours in other episodes predict the chunks of `per_task` entries of each task: shares
+    of equal tokens and of those within WITHIN bins, the median similarity, and the median time of a search for five
+    neighbours in ms. Empty where no task has two episodes."""
     gaps, similarities, seconds = [], [], []
-    for name, shard in store.shards.items():
-        if len(store.manifest.tasks[name].seeds) < 2:
-            continue
-        for row in np.linspace(shard.start, shard.stop - 1, min(per_task, shard.stop - shard.start)).astype(int):
+    for name in store.shards:
+        rows, similarity, chunks = neighbours_elsewhere(store, name, per_task)
+        gaps.append(np.abs(chunks - store.tokens[rows]))
+        similarities.append(similarity)
+        for row in rows:
             began = time.perf_counter()
             store.query(store.vectors[row], name, 5)
             seconds.append(time.perf_counter() - began)
-            found = store.query(store.vectors[row], name, 1, without=int(store.seeds[row]))
-            gaps.append(np.abs(found.chunks[0] - store.tokens[row]))
-            similarities.append(found.similarity[0])
-    if not gaps:
+    if not seconds:
         return {}
-    gap = np.stack(gaps)
+    gap = np.concatenate(gaps)
     return {
         "token_agreement": float((gap == 0).mean()),
         f"within_{WITHIN}": float((gap <= WITHIN).mean()),
-        "similarity": float(np.median(similarities)),
+        "similarity": float(np.median(np.concatenate(similarities))),
         "query_ms": 1000 * float(np.median(seconds)),
     }
 
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` when the block ends well. An older folder of that name is deleted once
-    the new one stands in its place.
+    """Yields a temporary folder that is renamed to `folder` when the block succeeds. An older folder of that name is
+    removed after that. What a kill between the two renames leaves, `_recover` puts back.
 
     Raises:
-        StorageError: the disk refused.
+        StorageError: writing failed.
     """
     mark = f"{os.getpid()}-{secrets.token_hex(4)}"
     new, old = (folder.with_name(f".{folder.name}.{mark}.{state}.tmp") for state in ("new", "old"))
@@ -251,14 +255,24 @@ def _new_folder(folder: Path) -> Iterator[Path]:
                 folder.rename(old)
             new.rename(folder)
     finally:
-        if old.exists() and not folder.exists():
-            old.rename(folder)
+        _recover(folder)
         for leftover in (new, old):
             shutil.rmtree(leftover, ignore_errors=True)
 
 
+def _recover(folder: Path) -> None:
+    """Puts the older folder back where a process ended between the two renames of `_new_folder`."""
+    for old in folder.parent.glob(f".{glob.escape(folder.name)}.*.old.tmp"):
+        if not folder.exists():
+            old.rename(folder)
+
+
 def _refuse_foreign(folder: Path) -> None:
-    """A datastore may be replaced, nothing else."""
+    """Refuses to replace a folder that is not a datastore.
+
+    Raises:
+        UsageError: `folder` holds something else.
+    """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     manifest = folder / "manifest.json"

@@ -22,19 +22,17 @@ from kerv_cli.settings import DrafterSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.protocol import Target
 from kerv_cli.training.imitation import Samples
-from kerv_cli.training.loop import Job, Metrics
+from kerv_cli.training.loop import Metrics
+from kerv_cli.training.observations import Rows
 
 
 @dataclass(frozen=True)
-class TeacherStates:
-    """The target on n observations. prompt (n, P, E), hidden (n, P + N − 1, E), tokens (n, N); in float16."""
+class TeacherStates(Rows):
+    """The target's greedy decodes of n observations."""
 
-    prompt: Tensor
-    hidden: Tensor
-    tokens: Tensor
-
-    def __len__(self) -> int:
-        return len(self.tokens)
+    prompt: Tensor  # (n, P, E) float16
+    hidden: Tensor  # (n, P + N − 1, E) float16
+    tokens: Tensor  # (n, N) int64
 
 
 @torch.inference_mode()
@@ -55,15 +53,15 @@ def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
 def teach(
     target: CompactTarget, samples: Samples, limit: int, on_progress: Callable[[int, int], None]
 ) -> TeacherStates:
-    """Evenly spread samples of `samples`, at most `limit`."""
+    """The target's decodes of at most `limit` of the samples, evenly spread."""
     chosen = torch.linspace(0, len(samples) - 1, min(limit, len(samples))).long()
     parts = []
     for indices in chosen.split(64):
         prompt, _ = target.encode_batch(samples.inputs(indices, target.device))
         tokens, hidden = greedy(target, prompt)
-        parts.append((prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
-        on_progress(sum(len(p[2]) for p in parts), len(chosen))
-    return TeacherStates(*(torch.cat(x) for x in zip(*parts, strict=True)))
+        parts.append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
+        on_progress(sum(map(len, parts)), len(chosen))
+    return TeacherStates.joined(parts)
 
 
 class Distillation:
@@ -82,7 +80,7 @@ class Distillation:
         self.device = target.device
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Over all unrolled passes, and the token loss of each."""
+        """Mean loss over the unrolled passes for the states at `indices` (B,), and the token loss of each pass."""
         prompt = self.states.prompt[indices].to(self.device).float()
         hidden = self.states.hidden[indices].to(self.device).float()
         tokens = self.states.tokens[indices].to(self.device)
@@ -99,7 +97,7 @@ class Distillation:
         return total / self.settings.unroll, metrics
 
     def noisy(self, hidden: Tensor, step: int) -> Tensor:
-        """Uniform noise on the input states, a function of the step."""
+        """hidden with uniform noise of ± settings.noise; the noise depends on `step` alone."""
         if not self.settings.noise:
             return hidden
         generator = torch.Generator(self.device).manual_seed(step)
@@ -140,8 +138,3 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     verified = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in verified) / max(1, len(verified))
-
-
-def distillation_job(run: Distillation, save: Callable[[nn.Module, Metrics], None]) -> Job:
-    """The run as the shared loop takes it."""
-    return Job(run.drafter, len(run.states), run.loss, run.validate, save)

@@ -1,13 +1,13 @@
 """Training the early drafter on the frozen target's own greedy decodes (docs/methods.md §5).
 
-What it reads of an observation is pooled as soon as the target has encoded it, so that neither frames nor prompts of a
-whole data set are kept. The history it is shown is what the demonstration *executed*, noise included.
+Prompts are pooled to features right after encoding, so that neither frames nor prompts of the data set stay in memory.
+The history is what the demonstration *executed*, noise included.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,19 +16,19 @@ from torch import Tensor, nn
 from kerv_cli.drafting.early import EarlyDrafter, choose, padded
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings, TrainSettings
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
-from kerv_cli.training.imitation import held_out_of, instruction_of, observed, soft_labels, token_loss
-from kerv_cli.training.loop import Job, Metrics
+from kerv_cli.training.imitation import soft_labels, token_loss
+from kerv_cli.training.loop import Metrics
+from kerv_cli.training.observations import Observations, Rows, observed_steps, read_observations
 
-BATCH = 64  # observations that the teacher decodes at once
+BATCH = 64  # observations that the target decodes at once
 RADII = {"strict": 0, "r3": 3, "r9": 9}
 
 
 @dataclass(frozen=True)
-class EarlySamples:
+class EarlySamples(Rows):
     """The target's greedy decodes of n observations, in episode order."""
 
     features: Tensor  # (n, F) float16, pooled prompts
@@ -38,31 +38,15 @@ class EarlySamples:
     episodes: Tensor  # (n,) int64
     perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
 
-    def __len__(self) -> int:
-        return len(self.tokens)
-
-    def where(self, mask: Tensor) -> EarlySamples:
-        """The samples where mask (n,) bool is set."""
-        return EarlySamples(*(getattr(self, f.name)[mask] for f in fields(self)))
-
-    def split(self, share: float) -> tuple[EarlySamples, EarlySamples]:
-        """(training, held out): the same episodes as `imitation.split`, which the target was not trained on either."""
-        held = held_out_of(self.episodes, share)
-        return self.where(~held), self.where(held)
-
 
 @dataclass(frozen=True)
-class Observations:
-    """Some steps of one episode."""
+class EarlyObservations(Observations):
+    """Observations, and the other fields of EarlySamples that do not need the target."""
 
-    inputs: Inputs
-    history: np.ndarray  # (n, h, D)
-    known: np.ndarray  # (n, h)
-    episode: int
-    perturbed: bool
-
-    def __len__(self) -> int:
-        return len(self.known)
+    history: Tensor
+    known: Tensor
+    episodes: Tensor
+    perturbed: Tensor
 
 
 @torch.inference_mode()
@@ -72,7 +56,7 @@ def teach_early(
     settings: DrafterSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> EarlySamples:
-    """The teacher's decodes of about `settings.samples` observations, spread evenly over all episodes.
+    """The target's decodes of about `settings.samples` observations, spread evenly over all episodes.
 
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
@@ -80,59 +64,42 @@ def teach_early(
     stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1
     share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
     parts: list[EarlySamples] = []
-    waiting: list[Observations] = []
+    waiting: list[EarlyObservations] = []
     for index in range(len(dataset.episodes)):
         waiting.append(observations(target, dataset.load(index), index, share, settings.history))
         if sum(map(len, waiting)) >= BATCH or index + 1 == len(dataset.episodes):
-            parts.append(decode(target, waiting))
+            parts.append(decode(target, EarlyObservations.joined(waiting)))
             waiting = []
         on_progress(index + 1, len(dataset.episodes))
-    return EarlySamples(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(EarlySamples)))
+    return EarlySamples.joined(parts)
 
 
-def observations(target: CompactTarget, episode: DemoEpisode, index: int, share: float, history: int) -> Observations:
-    """The share of the episode's observations, evenly spread, the first always."""
-    frames, size = episode.frames, target.settings.image_size
-    steps = episode.frame_steps if target.cameras else np.arange(episode.steps)
-    if target.cameras and frames.shape[1] != size:
-        raise CheckpointError(f"the demonstrations' frames have {frames.shape[1]} pixels, the target takes {size}")
-    order = np.arange(len(steps))
+def observations(
+    target: CompactTarget, episode: DemoEpisode, index: int, share: float, history: int
+) -> EarlyObservations:
+    """An evenly spread share of the episode's observations; the first is always one of them."""
+    order = np.arange(len(observed_steps(episode, target.settings)))
     chosen = np.flatnonzero(np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9))
+    seen = read_observations(episode, target.settings, target.observation, target.words, chosen)
     executed = target.actions.normalise(episode.executed)
-    shown = [padded(executed[:t], history, target.actions.dofs) for t in steps[chosen]]
-    images = torch.from_numpy(frames[chosen]).permute(0, 3, 1, 2) if target.cameras else None
-    words = target.words_of(instruction_of(episode.task)).repeat(len(chosen), 1)
-    felt, states = (torch.from_numpy(x).float() for x in observed(episode, steps[chosen], target.observation))
-    inputs = Inputs(images, felt, states, words)
-    actions, known = (np.stack(x) for x in zip(*shown, strict=True))
-    return Observations(inputs, actions, known, index, episode.perturbed)
+    shown = [padded(executed[:t], history, target.actions.dofs) for t in seen.steps.tolist()]
+    actions, known = (torch.from_numpy(np.stack(x)) for x in zip(*shown, strict=True))
+    episodes, perturbed = (torch.full((len(seen),), of_all) for of_all in (index, episode.perturbed))
+    return EarlyObservations(**vars(seen), history=actions, known=known, episodes=episodes, perturbed=perturbed)
 
 
-def decode(target: CompactTarget, waiting: Sequence[Observations]) -> EarlySamples:
-    """The teacher on some episodes' observations."""
-    counts = torch.tensor([len(o) for o in waiting])
-    inputs = [o.inputs for o in waiting]
-    felt, states, words = (torch.cat([getattr(i, n) for i in inputs]) for n in ("proprioception", "states", "words"))
-    images = torch.cat([i.images for i in inputs if i.images is not None]) if target.cameras else None
+def decode(target: CompactTarget, seen: EarlyObservations) -> EarlySamples:
+    """The target's greedy decodes of some observations."""
     features, tokens = [], []
-    for some in torch.arange(len(states)).split(BATCH):
-        seen = images[some].to(target.device) if images is not None else None
-        batch = Inputs(seen, *(x[some].to(target.device) for x in (felt, states, words)))
-        prompt, _ = target.encode_batch(batch)
+    for indices in torch.arange(len(seen)).split(BATCH):
+        prompt, _ = target.encode_batch(seen.inputs(indices, target.device))
         features.append(target.pooled(prompt).half().cpu())
         tokens.append(greedy(target, prompt)[0].cpu())
-    return EarlySamples(
-        features=torch.cat(features),
-        history=torch.from_numpy(np.concatenate([o.history for o in waiting])),
-        known=torch.from_numpy(np.concatenate([o.known for o in waiting])),
-        tokens=torch.cat(tokens),
-        episodes=torch.tensor([o.episode for o in waiting]).repeat_interleave(counts),
-        perturbed=torch.tensor([o.perturbed for o in waiting]).repeat_interleave(counts),
-    )
+    return EarlySamples(torch.cat(features), seen.history, seen.known, torch.cat(tokens), seen.episodes, seen.perturbed)
 
 
 class EarlyDistillation:
-    """Loss and validation of one run. The teacher's tokens are the labels, neighbouring bins share probability."""
+    """Loss and validation of one run. The target's tokens are the labels; neighbouring bins share probability."""
 
     def __init__(
         self, early: EarlyDrafter, training: EarlySamples, held_out: EarlySamples, train: TrainSettings
@@ -142,12 +109,12 @@ class EarlyDistillation:
         self.labels = soft_labels(early.actions.tokens, train.label_sigma).to(self.device)
 
     def logits(self, early: EarlyDrafter, samples: EarlySamples, indices: Tensor) -> Tensor:
-        """(B, N, V) of the samples at `indices` (B,)."""
+        """The drafter's logits (B, N, V) for the samples at `indices` (B,)."""
         given = (samples.features, samples.history, samples.known)
         return early(*(x[indices].to(self.device).float() for x in given))
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Cross-entropy of a batch."""
+        """Cross-entropy with the softened tokens of the target at `indices` (B,), and logged numbers."""
         logits = self.logits(self.early, self.training, indices)
         loss = token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
         return loss, {"token_loss": float(loss.detach())}
@@ -164,7 +131,8 @@ class EarlyDistillation:
 
 def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> Tensor:
     """drafts, teacher (n, N), strict (N,) bool -> (n,) length of the longest prefix within r bins of the teacher; the
-    strict tokens must be equal. A proxy of relaxed acceptance: there the target's token is conditioned on the draft."""
+    strict tokens must be equal. Approximates relaxed acceptance, in which later target tokens depend on the accepted
+    draft."""
     limit = torch.where(strict, 0, r)
     return ((drafts - teacher).abs() <= limit).long().cumprod(1).sum(1)
 
@@ -185,8 +153,3 @@ def measure(logits: Tensor, samples: EarlySamples, strict: Tensor) -> Metrics:
         metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])
     metrics["token_accuracy"] = balanced((logits.argmax(-1) == samples.tokens).float().mean(1))
     return metrics
-
-
-def early_job(run: EarlyDistillation, save: Callable[[nn.Module, Metrics], None]) -> Job:
-    """The run as the shared loop takes it."""
-    return Job(run.early, len(run.training), run.loss, run.validate, save)

@@ -2,7 +2,7 @@
 
 One sample is one recorded control step: the observation, and the expert's next H clean actions as tokens. Validation
 uses held-out *episodes*. Token accuracy does not show success (two policies with the same accuracy can differ by half
-of the tasks), so closed-loop episodes are the score wherever they are asked for.
+of the tasks), so the score is the success of closed-loop episodes where the settings ask for them.
 """
 
 from __future__ import annotations
@@ -10,55 +10,33 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.environments import spec_of, specs
+from kerv_cli.environments import specs
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings, TrainSettings
-from kerv_cli.spaces import ObservationSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Job, Metrics
+from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
 
-WITHIN = 9  # bins; the share of tokens this close is reported (Spec-VLA's relaxed radius)
+WITHIN = 9
+"""Bins; the share of tokens this close is reported (the relaxed radius of Spec-VLA)."""
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Everything a policy is trained on, in memory; n samples in episode order."""
+class Samples(Observations):
+    """The training data of a policy: observations and the expert's chunks."""
 
-    frames: Tensor | None  # (n, s, s, 3) uint8
-    proprioception: Tensor  # (n, p) float32
-    states: Tensor  # (n, s) float32, privileged
     chunks: Tensor  # (n, H, D) float32, the expert's clean actions, environment units
-    words: Tensor  # (n, L) int64
     episodes: Tensor  # (n,) int64, index of the sample's episode
-    tasks: Tensor  # (n,) int64, index into `task_names`
-    task_names: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.states)
-
-    def where(self, mask: Tensor) -> Samples:
-        """The samples where mask (n,) bool is set."""
-        chosen: dict[str, Any] = {k: v[mask] for k, v in vars(self).items() if isinstance(v, Tensor)}
-        return replace(self, **chosen)
-
-    def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
-        """The observations at `indices` (B,) as a batch."""
-        images = None
-        if self.frames is not None:
-            images = self.frames[indices].to(device).permute(0, 3, 1, 2)
-        return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
 def load_samples(
@@ -68,81 +46,23 @@ def load_samples(
     task_names: tuple[str, ...],
     on_episode: Callable[[int, int], None] = lambda done, total: None,
 ) -> Samples:
-    """Read the tasks' episodes. Vision policies take the steps that have a frame, state policies every step."""
+    """Reads the tasks' episodes into memory; on_episode(done, total) follows each.
+
+    Raises:
+        CheckpointError: a task without an episode, too few labels or frames of another size.
+    """
     chosen = [i for i, e in enumerate(dataset.episodes) if e.task in task_names]
     missing = set(task_names) - {dataset.episodes[i].task for i in chosen}
     if missing:
         raise CheckpointError(f"the demonstrations hold no episode of {', '.join(sorted(missing))}: record them first")
-    parts: list[dict[str, Tensor]] = []
+    parts = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
-        frames, steps = frames_and_steps(episode, settings)
-        felt, states = observed(episode, steps, dataset.manifest.observation)
-        ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
-        parts.append(
-            {
-                **({} if frames is None else {"frames": torch.from_numpy(frames)}),
-                "proprioception": torch.from_numpy(felt).float(),
-                "states": torch.from_numpy(states).float(),
-                "chunks": torch.from_numpy(np.stack([episode.labels[t : t + settings.chunk] for t in steps])).float(),
-                "words": ids.repeat(len(steps), 1),
-                "episodes": torch.full((len(steps),), number),
-                "tasks": torch.full((len(steps),), task_names.index(episode.task)),
-            }
-        )
+        seen = read_observations(episode, settings, dataset.manifest.observation, words)
+        chunks = torch.from_numpy(read_chunks(episode, seen.steps.numpy(), settings.chunk)).float()
+        parts.append(Samples(**vars(seen), chunks=chunks, episodes=torch.full((len(seen),), number)))
         on_episode(number + 1, len(chosen))
-    whole: dict[str, Any] = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return Samples(**{"frames": None, **whole}, task_names=task_names)
-
-
-def instruction_of(name: str) -> str:
-    """What the robot is told in a task."""
-    return spec_of(name).task(name).instruction
-
-
-def observed(episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Proprioception (n, p) and privileged state (n, s) at `steps` (n,)."""
-    states = episode.states[steps]
-    return states[:, : len(space.proprioception)], states
-
-
-def frames_and_steps(episode: DemoEpisode, settings: TargetSettings) -> tuple[np.ndarray | None, np.ndarray]:
-    """The episode's frames (n, size, size, 3), None for a state policy, and the control steps (n,) that a policy of
-    these settings learns from.
-
-    Raises:
-        CheckpointError: too few labels behind the episode's end for a whole chunk, or frames of another size.
-    """
-    if settings.chunk > len(episode.labels) - episode.steps + 1:
-        raise CheckpointError(
-            f"the demonstrations have {len(episode.labels) - episode.steps} labels behind an episode's end, "
-            f"chunks of {settings.chunk} need {settings.chunk - 1}: record them again with a longer tail"
-        )
-    if settings.observation == "state":
-        return None, np.arange(episode.steps)
-    if episode.frames.shape[1] != settings.image_size:
-        raise CheckpointError(
-            f"the demonstrations' frames have {episode.frames.shape[1]} pixels, the policy takes "
-            f"{settings.image_size}: set target.image_size or record again with world.camera.size"
-        )
-    return episode.frames, episode.frame_steps
-
-
-def split(samples: Samples, share: float) -> tuple[Samples, Samples]:
-    """(training, held out), by whole episodes."""
-    held = held_out_of(samples.episodes, share)
-    return samples.where(~held), samples.where(held)
-
-
-def held_out_of(episodes: Tensor, share: float) -> Tensor:
-    """episodes (n,) -> (n,) bool: every k-th episode, so that each task and both kinds are on both sides."""
-    count = int(episodes.max()) + 1
-    if count < 2:
-        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    if not 0 < share <= 0.5:
-        raise UsageError(f"train.held_out={share}: more than 0, at most 0.5")
-    every = min(max(2, round(1 / share)), count)
-    return episodes % every == every - 1
+    return Samples.joined(parts)
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
@@ -167,29 +87,30 @@ class Imitation:
         self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(device)
 
     def tokens(self, samples: Samples, indices: Tensor) -> Tensor:
-        """(B, N) int64."""
+        """The chunks of `samples` at `indices` (B,) as tokens (B, N) int64."""
         encoded = self.target.actions.encode(samples.chunks[indices].numpy())
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
     def autocast(self) -> torch.autocast:
-        """bfloat16 where it is asked for."""
+        """bfloat16 autocast where the settings ask for it."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16)
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Of a batch; in the first `scene_steps` of the positions alone."""
+        """Token loss and weighted position loss at `indices` (B,); in the first `scene_steps` the position
+        loss alone."""
         inputs = self.training.inputs(indices, self.device)
         scene = self.settings.scene_weight if self.target.cameras else 0.0
         with self.autocast():
+            places = places_of(inputs.states, self.target.observation)
             if scene and step < self.settings.scene_steps:
-                _, positions = self.target.encode_batch(inputs)
-                loss = position_loss(positions, places_of(inputs.states, self.target.observation))
+                loss = position_loss(self.target.encode_batch(inputs)[1], places)
                 return loss, {"position_loss": float(loss.detach())}
             tokens = self.tokens(self.training, indices)
             logits, positions = self.target.teacher_forced(inputs, tokens)
             loss = token_loss(logits, tokens, self.labels)
             metrics = {"token_loss": float(loss.detach())}
             if scene:
-                extra = position_loss(positions, places_of(inputs.states, self.target.observation))
+                extra = position_loss(positions, places)
                 loss = loss + scene * extra
                 metrics["position_loss"] = float(extra.detach())
         return loss, metrics
@@ -242,8 +163,8 @@ def new_target(
 
 
 def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:
-    """Whether the target in `folder`, described by its JSON, can be fine-tuned to `settings`: no weight depends on the
-    chunk length, all else must agree.
+    """Checks that the target in `folder`, with this description, can be fine-tuned to `settings`. All of them but the
+    chunk length must agree; no weight depends on that.
 
     Raises:
         UsageError: the first shape that differs.
@@ -264,22 +185,8 @@ def continued_target(settings: TargetSettings, init: CompactTarget) -> CompactTa
     return target
 
 
-def check_spaces(target: CompactTarget, dataset: DemoDataset) -> None:
-    """Refuse demonstrations of another environment than the target's.
-
-    Raises:
-        CheckpointError: other actions or observations.
-    """
-    target.actions.check_same(dataset.manifest.actions, "the target", f"the demonstrations in {dataset.path}")
-    if target.observation != dataset.manifest.observation:
-        raise CheckpointError(
-            f"the demonstrations in {dataset.path} have other observations than the target was trained on: "
-            "they are of another environment"
-        )
-
-
 def vocabulary(environment: str) -> WordTokenizer:
-    """All words of the environment's instructions."""
+    """Word tokenizer over the instructions of all tasks of an environment."""
     return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())
 
 
@@ -288,7 +195,7 @@ def imitation_job(
     save: Callable[[nn.Module, Metrics], None],
     closed_loop: Callable[[CompactTarget], float] | None = None,
 ) -> Job:
-    """The run as the shared loop takes it. With `closed_loop` (success in [0, 1]) success outranks the action error."""
+    """The run as a `Job`. With `closed_loop` (returns success in [0, 1]) success dominates the score."""
 
     def validate(module: nn.Module) -> Metrics:
         metrics = run.validate(module)

@@ -1,7 +1,7 @@
 """The optimisation loop that the target and the drafters share: schedule, EMA, validation, exact resume.
 
 The batch of step s is a function of (seed, s), and one resume file holds weights, EMA, optimiser moments, best score
-and history: a run that was cut and resumed writes the same bytes as one that was not (same machine, same threads).
+and history: an interrupted and resumed run writes the same bytes as an uninterrupted one (same machine and threads).
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ Metrics = dict[str, float]
 
 @dataclass(frozen=True)
 class Job:
-    """What is optimised. `loss(batch indices, step)` -> scalar loss and logged numbers; `validate(module)` -> metrics
-    with a `score` (higher is better) on the EMA weights; `save(module, metrics)` keeps the best."""
+    """A module and its optimisation. samples: number of training samples. loss(batch indices, step) -> scalar loss and
+    logged numbers. validate(module) -> metrics of the EMA weights with a `score`, higher is better. save(module,
+    metrics) writes the best one."""
 
     module: nn.Module
     samples: int
@@ -40,8 +41,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run has come. identity: hash of everything that determines it; best: greatest score so far; history:
-    the metrics of every validation."""
+    """The progress of a run. identity: hash of everything that determines it. step: steps done. best: greatest score so
+    far. history: the metrics of every validation."""
 
     identity: str
     step: int
@@ -50,11 +51,11 @@ class Progress:
 
 
 class Loop:
-    """Runs a `Job`. folder: where `resume.safetensors` and `log.csv` live."""
+    """Runs a `Job`. folder: holds `resume.safetensors` and `log.csv`. identity: hash of everything that determines the
+    run; another run is never resumed."""
 
     def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str) -> None:
-        self.job, self.settings, self.folder = job, settings, folder
-        self.identity = identity  # hash of everything that determines the run; another run is never resumed
+        self.job, self.settings, self.folder, self.identity = job, settings, folder, identity
         self.step, self.best = 0, -math.inf
         self.history: list[Metrics] = []
         decay = [p for p in job.module.parameters() if p.dim() >= 2]
@@ -64,7 +65,11 @@ class Loop:
         self.ema = {k: v.detach().clone() for k, v in job.module.state_dict().items()}
 
     def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
-        """Train to `settings.steps`, resuming what is there -> metrics of the best checkpoint."""
+        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint.
+
+        Raises:
+            CheckpointError: as `restore`. KervError: training diverged. StorageError: writing failed.
+        """
         self.restore()
         settings = self.settings
         while self.step < settings.steps:
@@ -77,7 +82,7 @@ class Loop:
         return max(self.history, key=lambda m: m["score"])
 
     def update(self) -> Metrics:
-        """One optimiser step -> loss and what the job logs.
+        """One optimiser step -> loss and logged numbers.
 
         Raises:
             KervError: the loss is not finite.
@@ -101,7 +106,11 @@ class Loop:
         return {"loss": loss.item(), **metrics}
 
     def check(self, training: Metrics) -> None:
-        """Validate the EMA weights, keep the best, write the resume file."""
+        """Validates the EMA weights, saves the best, writes the resume file. training: numbers of the last step.
+
+        Raises:
+            KervError: a metric is not finite. StorageError: writing failed.
+        """
         module = self.job.module
         live = {k: v.detach().clone() for k, v in module.state_dict().items()}
         module.load_state_dict(self.ema)
@@ -121,7 +130,7 @@ class Loop:
         self.store()
 
     def store(self) -> None:
-        """Write the resume file, then the log."""
+        """Writes the resume file, then the log."""
         tensors = {f"model.{k}": v for k, v in self.job.module.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
@@ -131,17 +140,17 @@ class Loop:
         self.log()
 
     def log(self) -> None:
-        """Write `log.csv`, a row per validation."""
+        """Writes `log.csv`, a row per validation."""
         import pandas as pd
 
         with atomic_path(self.folder / "log.csv") as temporary:
             pd.DataFrame(self.history).to_csv(temporary, index=False, float_format="%.6g")
 
     def restore(self) -> None:
-        """Go on where the folder's run stopped, if it holds one.
+        """Continues from the folder's resume file, if there is one.
 
         Raises:
-            CheckpointError: a run with other settings or data, or a damaged one.
+            CheckpointError: it is of a run with other settings or data, or damaged.
         """
         path = self.folder / "resume.safetensors"
         if not path.is_file():
@@ -161,13 +170,13 @@ class Loop:
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.best, self.history = progress.step, progress.best, progress.history
-        self.log()  # the run may have been cut before it could
+        self.log()  # the run may have ended before it wrote the log
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
-    """Tensors and progress in one file, so that no kill can leave them of different steps."""
+    """Writes tensors and progress into one file, so that a kill cannot leave them at different steps."""
     text = json.dumps(asdict(progress), allow_nan=False)
-    # one key, because safetensors writes several in any order: equal states are equal bytes
+    # one key, because safetensors writes several in random order and equal states shall be equal bytes
     save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
 
 
@@ -175,7 +184,7 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
     """The inverse of `write_state`.
 
     Raises:
-        CheckpointError: damaged, or numbers that are not finite.
+        CheckpointError: the file is damaged, or holds numbers that are not finite.
     """
     again = f"delete {path.parent} to begin again"
     try:
@@ -201,7 +210,8 @@ def digest(tensors: Mapping[str, Tensor], text: str) -> str:
 
 
 def schedule(step: int, settings: TrainSettings) -> float:
-    """Linear warm-up, then cosine to 2 % of the peak; once for the position phase and once for the rest."""
+    """Factor of the learning rate: linear warm-up, then cosine to 2 % of the peak; once for the first `scene_steps` and
+    once for the rest."""
     begin, end = (0, settings.scene_steps) if step < settings.scene_steps else (settings.scene_steps, settings.steps)
     if step - begin < settings.warmup:
         return (step - begin + 1) / settings.warmup

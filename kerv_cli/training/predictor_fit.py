@@ -1,5 +1,5 @@
-"""How well the next actions follow from the last ones: windows of the demonstrations, the filters' noise fitted on
-training episodes, every predictor's error on held-out ones (METHODS §3.1)."""
+"""Fits the kinematic predictors: windows of actions from the demonstrations, the noise of the filters from training
+episodes, every predictor's error on held-out ones (docs/methods.md §3.1)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from kerv_cli.decoding.calibration_file import Errors
 from kerv_cli.drafting.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
 from kerv_cli.errors import CheckpointError, KervError, UsageError
 from kerv_cli.spaces import ActionSpace
+from kerv_cli.training.observations import check_tail
 
 if TYPE_CHECKING:
     from kerv_cli.environments.demos.dataset import DemoDataset
@@ -26,7 +27,7 @@ HISTORIES = ("labels", "executed")
 
 @dataclass(frozen=True)
 class Windows:
-    """n recorded moments: what was done before each, and what the expert does from there on; normalised.
+    """n moments of demonstrations: the actions before each and the expert's actions from there on, normalised.
 
     past (n, window, D), future (n, H, D), task (n,) index into `tasks`, held_out (n,) bool by whole episodes.
     """
@@ -48,17 +49,13 @@ def episode_windows(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(past (n, window, D), future (n, horizon, D)) of every moment of an episode that has a full window behind it.
 
-    history: what the past is made of: the clean `labels`, or what was `executed`. The future is always the labels.
+    history: the past is the clean `labels` or the `executed` actions. The future is always the labels.
 
     Raises:
         CheckpointError: too few labels were recorded beyond the episode's end.
     """
     steps, dofs = episode.executed.shape
-    if len(episode.labels) < steps + horizon - 1:
-        raise CheckpointError(
-            f"the demonstrations have {len(episode.labels) - steps} labels behind an episode's end, predictions of "
-            f"{horizon} steps need {horizon - 1}: record them again with a longer tail"
-        )
+    check_tail(episode, horizon, f"predictions of {horizon} steps")
     if steps <= window:
         return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
     labels = actions.normalise(episode.labels)
@@ -142,7 +139,8 @@ def fit_noise(past: np.ndarray, future: np.ndarray, order: int, dampings: Sequen
 
 
 def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noise]:
-    """The noise of every kind of filter, per DoF, from the training episodes; held DoFs (D,) bool are not fitted."""
+    """Kind of filter -> its noise per DoF, fitted on the training episodes to the next `steps` actions. held (D,) bool:
+    DoFs that are not fitted, because they are held."""
     past, future = windows.where(~windows.held_out)
     fitted = {}
     for kind, model in FILTERS.items():
@@ -156,7 +154,7 @@ def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noi
 
 
 def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: ActionSpace) -> Errors:
-    """Errors of every predictor on the held-out episodes."""
+    """Kind of predictor -> task -> DoF -> H mean absolute errors on the held-out episodes, normalised units."""
     window, horizon = windows.past.shape[1], windows.future.shape[1]
     errors: Errors = {}
     for kind in PREDICTORS:
@@ -170,6 +168,6 @@ def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: Actio
 
 
 def moving_errors(errors: Errors, kind: str, space: ActionSpace) -> np.ndarray:
-    """(tasks, H): mean over the DoFs that are predicted and not held."""
+    """(tasks, H): errors of predictor `kind`, averaged over the DoFs that are not strict."""
     moving = [name for name in space.names if name not in space.strict]
     return np.array([[rows[name] for name in moving] for rows in errors[kind].values()]).mean(1)

@@ -1,9 +1,10 @@
-"""A training run from settings to a folder on disk: what is read, where it is saved, what is written down about it."""
+"""Training runs, from settings to a folder on disk: the target, the drafter and the early drafter."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -24,31 +25,29 @@ from kerv_cli.runtime import set_up
 from kerv_cli.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.distillation import Distillation, distillation_job, teach
-from kerv_cli.training.early_distillation import EarlyDistillation, early_job, teach_early
+from kerv_cli.training.distillation import Distillation, teach
+from kerv_cli.training.early_distillation import EarlyDistillation, teach_early
 from kerv_cli.training.imitation import (
     Imitation,
     Samples,
     check_init,
-    check_spaces,
     continued_target,
     imitation_job,
     load_samples,
     new_target,
-    split,
     vocabulary,
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
+from kerv_cli.training.observations import check_spaces, split
 
 Progress = Callable[[int, int], None]
 
 
 def determining(train: TrainSettings) -> dict[str, Any]:
-    """What of the optimisation settings makes two runs different. A run may be resumed with more or fewer steps.
-    `init` is a name: the weights that it stands for count."""
-    return {
-        k: v for k, v in asdict(train).items() if k not in ("steps", "validate_every", "closed_loop", "init", "half")
-    }
+    """The optimisation settings that identify a run. Steps and validation intervals may change on resuming; `init` is
+    identified by its weights' hash instead of its name."""
+    free = ("steps", "validate_every", "closed_loop", "init", "half")
+    return {k: v for k, v in asdict(train).items() if k not in free}
 
 
 def identity_of(**parts: Any) -> str:
@@ -56,8 +55,62 @@ def identity_of(**parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-class TargetRun:
-    """`kerv train target`."""
+class Run(ABC):
+    """A training run: `load` reads what it needs, `train` optimises and saves the best checkpoint in `folder`. `plan`
+    says in one line what would be done."""
+
+    kind: str  # the word behind `kerv train`
+    settings: TrainTargetSettings | TrainDrafterSettings
+    dataset: DemoDataset
+    folder: Path
+    device: str
+
+    @abstractmethod
+    def job(self) -> Job:
+        """A fresh module, its loss and its validation."""
+
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """What determines the run besides the optimisation settings and the demonstrations."""
+
+    @abstractmethod
+    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+        """Writes the weights and their description; made: provenance."""
+
+    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
+        """Trains, resuming what the folder holds -> metrics of the best checkpoint. on_step(step, metrics).
+
+        Raises:
+            CheckpointError: the folder holds another run. KervError: training diverged. StorageError: writing failed.
+        """
+        train, job = self.settings.train, self.job()
+        identity = identity_of(train=determining(train), demos=self.dataset.sha256, **self.identity())
+        job.module.train()
+        return Loop(job, train, self.folder, identity).run(on_step)
+
+    def save(self, module: nn.Module, metrics: Metrics) -> None:
+        """Writes the weights with their provenance; metrics: of their validation."""
+        made = {
+            "command": f"kerv train {self.kind}",
+            "settings": asdict(self.settings),
+            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
+            "validation": metrics,
+            "parameters": sum(p.numel() for p in module.parameters()),
+            **provenance(self.device),
+        }
+        self.write(module, made)
+
+
+class TargetRun(Run):
+    """`kerv train target`. The constructor checks that the run is possible.
+
+    Raises:
+        UsageError: settings that do not fit together. CheckpointError: no such demonstrations or `train.init`,
+            demonstrations of another environment or camera.
+    """
+
+    kind = "target"
+    settings: TrainTargetSettings
 
     def __init__(self, settings: TrainTargetSettings) -> None:
         self.settings = settings
@@ -80,21 +133,27 @@ class TargetRun:
         self.origin: dict[str, str] = {}  # hash of the weights that the run begins with, where they are not fresh
 
     def check_demos(self) -> None:
-        """Refuse demonstrations of another environment, or frames of another camera than the policy will be shown.
+        """Refuses demonstrations of another environment, or frames of another camera than the policy will be shown.
 
         Raises:
             CheckpointError: they are.
         """
-        manifest, where = self.dataset.manifest, f"the demonstrations in {self.dataset.path}"
-        manifest.actions.check_same(self.spec.actions, where, f"the tasks' environment {self.spec.name}")
-        if self.settings.target.observation == "vision" and manifest.config["camera"]["name"] != self.world.camera.name:
-            raise CheckpointError(
-                f"{where} show camera {manifest.config['camera']['name']}, the policy would be shown "
-                f"{self.world.camera.name}: set world.camera.name, or record again"
-            )
+        spec, shown = self.spec, self.world.camera.name
+        check_spaces(self.dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
+        if self.settings.target.observation == "vision":
+            recorded = self.dataset.manifest.config["camera"]["name"]
+            if recorded != shown:
+                raise CheckpointError(
+                    f"the demonstrations in {self.dataset.path} show camera {recorded}, the policy would be shown "
+                    f"{shown}: set world.camera.name, or record again"
+                )
 
     def find_init(self) -> Path | None:
-        """The folder of the target that the run begins with."""
+        """Folder of the target `train.init`; None for a fresh run.
+
+        Raises:
+            UsageError: the run would overwrite it, or another shape. CheckpointError: no such target.
+        """
         name = self.settings.train.init
         if name is None:
             return None
@@ -107,7 +166,7 @@ class TargetRun:
         return folder
 
     def plan(self) -> str:
-        """One line: what the run would do."""
+        """One line for --plan: demonstrations, tasks, steps and folder."""
         train, episodes = self.settings.train, [e for e in self.dataset.episodes if e.task in self.tasks]
         return (
             f"{self.folder}: {self.settings.target.size} on {self.settings.target.observation}, {len(episodes)} "
@@ -116,66 +175,58 @@ class TargetRun:
         )
 
     def load(self, progress: Progress) -> None:
-        """Read the demonstrations, and the weights to begin with."""
+        """Reads the demonstrations and the weights of `train.init` into memory; progress(done, total).
+
+        Raises:
+            CheckpointError: one of them is damaged or of another environment.
+        """
         self.device, _ = set_up(self.settings.runtime)
         if self.init is not None:
             self.begun, described = load_target(self.init)
-            assert self.begun is not None
             self.origin = {"init": described.sha256}
-            check_spaces(self.begun, self.dataset)
-        words = self.begun.words if self.begun else vocabulary(self.dataset.manifest.environment)
-        self.samples = load_samples(self.dataset, self.settings.target, words, self.tasks, progress)
+            check_spaces(self.dataset, described.actions, described.observation, f"the target in {self.init}")
+        self.words = self.begun.words if self.begun else vocabulary(self.dataset.manifest.environment)
+        self.samples = load_samples(self.dataset, self.settings.target, self.words, self.tasks, progress)
 
-    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
-        """Train, resuming what is there -> metrics of the best checkpoint."""
+    def job(self) -> Job:
+        """See `Run.job`; validated in closed loop where the settings ask for it."""
         assert self.samples is not None
         settings = self.settings
         if self.begun is None:
-            camera = self.world.camera.name
-            words = vocabulary(self.dataset.manifest.environment)
-            target = new_target(settings.target, self.dataset, self.samples, words, camera, settings.train.seed)
+            camera, seed = self.world.camera.name, settings.train.seed
+            target = new_target(settings.target, self.dataset, self.samples, self.words, camera, seed)
         else:
             target = continued_target(settings.target, self.begun)
-        target = target.to(self.device)
-        identity = identity_of(
-            target=asdict(settings.target),
-            train=determining(settings.train),
-            demos=self.dataset.sha256,
-            tasks=self.tasks,
-            **self.origin,
-        )
-        run = Imitation(target, self.samples, settings.train, torch.device(self.device))
-        closed_loop = self.closed_loop if settings.train.closed_loop else None
-        loop = Loop(imitation_job(run, self.save, closed_loop), settings.train, self.folder, identity)
-        target.train()
-        return loop.run(on_step)
+        run = Imitation(target.to(self.device), self.samples, settings.train, torch.device(self.device))
+        return imitation_job(run, self.save, self.closed_loop if settings.train.closed_loop else None)
+
+    def identity(self) -> dict[str, Any]:
+        """Shapes, tasks and the weights to begin with."""
+        return {"target": asdict(self.settings.target), "tasks": self.tasks, **self.origin}
 
     def closed_loop(self, target: CompactTarget) -> float:
-        """Success in [0, 1] of greedy decoding over the tasks, on selection seeds."""
+        """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
         from kerv_cli.rollouts.run import success_of
 
         seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
         return success_of(target, self.tasks, seeds, self.world)
 
-    def save(self, module: nn.Module, metrics: Metrics) -> None:
-        """Write the weights and what made them."""
+    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+        """See `Run.write`."""
         assert isinstance(module, CompactTarget)
-        made = {
-            "command": "kerv train target",
-            "settings": asdict(self.settings),
-            **self.origin,
-            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
-            "validation": metrics,
-            "parameters": sum(p.numel() for p in module.parameters()),
-            **provenance(self.device),
-        }
-        save_target(self.folder, module, self.dataset.manifest.environment, made, self.settings.train.half)
+        environment = self.dataset.manifest.environment
+        save_target(self.folder, module, environment, made | self.origin, self.settings.train.half)
 
 
-class DrafterRun:
-    """`kerv train drafter`."""
+class DrafterRun(Run):
+    """`kerv train drafter`: the EAGLE-style drafter.
 
-    noun = "drafter"
+    Raises:
+        UsageError: `train.init` is set. CheckpointError: no such target or demonstrations.
+    """
+
+    kind = noun = "drafter"
+    settings: TrainDrafterSettings
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
         self.settings = settings
@@ -184,13 +235,15 @@ class DrafterRun:
         self.target_folder = find_target(settings.results, settings.policy.target)
         self.folder = self.place()
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        described = read_target(self.target_folder)
+        check_spaces(self.dataset, described.actions, described.observation, "the target")
 
     def place(self) -> Path:
-        """Where the drafter is put."""
+        """Folder of the drafter."""
         return artifact_folder("drafter")(self.settings.results, self.settings.policy.drafter, self.target_folder)
 
     def plan(self) -> str:
-        """One line: what the run would do."""
+        """One line for --plan: target, observations, steps and folder."""
         s = self.settings
         return (
             f"{self.folder}: {s.drafter.layers}-layer {self.noun} of {self.target_folder}, greedy decodes of "
@@ -198,79 +251,65 @@ class DrafterRun:
         )
 
     def load(self, progress: Progress) -> None:
-        """Load the target and let it decode the demonstrations' observations."""
+        """Loads the target and lets it decode the demonstrations' observations; progress(done, total).
+
+        Raises:
+            CheckpointError: target or demonstrations are damaged.
+        """
         self.device, _ = set_up(self.settings.runtime)
         self.target, self.described = load_target(self.target_folder, self.device)
-        check_spaces(self.target, self.dataset)
         self.teach(progress)
 
     def teach(self, progress: Progress) -> None:
-        """The target's decodes, for training and validation."""
+        """Collects the target's states for training and validation."""
         tasks = tuple(dict.fromkeys(e.task for e in self.dataset.episodes))
         samples = load_samples(self.dataset, self.target.settings, self.target.words, tasks)
         training, held_out = split(samples, self.settings.train.held_out)
         limit = self.settings.drafter.samples
-        self.states = teach(self.target, training, limit, lambda done, total: progress(done, total))
+        self.states = teach(self.target, training, limit, progress)
         self.held_out = teach(self.target, held_out, max(60, limit // 50), lambda done, total: None)
 
     def job(self) -> Job:
-        """What the loop optimises."""
+        """See `Run.job`."""
+        torch.manual_seed(self.settings.train.seed)
         drafter = Drafter.beside(self.settings.drafter, self.target).to(self.device)
         run = Distillation(drafter, self.target, self.states, self.held_out, self.settings.drafter)
-        return distillation_job(run, self.save)
+        return Job(drafter, len(self.states), run.loss, run.validate, self.save)
 
-    def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
-        """Train, resuming what is there -> metrics of the best checkpoint."""
-        settings = self.settings
-        torch.manual_seed(settings.train.seed)
-        job = self.job()
-        identity = identity_of(
-            drafter=asdict(settings.drafter),
-            train=determining(settings.train),
-            demos=self.dataset.sha256,
-            target=self.described.sha256,
-        )
-        loop = Loop(job, settings.train, self.folder, identity)
-        job.module.train()
-        return loop.run(on_step)
-
-    def save(self, module: nn.Module, metrics: Metrics) -> None:
-        """Write the weights and what made them."""
-        made = {
-            "command": "kerv train drafter",
-            "settings": asdict(self.settings),
-            "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
-            "validation": metrics,
-            "parameters": sum(p.numel() for p in module.parameters()),
-            **provenance(self.device),
-        }
-        self.write(module, made)
+    def identity(self) -> dict[str, Any]:
+        """Shapes and the target's weights."""
+        return {"drafter": asdict(self.settings.drafter), "target": self.described.sha256}
 
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
-        """Write the weights; made: provenance."""
+        """See `Run.write`."""
         assert isinstance(module, Drafter)
         save_drafter(self.folder, module, self.target, self.described.sha256, made, self.settings.train.half)
 
 
 class EarlyRun(DrafterRun):
-    """`kerv train drafter drafter=early`."""
+    """`kerv train drafter drafter=early`; raises as DrafterRun."""
 
     noun = "early drafter"
 
     def place(self) -> Path:
+        """Folder of the early drafter."""
         return artifact_folder("early")(self.settings.results, self.settings.policy.early, self.target_folder)
 
     def teach(self, progress: Progress) -> None:
+        """Collects the target's tokens and pooled prompts."""
         taught = teach_early(self.target, self.dataset, self.settings.drafter, progress)
-        self.training, self.validation = taught.split(self.settings.train.held_out)
+        self.training, self.validation = split(taught, self.settings.train.held_out)
 
     def job(self) -> Job:
+        """See `Run.job`."""
+        torch.manual_seed(self.settings.train.seed)
         early = EarlyDrafter.beside(self.settings.drafter, self.target)
         early.standardise(self.training.features)
         run = EarlyDistillation(early.to(self.device), self.training, self.validation, self.settings.train)
-        return early_job(run, self.save)
+        return Job(early, len(self.training), run.loss, run.validate, self.save)
 
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+        """See `Run.write`."""
         assert isinstance(module, EarlyDrafter)
         save_early(self.folder, module, self.described.sha256, made, self.settings.train.half)
 
@@ -279,7 +318,7 @@ DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": Early
 
 
 def drafter_run(settings: TrainDrafterSettings) -> DrafterRun:
-    """The run of `drafter.kind`.
+    """The training run of `drafter.kind`.
 
     Raises:
         UnknownName: no such kind.

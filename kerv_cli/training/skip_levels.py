@@ -1,7 +1,7 @@
-"""How similar is similar enough to skip the verification (METHODS §4.3; HeiSD): each task's s_min, from a datastore.
+"""Calibrates verify-skip (docs/methods.md §4.3; HeiSD): the similarity s_min of each task, from a datastore.
 
 An entry's key is looked up among the other episodes of its task, and the best neighbour's chunk is compared with the
-chunk that the expert went on with from the entry itself. That is what would have been executed without a forward.
+entry's own, the expert's next actions. The neighbour's chunk would have been executed without verification.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kerv_cli.drafting.datastore import Datastore
 
 ENTRIES = 4000  # looked up per task, evenly spread; on MT10, levels from 1000 did not hold on other episodes
-LEAST = 20  # entries above a level; fewer prove nothing about it
+LEAST = 20  # entries above a level; fewer do not support it
 LOW, HIGH = 2.0, 1 / 3  # wrong chunks that the bounds of s_min allow, as multiples of what s_min itself allows
 
 
@@ -32,39 +32,47 @@ class Matches:
     strict: np.ndarray  # (n,) bool, some token of a strict DoF differs
 
     def good(self, epsilon: float) -> np.ndarray:
-        """(n,) bool: the error is at most epsilon and strict DoFs are the expert's, token for token. A wrong gripper
-        hides in a mean over all DoFs, and drops what is held."""
+        """(n,) bool: the error is at most epsilon and all tokens of strict DoFs are the expert's. The gripper is judged
+        apart, because a wrong one hardly changes the mean over all DoFs and drops the object."""
         return (self.error <= epsilon) & ~self.strict
 
 
-def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
-    """Leave one episode out: the best neighbour of up to `entries` evenly spread entries of `task`; none where the
-    datastore holds a single episode of it.
+def neighbours_elsewhere(store: Datastore, task: str, entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Leave-one-episode-out: up to `entries` evenly spread entries of `task` and their best neighbours in other
+    episodes.
+
+    Rows (n,), cosines (n,) float32 and the neighbours' chunks (n, N) int64; n is 0 where the datastore holds a single
+    episode of the task.
 
     Raises:
         UnknownName: a task that the datastore does not hold.
     """
     if task not in store.shards:
         raise UnknownName("task of the datastore", task, store.shards)
-    shard, space = store.shards[task], store.manifest.actions
-    if len(np.unique(store.seeds[shard])) < 2:
-        return Matches(np.zeros(0, np.float32), np.zeros(0), np.zeros(0, bool))
-    rows = np.linspace(shard.start, shard.stop - 1, min(entries, shard.stop - shard.start)).astype(int)
-    similarity, chunks = [], []
-    for row in rows:
+    shard = store.shards[task]
+    count = min(entries, shard.stop - shard.start) if len(np.unique(store.seeds[shard])) > 1 else 0
+    rows = np.linspace(shard.start, shard.stop - 1, count).astype(int)
+    similarity, chunks = np.zeros(count, np.float32), np.zeros((count, store.tokens.shape[1]), np.int64)
+    for i, row in enumerate(rows):
         found = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
-        similarity.append(found.similarity[0])
-        chunks.append(found.chunks[0])
-    own, drafted = store.tokens[rows].astype(np.int64), np.stack(chunks)
+        similarity[i], chunks[i] = found.similarity[0], found.chunks[0]
+    return rows, similarity, chunks
+
+
+def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
+    """The entries of `neighbours_elsewhere`, with the neighbours' chunks compared to their own."""
+    space = store.manifest.actions
+    rows, similarity, drafted = neighbours_elsewhere(store, task, entries)
+    own = store.tokens[rows].astype(np.int64)
     error = np.abs(space.values_of(drafted) - space.values_of(own)).mean(1)
     strict = (drafted != own)[:, space.strict_tokens(own.shape[1])].any(1)
-    return Matches(np.array(similarity, np.float32), error, strict)
+    return Matches(similarity, error, strict)
 
 
 def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, least: int = LEAST) -> float | None:
     """The lowest similarity s such that of the entries with similarity ≥ s at least the share `confidence` is good.
 
-    similarity (n,), good (n,) bool. Equal similarities are above a level together. None where no level has `least`
+    similarity (n,), good (n,) bool. Entries of equal similarity count together. None where no level has `least`
     entries above it and enough good ones among them.
     """
     order = np.argsort(-similarity, kind="stable")
@@ -76,11 +84,11 @@ def lowest_level(similarity: np.ndarray, good: np.ndarray, confidence: float, le
 
 
 def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLevel:
-    """s_min of one task, the bounds between which feedback may move it, and what it would skip.
+    """s_min of one task, the bounds between which feedback may move it, and the share of decodes it would skip.
 
     low ≤ s_min ≤ high: the same level where twice and where a third of the wrong chunks are allowed (at a confidence
-    of 0.9: 0.8 and 0.967). Where no level is that good, high is the largest similarity seen, where next to nothing is
-    skipped. A task without an s_min has NEVER for all three: nothing lets it skip.
+    of 0.9: 0.8 and 0.967). Where no level is that good, high is the largest similarity seen, where hardly
+    anything is skipped. A task without an s_min has NEVER for all three and never skips.
     """
     good, wrong = matches.good(epsilon), 1 - confidence
     s_min = lowest_level(matches.similarity, good, confidence)
@@ -106,8 +114,8 @@ def skip_section(
     confidence: float,
     on_progress: Callable[[int, int], None],
 ) -> SkipSection | None:
-    """The calibration's `skip`: the levels of those `tasks` that the datastore holds, and which datastore it was. None
-    where it holds none of the tasks."""
+    """The calibration's section `skip`: levels of those `tasks` that the datastore holds, and its hash. None where it
+    holds none of them."""
     found = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:

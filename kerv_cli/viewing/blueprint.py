@@ -1,4 +1,4 @@
-"""How an episode's recording is laid out on the screen: a pure function of what the recording holds."""
+"""Layout of an episode's recording in the viewer: a pure function of the episode's properties."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEP, TIME = "step", "time"
 CELL_WIDTH, CELL_HEIGHT = 60.0, 26.0
 """A token's cell in the picture of the current chunk, in scene units."""
 KEY_ROWS = 4
-"""At least so many rows has the picture's key."""
+"""Least number of rows of the picture's key."""
 
 SIGNALS = {
     "variability": "K, kinematic variability",
@@ -20,18 +20,17 @@ SIGNALS = {
     "similarity": "similarity of the best neighbour",
     "deviation": "deviation from AR",
 }
-"""Optional numbers of a decode (fields of DecodeRecord) and the names of their series."""
+"""Optional fields of DecodeRecord -> titles of their views."""
 
 
 @dataclass(frozen=True)
 class EpisodeMeta:
-    """What decides the layout."""
+    """Properties of an episode that decide the layout."""
 
     chunk_steps: int  # H
     dofs: tuple[str, ...]  # names of the D degrees of freedom
     frames: bool  # camera frames were kept
-    drafted: bool  # some token was not plainly decoded by the target
-    verified: bool  # some draft was verified
+    drafted: bool  # some token was drafted, compensated or skipped
     threshold: bool  # some acceptance rule had a threshold
     signals: tuple[str, ...]  # keys of SIGNALS that some decode has
     most: float  # the most forwards or the longest acceptance length of a decode
@@ -40,7 +39,8 @@ class EpisodeMeta:
 
 
 def blueprint(meta: EpisodeMeta) -> rrb.Blueprint:
-    """Camera, path and summary left; tokens and series over time in the middle; the current decode right. Paused."""
+    """The layout: camera, path and summary on the left; tokens and series over time in the middle; the current decode
+    on the right. Playback is paused."""
     left: list[rrb.View] = [_path(meta), _document("summary", "Episode")]
     shares = [4.0, 3.6]
     if meta.frames:
@@ -80,7 +80,7 @@ def _path(meta: EpisodeMeta) -> rrb.Spatial3DView:
 
 
 def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
-    """One column of views that share the time axis; the shares are about hundreds of pixels."""
+    """A column of views that share the time axis; row shares are roughly hundreds of pixels."""
     lanes = f"Decode mode, and tokens of each chunk; lanes of a step: {', '.join(meta.dofs)}"
     views: list[rrb.View] = [_states(lanes, "/mode", "/tokens/**") if meta.drafted else _states("Decode mode", "/mode")]
     shares = [1.1 + (min(meta.chunk_steps, 5) * (0.3 + 0.25 * len(meta.dofs)) if meta.drafted else 0.0)]
@@ -118,7 +118,7 @@ def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
 
 
 def _always() -> list[rrb.View]:
-    """The series that every method has; they stand where there is room."""
+    """Phases and actions, the series of every method; placed in the middle or right column."""
     return [
         _series("Time by phase per decode, ms", "decode/phases"),
         _series("Actions and gripper opening", "actions", "gripper"),

@@ -1,15 +1,15 @@
-"""EpisodeRecord -> one .rrd file for the Rerun viewer.
+"""Writes an EpisodeRecord as an .rrd file for the Rerun viewer.
 
-Everything is put together in memory and written by one atomic write of our own: Rerun's file sink waits forever on a
-full disk. Timelines: `step` (control steps) and `time` (simulated seconds). Column i of an entity belongs to a control
-step or to the control step at which a decode's actions begin.
+The recording is encoded in memory and written atomically: Rerun's file sink waits forever on a full disk. Timelines:
+`step` (control steps) and `time` (simulated seconds). A row of an entity belongs to a control step, or to a decode, at
+the control step at which its actions begin.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,19 +28,19 @@ from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, acceptance, 
 
 JPEG_QUALITY = 85
 _SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in OUTCOMES.values()}
-_MODE_COLORS = {"ar": 0x6E7B8BFF, "skip": 0xF0E442FF, "expert": 0x4E79A7FF}  # all other modes are names of proposers
+_MODE_COLORS = {"ar": 0x6E7B8BFF, "skip": 0xF0E442FF, "expert": 0x4E79A7FF}  # other modes are names of proposers
 _OTHER_COLORS = (0x0072B2FF, 0xA0522DFF, 0x4C9F70FF, 0xB07AA1FF)
 _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 _CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
 
 Chunks = Sequence[Sequence[TokenOutcome]]
-"""Per decode, what became of each token of its chunk."""
+"""Outcomes of the tokens of each decode's chunk."""
 
 
 @dataclass(frozen=True)
 class Entity:
-    """What one entity of the recording gets."""
+    """The data of one entity of the recording."""
 
     path: str
     static: tuple[rr.AsComponents, ...] = ()
@@ -49,20 +49,17 @@ class Entity:
 
 
 def save_episode(record: EpisodeRecord, path: Path, *, method: str) -> Path:
-    """Writes an episode as a recording that carries its own layout; the file is complete or absent.
+    """Writes an episode as a recording that carries its own layout, atomically -> `path`.
 
     Args:
-        record: frames may be missing; then the recording has no camera.
+        record: without frames, the recording has no camera.
         path: the .rrd file; its folder is created.
         method: name of the method, for the summary; recordings of one method share their layout in the viewer.
-
-    Returns:
-        `path`.
 
     Raises:
         StorageError: the disk is full or read-only, or the folder may not be written to.
     """
-    with catch_and_log_exceptions(strict=True):  # a mistake must raise here, not become a warning and a missing view
+    with catch_and_log_exceptions(strict=True):  # rerun would turn exceptions into warnings and missing views
         content = _encode(record, method)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
@@ -90,7 +87,7 @@ def _encode(record: EpisodeRecord, method: str) -> bytes:
 
 
 def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
-    """What of the episode decides the layout."""
+    """The properties of the episode that decide its layout."""
     low, high = record.path.min(axis=0), record.path.max(axis=0)
     x, y, z = ((low + high) / 2).tolist()
     return EpisodeMeta(
@@ -98,7 +95,6 @@ def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
         dofs=record.space.names,
         frames=bool(record.frames),
         drafted=any(o.kind not in ("target", "scripted", "dropped") for chunk in chunks for o in chunk),
-        verified=any(d.verifications for d in record.decodes),
         threshold=any(_threshold(d) for d in record.decodes),
         signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
         most=max(max(d.forwards, acceptance(d)[0] if d.verifications else 0) for d in record.decodes),
@@ -108,7 +104,7 @@ def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
 
 
 def readable(text: str) -> str:
-    """`text` with `?` for what the viewer's font lacks, on one line: a missing glyph ends the 0.41 viewer's process."""
+    """`text` on one line, with `?` for characters that the viewer's font lacks: they crash the 0.41 viewer."""
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
 
 
@@ -156,7 +152,8 @@ def _jpeg(frame: NDArray[np.uint8]) -> bytes:
 
 
 def _world(record: EpisodeRecord) -> list[Entity]:
-    """The end effector's path: all of it, faint; what lies behind, coloured by the gripper; where it is now."""
+    """The end effector's path: the whole path faintly, the part up to now coloured by gripper opening, and the present
+    position."""
     steps = np.arange(len(record.path), dtype=np.int64)
     opening = np.clip(record.gripper, 0.0, 1.0)[:, None]
     colors = np.round(_OPEN * opening + _CLOSED * (1 - opening)).astype(np.uint8)
@@ -187,7 +184,7 @@ def _actions(record: EpisodeRecord) -> list[Entity]:
 
 
 def _modes(record: EpisodeRecord, starts: NDArray[np.int64]) -> Entity:
-    """The decode mode; only its changes."""
+    """The decode mode over time; a row per change."""
     modes = [d.mode for d in record.decodes]
     changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]
     used = sorted(set(modes))
@@ -200,7 +197,7 @@ def _modes(record: EpisodeRecord, starts: NDArray[np.int64]) -> Entity:
 
 
 def _mode_color(mode: str, place: int) -> int:
-    """0xRRGGBBAA: its own, that of the proposer of that name, or one of those for the others, by its place."""
+    """0xRRGGBBAA of a mode: from the table, of the proposer of that name, else the `place`-th of the other colours."""
     part = parts("proposer").get(mode)
     if mode not in _MODE_COLORS and part is not None and part.colour is not None:
         return part.colour << 8 | 0xFF
@@ -267,7 +264,7 @@ def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) ->
 
 
 def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64]) -> list[Entity]:
-    """Numbers per decode; a decode without the number has no row, a number that no decode has no entity."""
+    """Series of numbers per decode. A decode without a number has no row; a number that no decode has has no entity."""
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
@@ -303,18 +300,19 @@ class Series:
     colors: Sequence[int] | None = None
 
     def entity(self, starts: NDArray[np.int64]) -> Entity:
+        """The entity, with a row for every decode that has values. starts (decodes,): control steps."""
         rows = [i for i, value in enumerate(self.values) if value]
         style = _named(self.names, self.colors, held=True)
         return Entity(self.path, (style,), starts[rows], _rows(np.array([self.values[i] for i in rows])))
 
 
 def _threshold(decode: DecodeRecord) -> tuple[int, ...]:
-    """r per DoF of a decode, in bins; empty where no rule with a threshold ran."""
+    """r per DoF of a decode, in bins; empty without an acceptance rule that has a threshold."""
     return next((r.threshold for r in decode.rounds if r.threshold), ())
 
 
 def _thresholds(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> tuple[list[tuple[int, ...]], list[str]]:
-    """r of every decode, one number per set of DoFs that share it all along, and the sets' names. dofs: D names."""
+    """r of every decode, one number per set of DoFs with equal r in all decodes, and the sets' names. dofs: D names."""
     limits = [_threshold(d) for d in decodes]
     groups: dict[tuple[int, ...], list[int]] = {}  # a DoF's r over the episode -> the DoFs that have it
     for dof in range(len(dofs)):
@@ -326,9 +324,7 @@ def _thresholds(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> tuple[l
 
 
 def _named(names: Sequence[str], colors: Sequence[int] | None = None, held: bool = False) -> rr.SeriesLines:
-    colored = (
-        None if colors is None else np.resize(np.array(colors, dtype=np.uint32), len(names))
-    )  # then from the first
+    colored = None if colors is None else np.resize(np.array(colors, dtype=np.uint32), len(names))  # repeats
     return rr.SeriesLines(names=list(names), colors=colored, interpolation_mode="StepAfter" if held else None)
 
 
@@ -342,8 +338,8 @@ def _markdown(text: str) -> rr.TextDocument:
 
 
 def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
-    """The episode in single values, kept as properties of the recording."""
-    rounds = [r for d in record.decodes for r in d.rounds if r.tree_size > 0 and r.mode != "skip"]
+    """The episode's totals, stored as properties of the recording."""
+    rounds = [r for d in record.decodes for r in d.rounds if r.is_verification]
     facts: dict[str, Any] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
@@ -370,21 +366,25 @@ def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
 def summary(record: EpisodeRecord, method: str) -> str:
     """The episode as Markdown, with the key to the tokens' colours."""
     facts = _facts(record, method)
-    outcome = "SUCCESS" if record.success else "FAILURE"
-    lines = [f"| {facts['task']} | {outcome} |", "|:--|:--|"]
-    lines += [f"| instruction | {facts['instruction']} |"]
-    lines += [f"| method, seed | {facts['method']}, {record.seed} |"]
-    lines.append(f"| control steps | {record.steps} ({record.steps / record.space.control_hz:.2f} s) |")
     modes = [d.mode for d in record.decodes]
-    counts = ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes))
-    lines.append(f"| decodes | {counts} |")
-    lines.append(f"| forwards per step | {facts['forwards_per_step']:.2f} |")
+    rows = {
+        "instruction": facts["instruction"],
+        "method, seed": f"{facts['method']}, {record.seed}",
+        "control steps": f"{record.steps} ({record.steps / record.space.control_hz:.2f} s)",
+        "decodes": ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes)),
+        "forwards per step": f"{facts['forwards_per_step']:.2f}",
+    }
     if "acceptance_length" in facts:
-        lines.append(f"| AL | {facts['acceptance_length']:.2f} |")
-        lines.append(f"| accepted per round | {facts['accepted_per_round']:.2f} |")
-    lines.append(f"| compensated tokens | {facts['compensated_tokens']} |")
-    lines.append(f"| decodes without verification | {facts['skipped_decodes']} |")
-    lines.append(f"| inference per step | {facts['ms_per_step']:.2f} ms |")
-    lines += ["", "| token | what became of it |", "|:--|:--|"]
-    lines += [f"| {style.symbol} {name} | {style.meaning} |" for name, style in OUTCOMES.items()]
-    return "\n".join(lines)
+        rows["AL"] = f"{facts['acceptance_length']:.2f}"
+        rows["accepted per round"] = f"{facts['accepted_per_round']:.2f}"
+    rows["compensated tokens"] = facts["compensated_tokens"]
+    rows["decodes without verification"] = facts["skipped_decodes"]
+    rows["inference per step"] = f"{facts['ms_per_step']:.2f} ms"
+    key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
+    outcome = "SUCCESS" if record.success else "FAILURE"
+    lines = [f"| {facts['task']} | {outcome} |", "|:--|:--|", *_table_rows(rows)]
+    return "\n".join([*lines, "", "| token | outcome |", "|:--|:--|", *_table_rows(key)])
+
+
+def _table_rows(rows: Mapping[str, Any]) -> list[str]:
+    return [f"| {name} | {value} |" for name, value in rows.items()]

@@ -1,4 +1,4 @@
-"""What became of every token of a decode, from its record: colours, symbols and the table that a person reads."""
+"""Outcomes of a decode's tokens, from its record: colours, symbols and a table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from kerv_cli.decoding.record import DecodeRecord, Round
 
 @dataclass(frozen=True)
 class OutcomeStyle:
-    """How an outcome is drawn. Colours tell apart for colour-blind eyes too (Okabe-Ito); the symbol says it again."""
+    """Colour and symbol of a token outcome; the colours are Okabe-Ito's, which colour-blind readers can tell apart."""
 
     symbol: str
     color: int  # 0xRRGGBBAA
@@ -20,8 +20,8 @@ class OutcomeStyle:
 OUTCOMES: dict[str, OutcomeStyle] = {
     "accepted": OutcomeStyle("✓", 0x009E73FF, "draft equal to the target token"),
     "relaxed": OutcomeStyle("≈", 0x7BCB8FFF, "draft off the target token by 1 to r bins, and kept"),
-    "rejected": OutcomeStyle("×", 0xD1321FFF, "draft refused: here the path ended"),
-    "bonus": OutcomeStyle("+", 0x56B4E9FF, "the target token after a wholly accepted draft"),
+    "rejected": OutcomeStyle("×", 0xD1321FFF, "draft refused: the accepted path ends before it"),
+    "bonus": OutcomeStyle("+", 0x56B4E9FF, "the target token behind a wholly accepted draft"),
     "target": OutcomeStyle("·", 0x6E7B8BFF, "decoded by the target without a draft"),
     "compensated": OutcomeStyle("~", 0xE69F00FF, "filled by a prediction instead of the target"),
     "skipped": OutcomeStyle("»", 0xF0E442FF, "executed without a verification"),
@@ -32,7 +32,8 @@ OUTCOMES: dict[str, OutcomeStyle] = {
 
 @dataclass(frozen=True)
 class TokenOutcome:
-    """One place of a chunk. None where there was none: no draft, no target token, no limit, no token known."""
+    """What became of one token of a chunk. Fields are None where there was no draft, target token, limit or known
+    token."""
 
     kind: str  # a key of OUTCOMES
     token: int | None = None  # what was committed
@@ -43,7 +44,7 @@ class TokenOutcome:
 
     @property
     def short(self) -> str:
-        """`draft → target token` where they differ, else the one token that there is; at most 9 characters."""
+        """`draft → target token` where they differ, else the only known token; at most 9 characters."""
         if self.draft is not None and self.target is not None and self.draft != self.target:
             return f"{self.draft} → {self.target}"
         known = next((x for x in (self.draft, self.target, self.token) if x is not None), None)
@@ -60,9 +61,9 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
 
 
 def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome]:
-    """The outcome of each of the `size` tokens of a decode's chunk, in chunk order.
+    """The outcome of each of the chunk's `size` tokens.
 
-    A rejected place stays rejected, whoever filled it later; any other place that was not executed is dropped.
+    A rejected token stays `rejected` even if it was filled later; other tokens that were not executed are `dropped`.
     """
     outcomes: list[TokenOutcome | None] = [None] * size
     for number, played in enumerate(decode.rounds):
@@ -71,7 +72,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
             if before is None or before.kind != "rejected":
                 outcomes[place] = outcome
     executed = len(decode.actions) * dofs
-    for place in range(max(0, executed - decode.compensated), executed):  # the prediction fills up the last steps
+    for place in range(max(0, executed - decode.compensated), executed):  # predictions fill the last executed tokens
         before = outcomes[place]
         if before is None or before.kind != "rejected":
             outcomes[place] = TokenOutcome("compensated")
@@ -99,7 +100,7 @@ def _outcomes_of_round(played: Round, number: int) -> list[tuple[int, TokenOutco
 
 
 def _settled(outcome: TokenOutcome | None, decode: DecodeRecord, place: int, executed: bool) -> TokenOutcome:
-    """The outcome with its committed token, once it is known which control steps were executed."""
+    """The outcome with its committed token, given whether its control step was executed."""
     token = decode.tokens[place] if place < len(decode.tokens) else None
     if outcome is None:
         outcome = TokenOutcome(_unjudged(decode))
@@ -108,7 +109,7 @@ def _settled(outcome: TokenOutcome | None, decode: DecodeRecord, place: int, exe
 
 
 def _unjudged(decode: DecodeRecord) -> str:
-    """What a place is that no round of the decode tells about."""
+    """Outcome of a token that is in no round of the decode."""
     if not decode.skipped and not decode.rounds and not decode.tokens:
         return "scripted"
     return "skipped" if decode.skipped or not decode.forwards else "target"
@@ -117,7 +118,7 @@ def _unjudged(decode: DecodeRecord) -> str:
 def decode_table(
     decode: DecodeRecord, number: int, step: int, outcomes: Sequence[TokenOutcome], names: Sequence[str]
 ) -> str:
-    """A decode as Markdown: one line about it and a row per token. names: of the D DoFs."""
+    """A decode as Markdown: a line of totals and a row per token. names: of the D DoFs."""
     lines = [
         f"**Decode {number} at step {step}: {decode.mode}**  ",
         decode_line(decode),
@@ -153,7 +154,7 @@ def decode_line(decode: DecodeRecord) -> str:
 
 def acceptance(decode: DecodeRecord) -> tuple[float, float]:
     """AL (tokens committed per verification) and accepted per round (docs/methods.md §7) of a decode that verified."""
-    rounds = [r for r in decode.rounds if r.tree_size > 0 and r.mode != "skip"]
+    rounds = [r for r in decode.rounds if r.is_verification]
     return sum(r.committed for r in rounds) / len(rounds), sum(r.accepted for r in rounds) / len(rounds)
 
 

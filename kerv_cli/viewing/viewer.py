@@ -1,4 +1,4 @@
-"""Find, check, read back and open recordings. Rerun is imported only where a file is read."""
+"""Finds, checks, reads and opens recordings. Rerun is imported only where a file is read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rerun.chunk import RrdReader
 
 MOST_OPENED = 16
-"""Recordings that one command opens; more fill the viewer's memory and nobody's eyes."""
+"""Largest number of recordings that one command opens; more would fill the viewer's memory."""
 _START_SECONDS = 2.0
 _TIMELINES = ("step", "time")
 
@@ -28,7 +28,7 @@ def find_recordings(places: Sequence[Path]) -> list[Path]:
     """The .rrd files among and below `places`, the newest first.
 
     Raises:
-        UsageError: a place does not exist or is no recording, or there is none below them.
+        UsageError: a place does not exist or is not a recording, or no recording was found.
     """
     found: dict[Path, float] = {}
     for place in (Path(p).expanduser() for p in places):
@@ -54,13 +54,13 @@ def has_display() -> bool:
 
 
 def open_recording(paths: Sequence[Path]) -> str:
-    """Opens recordings in the Rerun viewer and comes back; without a display, says what to type.
+    """Opens recordings in the Rerun viewer without waiting for it; without a display, names the commands that do.
 
     Args:
         paths: recordings, the newest first; at most MOST_OPENED are opened.
 
     Returns:
-        What was done, or the commands to type, for a person.
+        A sentence about what was opened, or the commands to type.
 
     Raises:
         UsageError: no paths.
@@ -80,7 +80,7 @@ def open_recording(paths: Sequence[Path]) -> str:
 
 
 def viewer_command() -> list[str]:
-    """How to call the viewer that belongs to this Python."""
+    """The command of the viewer, preferably the one installed beside this Python."""
     beside = Path(sys.executable).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
     if beside.is_file():
         return [str(beside)]
@@ -104,7 +104,7 @@ def _instructions(paths: Sequence[Path], more: str) -> str:
 
 
 def _start(command: list[str]) -> None:
-    """Starts the viewer on its own; one that ends at once with an error becomes one line."""
+    """Starts the viewer as a process of its own. KervError: it exited at once, with its last line."""
     with tempfile.TemporaryFile() as log:
         try:
             viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
@@ -113,7 +113,7 @@ def _start(command: list[str]) -> None:
         try:
             status = viewer.wait(timeout=_START_SECONDS)
         except subprocess.TimeoutExpired:
-            viewer.returncode = 0  # it runs on after us: not a process that was forgotten
+            viewer.returncode = 0  # it outlives this process: Popen must not warn of it
             return
         if status:
             log.seek(0)
@@ -122,7 +122,7 @@ def _start(command: list[str]) -> None:
 
 
 def read_back(path: Path) -> dict[str, Any]:
-    """What a recording holds, read chunk by chunk.
+    """The contents of a recording, read chunk by chunk.
 
     Returns:
         `application`, `recording` (ids), `name`, `bytes`, `blueprint` (whether it carries a layout), `episode` (the
@@ -165,7 +165,7 @@ def read_back(path: Path) -> dict[str, Any]:
 
 
 def read_summary(path: Path) -> str:
-    """`read_back` for a person. Raises KervError as it does."""
+    """`read_back` as text; errors as there."""
     found = read_back(path)
     lines = [f"{path}: {found['name'] or found['recording']}, {found['bytes'] / 1e6:.2f} MB"]
     if "step" in found["timelines"]:
@@ -182,11 +182,11 @@ def _figure(value: Any) -> str:
 
 
 def _checked(path: Path) -> RrdReader:
-    """A reader of a recording whose frame is whole: header, footer, at least one recording."""
+    """A reader of the recording, after checking header, footer and that it holds a recording."""
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns of a missing footer and then raises, or does not
+        warnings.simplefilter("ignore")  # of a missing footer, which may also raise
         try:
             reader = RrdReader(path)
             recordings = reader.recordings()

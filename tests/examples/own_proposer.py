@@ -40,6 +40,5 @@ register(
         check,
         colour=0x7A9E2F,
         traits={"when": PREFILL, "chains": True},
-        about="the token that most often followed: an example",
     )
 )

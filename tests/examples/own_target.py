@@ -86,4 +86,4 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     return MockTarget(description.actions, description.chunk)
 
 
-register(Part("target", "mock", "examples.own_target:build", about="random sums: an example"))
+register(Part("target", "mock", "examples.own_target:build"))

@@ -36,4 +36,4 @@ def build(options: ThreadOptions, slots: int, threads: int, folder: Path) -> Thr
     return Threads(slots, options.name)
 
 
-register(Part("executor", "threads", "thread_executor:build", settings=ThreadOptions, about="threads of this process"))
+register(Part("executor", "threads", "thread_executor:build", settings=ThreadOptions))

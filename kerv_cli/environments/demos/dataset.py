@@ -15,12 +15,12 @@ from kerv_cli.manifests import read
 from kerv_cli.spaces import ActionSpace, ObservationSpace
 
 FORMAT = 2
-"""Of manifests. Format 1 did not name the environment, since there was only Meta-World."""
+"""Format of manifests. Format 1 did not name the environment, because Meta-World was the only one."""
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """What the manifest tells of one episode; `steps` are control steps up to the success, `sha256` is the file's."""
+    """One episode's entry in the manifest. steps: control steps up to the success. bytes, sha256: of its file."""
 
     seed: int
     perturbed: bool
@@ -40,11 +40,11 @@ class TaskEntry:
 
 @dataclass(frozen=True)
 class DemoManifest:
-    """What `kerv demos` recorded.
+    """The manifest that `kerv demos` writes.
 
-    environment, actions, observation: of the tasks' environment. config: the fields of DemoConfig but for the workers.
+    environment, actions, observation: of the tasks' environment. config: the fields of DemoConfig without the workers.
     versions: of the packages that the physics and the frames depend on. sha256: over the hashes of all episode files.
-    seeds: the first and the last. missing: episodes that were asked for and whose experts failed.
+    seeds: the first and the last. missing: how many of the requested episodes failed.
     """
 
     format: int
@@ -61,7 +61,7 @@ class DemoManifest:
 
 
 def with_environment(value: Mapping[str, Any]) -> dict[str, Any]:
-    """A recording's or a manifest's JSON in today's format: one of format 1 is of Meta-World."""
+    """The JSON of a recording or manifest in the present format. One of format 1 is of Meta-World."""
     if value["format"] != 1:
         return dict(value)
     from kerv_cli.environments.metaworld.spec import SPEC
@@ -71,12 +71,12 @@ def with_environment(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def episode_path(out: Path, task: str, seed: int) -> Path:
-    """Where an episode lies within a dataset's folder."""
+    """File of an episode within the dataset's folder `out`."""
     return Path(out) / "episodes" / task / f"{seed:06d}.safetensors"
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Hex hash over the episode files' hashes, for the JSON of a manifest's `tasks`."""
+    """Hex SHA-256 over the hashes of the episode files; tasks: as in a manifest's JSON."""
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
         for episode in summary["episodes"]:
@@ -113,7 +113,7 @@ class DemoDataset:
 
     @classmethod
     def open(cls, path: Path) -> DemoDataset:
-        """Opens a dataset and checks that its episode files are there in full size; contents are checked by `load`.
+        """Opens a dataset and checks that its episode files exist in full size; `load` checks their contents.
 
         Raises:
             CheckpointError: no dataset there, its recording was not finished, or it is damaged.
@@ -135,7 +135,7 @@ class DemoDataset:
         return cls(path, manifest, entries)
 
     def load(self, index: int) -> DemoEpisode:
-        """Reads episode `index` of `episodes`.
+        """Reads the episode of entry `index` of `episodes`.
 
         Raises:
             CheckpointError: the file changed since it was recorded.

@@ -19,8 +19,8 @@ from kerv_cli.files import atomic_path
 from kerv_cli.spaces import ActionSpace, ObservationSpace
 
 FORMAT = 1
-"""Of episode files."""
-_INITIAL_STATE = "rand_vec"  # the tensor's name in files: format 1 took it from Meta-World
+"""Format of episode files."""
+_INITIAL_STATE = "rand_vec"  # name of the tensor in format 1, taken from Meta-World
 _LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
 
 
@@ -29,14 +29,14 @@ class DemoEpisode:
     """One successful episode of T control steps (up to and including the first success).
 
     Attributes:
-        task, seed, perturbed: which episode, and whether its execution was noisy.
+        task, seed: of the episode. perturbed: whether its execution was noisy.
         steps: T.
         frames: (n, size, size, 3) uint8, the frames before the actions of `frame_steps`.
         frame_steps: (n,) int64.
         states: (T, s) float32, privileged state before each action; it begins with the proprioception.
         labels: (T + tail, D) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
         executed: (T, D) float32, the actions that moved the robot.
-        initial_state: (n,) float64, what distinguishes the episode's start from others, e.g. object and goal placement.
+        initial_state: (n,) float64, as `World.initial_state`, e.g. object and goal placement.
     """
 
     task: str
@@ -52,7 +52,7 @@ class DemoEpisode:
 
     @property
     def end_effector(self) -> NDArray[np.float32]:
-        """(T, 3) float32: its position in metres before each action."""
+        """(T, 3) float32: position of the end effector before each action, metres."""
         return self.states[:, :3]
 
 
@@ -60,7 +60,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
     """Writes one episode, atomically; frames as PNG bytes, end to end, with n + 1 offsets.
 
     Raises:
-        StorageError: the disk refused.
+        StorageError: writing failed.
     """
     from safetensors.numpy import save
 
@@ -89,10 +89,8 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
-    """The same safetensors bytes with the metadata's keys in order.
-
-    safetensors writes them in random order, and two recordings of one episode would differ in their hash.
-    """
+    """The same safetensors bytes with the metadata's keys in order. safetensors writes them in random order, so that
+    the files of two recordings of one episode would have different hashes."""
     start = _LENGTH.size + _LENGTH.unpack_from(data)[0]
     header = json.loads(data[_LENGTH.size : start])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
@@ -102,7 +100,7 @@ def _with_sorted_metadata(data: bytes) -> bytes:
 
 
 def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace) -> DemoEpisode:
-    """Reads one episode of an environment with these spaces.
+    """Reads one episode of an environment that has these spaces.
 
     Raises:
         CheckpointError: the file is missing, damaged, of another format or of other spaces.
@@ -128,11 +126,8 @@ def _episode_from(
     steps = int(metadata["steps"])
     if arrays["states"].shape != (steps, state) or arrays["executed"].shape != (steps, dofs):
         raise ValueError(f"the arrays do not hold {steps} steps of {state} state numbers and {dofs} DoFs")
-    if (
-        len(arrays["labels"]) < steps
-        or arrays["labels"].shape[1:] != (dofs,)
-        or len(arrays["frame_steps"]) != len(frames)
-    ):
+    labels = arrays["labels"]
+    if len(labels) < steps or labels.shape[1:] != (dofs,) or len(arrays["frame_steps"]) != len(frames):
         raise ValueError("labels or frames are too few")
     return DemoEpisode(
         task=metadata["task"],
@@ -142,7 +137,7 @@ def _episode_from(
         frames=np.stack(frames),
         frame_steps=arrays["frame_steps"],
         states=arrays["states"],
-        labels=arrays["labels"],
+        labels=labels,
         executed=arrays["executed"],
         initial_state=arrays[_INITIAL_STATE],
     )

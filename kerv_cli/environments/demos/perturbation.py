@@ -1,4 +1,4 @@
-"""Noise on what an expert executes, so that demonstrations visit states beside its path."""
+"""Noise on the actions that an expert executes, so that demonstrations visit states off its path."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ _BURST_STEPS = (3, 8)
 
 
 def is_perturbed(seed: int, fraction: float) -> bool:
-    """Whether the episode of this seed is executed with noise: spreads `fraction` evenly over consecutive seeds."""
+    """Whether the episode of this seed is executed with noise; the `fraction` of such seeds is spread evenly."""
     return int((seed + 1) * fraction) > int(seed * fraction)
 
 
 class Perturbation:
-    """One episode's noise: Gaussian, now and then a burst in one direction. Strict DoFs, e.g. a gripper, stay clean.
+    """One episode's noise: Gaussian, sometimes a burst in one random direction. Strict DoFs, e.g. a gripper, stay
+    clean.
 
     Attributes:
         sigma: standard deviation of the Gaussian, drawn once; half of a DoF's range is 1.
@@ -25,11 +26,11 @@ class Perturbation:
     def __init__(
         self, task: str, seed: int, space: ActionSpace, noise: tuple[float, float], burst_probability: float
     ) -> None:
-        """Fixed by task and seed.
+        """The noise is a function of task and seed.
 
         Args:
-            task, seed: the episode.
-            space: whose actions are perturbed.
+            task, seed: of the episode.
+            space: of the actions that are perturbed.
             noise: (low, high) range of sigma.
             burst_probability: chance per step that a burst of 3 to 8 steps starts.
         """

@@ -1,10 +1,10 @@
 """Demonstrations: scripted experts, recorded to disk with clean labels, and read back.
 
-Half of the episodes (by default) are executed with noise, so that states beside the expert's path are visited; the
-labels are the clean expert's actions at the visited states all the same. Only successful episodes are kept.
+By default half of the episodes are executed with noise, so that they visit states off the expert's path; their labels
+are still the expert's clean actions at those states. Only successful episodes are kept.
 
-On disk: `recording.json` (what is being recorded), `episodes/<task>/<seed:06d>.safetensors`,
-`failed/<task>/<seed:06d>.json` and, when all is done, `manifest.json`.
+On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:06d>.safetensors`,
+`failed/<task>/<seed:06d>.json` and, when the recording is complete, `manifest.json`.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ _EXTRA_ATTEMPTS = 20
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What to record.
+    """The configuration of a recording.
 
     Attributes:
         tasks: tasks and suites of one environment.
         episodes: successful episodes per task.
         first_seed: seeds start here, per task; seeds for selection and evaluation are refused.
-        perturbed: fraction of episodes executed with noise; which ones follows from the seed.
+        perturbed: fraction of episodes executed with noise; `is_perturbed` says which.
         noise_low, noise_high: range of the Gaussian noise's standard deviation on the DoFs that are not strict, drawn
             once per episode; half of a DoF's range is 1.
         burst_probability: chance per step that a burst starts: 3 to 8 steps in one random direction.
-        camera: the frames' view; the environment's first camera unless it is named.
+        camera: view of the frames; the environment's first camera where none is named.
         frame_stride: control steps per recorded frame.
         tail: labels recorded beyond success, so that an action chunk that starts near the end has true labels.
-        workers: processes; changes nothing in the result.
+        workers: processes; the result does not depend on them.
         horizon: control steps within which the expert must succeed; 0: the environment's.
     """
 
@@ -100,10 +100,8 @@ class DemoConfig:
 
 
 def run_expert(world: World, seed: int, config: DemoConfig) -> DemoEpisode | None:
-    """Runs one episode; None when the expert did not succeed within the horizon.
-
-    An episode also counts as failed when its tail would not fit the steps that the simulator runs.
-    """
+    """Runs one episode; None when the expert did not succeed within the horizon, or so late that the simulator's own
+    horizon leaves no room for the tail."""
     expert = world.spec.expert(world.task)
     perturbed = is_perturbed(seed, config.perturbed)
     noise = (config.noise_low, config.noise_high)
@@ -148,24 +146,24 @@ def _tail_labels(world: World, expert: Expert, observation: Observation, tail: i
 
 
 def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None = None) -> DemoManifest:
-    """Records demonstrations into the folder `out`; a killed run goes on where it stopped.
+    """Records demonstrations into the folder `out`; an interrupted recording resumes.
 
     A seed whose expert fails is replaced by the next one beyond the range, up to `config.seed_limit`. Which episodes
     come out does not depend on the number of workers.
 
     Args:
-        config: what to record.
+        config: of the recording.
         out: the dataset's folder.
         on_progress: called with (episodes done, episodes wanted).
 
     Returns:
-        The manifest, as written to `out/manifest.json`. Where a task's expert failed too often, fewer episodes than
-        requested are kept, and the manifest's `missing` says how many are not there.
+        The manifest, as written to `out/manifest.json`. Where an expert failed too often, its `missing` is the number
+        of requested episodes that could not be recorded.
 
     Raises:
         UsageError: `out` holds demonstrations of another configuration.
         RenderingUnavailable: no frame can be drawn here.
-        StorageError: the disk refused.
+        StorageError: writing failed.
         KervError: a task's expert never succeeded.
     """
     out = Path(out)
@@ -210,7 +208,7 @@ def _jobs(wanted: Mapping[str, range]) -> list[tuple[str, range]]:
 
 
 def _next_seeds(config: DemoConfig, kept: int, tried: range) -> range:
-    # One new seed per failure, in order: the outcome does not depend on how the work was divided.
+    # One new seed per failure, in order: the outcome does not depend on how the work is divided.
     return range(tried.stop, min(tried.stop + config.episodes - kept, config.seed_limit))
 
 
@@ -249,7 +247,7 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
 
 
 def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[str, Any]:
-    # Another Python or numpy may go on with a recording; another simulator would be another world.
+    # Another Python or numpy may resume a recording; another simulator version may have other physics.
     identity = json.loads(json.dumps(with_environment(identity)))
     same = ("environment", "format", "actions", "observation")
     versions = {name: identity["versions"].get(name) for name in packages}
@@ -275,7 +273,7 @@ _world: World | None = None
 
 
 def _record_seeds(config: DemoConfig, out: Path, task: str, seeds: Sequence[int]) -> tuple[str, _Outcomes]:
-    """In a worker: brings each seed's outcome to disk, unless it is there already."""
+    """Runs in a worker: records each seed that has no file yet."""
     return task, {seed: _record_seed(config, out, task, seed) for seed in seeds}
 
 

@@ -10,17 +10,17 @@ from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.spaces import Observation
 
 HOVER = 0.03
-"""Metres above mouth or grasp at which the hand waits until it is aligned."""
-_LOW = 0.004  # metres above the mouth where a peg that is nearly aligned waits for its moment
-_DEPTH = 0.045  # metres below the mouth that the tip is sent to
-_NEAR, _ALIGNED = 0.003, 0.06  # metres and radians: aligned with the slot
-_GRASP_NEAR, _GRASP_ALIGNED = 0.009, 0.2  # and with the peg
+"""Metres above the slot's mouth or the grasp at which the hand waits until it is aligned."""
+_LOW = 0.004  # metres above the mouth at which a nearly aligned peg waits
+_DEPTH = 0.045  # metres below the mouth: where the tip should go
+_NEAR, _ALIGNED = 0.003, 0.06  # metres and radians within which the peg is aligned with the slot
+_GRASP_NEAR, _GRASP_ALIGNED = 0.009, 0.2  # the same for the hand and the grasp
 _HELD_NEAR = 0.015  # metres from the grasp within which closed fingers hold the peg
-_GAIN = 0.6  # of the remaining way per control step
+_GAIN = 0.6  # share of the remaining way per control step
 
 
 class InsertionExpert:
-    """Turns and moves the hand so that the peg comes over the slot, aligned, and then along the slot's axis."""
+    """Grasps the peg, moves it over the slot until it is aligned, then along the slot's axis."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
         """Raises UnknownName for a task that does not exist."""
@@ -28,7 +28,7 @@ class InsertionExpert:
         self._low, self._high = np.array(spec.actions.low), np.array(spec.actions.high)
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """The action (7,) for the whole state (19,), within the limits."""
+        """The action (7,) within the limits, from the privileged state (19,)."""
         state = observation.state
         hand, opening = Pose.of(state[:3], state[3:6]), float(state[6])
         peg, slot = Pose.of(state[7:10], state[16:19]), Pose.of(state[10:13], state[13:16])
@@ -51,11 +51,11 @@ class InsertionExpert:
 
 
 def _next_peg(peg: Pose, slot: Pose) -> Pose:
-    """Where the peg should go now: over the mouth until it is aligned, then into the slot."""
+    """The next pose of the peg: over the mouth until it is aligned, then in the slot."""
     depth, sideways, askew = misfit(peg, slot)
     off = max(sideways / _NEAR, askew / _ALIGNED)
     if off < (3.0 if depth > 0.002 else 1.0):  # the slot guides a peg that is in it
         return slot.along(PEG_HALF - _DEPTH)
-    if depth > -HOVER / 2 and sideways > 5 * _NEAR:  # low and beside the mouth: up first, as it lies
+    if depth > -HOVER / 2 and sideways > 5 * _NEAR:  # low and beside the mouth: up first, without turning
         return Pose(peg.position + np.array([0.0, 0.0, HOVER]), peg.quaternion)
     return slot.along(PEG_HALF + (_LOW if off < 4.0 else HOVER))

@@ -1,4 +1,4 @@
-"""Poses of the insertion world: a position in metres and a rotation."""
+"""Poses of the insertion world: a position in metres and a rotation, as quaternion (w, x, y, z)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from kerv_cli.environments.camera import load_mujoco
 
-load_mujoco()  # before mujoco is imported, which chooses its GL backend then
+load_mujoco()  # chooses the GL backend, which mujoco reads when it is imported
 import mujoco  # noqa: E402
 
 Array = NDArray[np.float64]
 
 GRASP = 0.025
-"""Metres from the peg's centre up its axis to where the hand holds it."""
+"""Metres from the peg's centre up its axis to the grasp, where the hand holds it."""
 PEG_HALF = 0.04
 """Half of the peg's length, metres."""
 
@@ -38,19 +38,19 @@ def vector_of(quaternion: Array) -> Array:
 
 
 def product(first: Array, second: Array) -> Array:
-    """The rotation `second`, then `first`; quaternions."""
+    """Quaternion (4,) of the rotation `second` followed by `first`."""
     found = np.zeros(4)
     mujoco.mju_mulQuat(found, first, second)
     return found
 
 
 def inverse(quaternion: Array) -> Array:
-    """The rotation back."""
+    """Quaternion (4,) of the opposite rotation."""
     return quaternion * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def rotated(quaternion: Array, vector: Array) -> Array:
-    """The vector (3,), turned."""
+    """The vector (3,) rotated by the quaternion."""
     found = np.zeros(3)
     mujoco.mju_rotVecQuat(found, vector, quaternion)
     return found
@@ -58,7 +58,7 @@ def rotated(quaternion: Array, vector: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """position (3,) metres and quaternion (w, x, y, z), in the world."""
+    """position (3,) in metres and quaternion (w, x, y, z), in the world's axes."""
 
     position: Array
     quaternion: Array
@@ -75,11 +75,11 @@ class Pose:
 
     @property
     def angle(self) -> float:
-        """How far it is turned, radians."""
+        """Angle of the rotation, radians."""
         return float(np.linalg.norm(self.vector))
 
     def along(self, distance: float) -> Pose:
-        """The pose moved along its own z axis, metres."""
+        """The pose moved by `distance` metres along its own z axis."""
         return Pose(self.position + rotated(self.quaternion, np.array([0.0, 0.0, distance])), self.quaternion)
 
     def seen_from(self, other: Pose) -> Pose:
@@ -94,19 +94,19 @@ class Pose:
 
 
 def turn_between(start: Pose, end: Pose) -> Array:
-    """The rotation vector in the world's axes that turns `start` like `end`, radians."""
+    """Rotation vector (3,) in the world's axes from the rotation of `start` to that of `end`, radians."""
     return vector_of(product(end.quaternion, inverse(start.quaternion)))
 
 
 def misfit(peg: Pose, slot: Pose) -> tuple[float, float, float]:
-    """How a peg lies in a slot: depth of its tip below the mouth and distance of its centre from the slot's axis, in
-    metres; angle between the two, radians."""
+    """A peg's pose relative to a slot: depth of its tip below the mouth and distance of its centre from the slot's
+    axis, metres; angle between the two, radians."""
     centre = peg.seen_from(slot)
     depth = -float(centre.along(-PEG_HALF).position[2])
     return depth, float(np.hypot(*centre.position[:2])), centre.angle
 
 
 def limited(vector: Array, most: float) -> Array:
-    """The vector, no longer than `most`."""
+    """The vector, shortened to length `most` if it is longer."""
     length = float(np.linalg.norm(vector))
     return vector if length <= most else vector * (most / length)

@@ -1,12 +1,13 @@
-"""Insertion: a free-flying gripper with OpenVLA's seven degrees of freedom, a flat peg and a slot that it fits one way.
+"""Insertion: a free-flying gripper with OpenVLA's seven degrees of freedom, and a flat peg that fits a slot one way
+only.
 
-Small on purpose: it shows that nothing of Meta-World is built into kerv, and its tasks need rotation.
+It is a small second environment beside Meta-World, with other spaces and with tasks that need rotation.
 """
 
 from __future__ import annotations
 
 from kerv_cli.environments.insertion.tasks import DIFFICULTIES, SUITES, TASKS
-from kerv_cli.environments.spec import EnvironmentSpec, Seeds
+from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.spaces import ActionSpace, Group, ObservationSpace, Place
 
 SPEC = EnvironmentSpec(
@@ -34,7 +35,6 @@ SPEC = EnvironmentSpec(
     difficulties=DIFFICULTIES,
     horizon=120,
     cameras=("front", "top", "wrist"),
-    seeds=Seeds(training=range(50_000), selection=range(50_000, 100_000), evaluation=range(100_000, 2**31)),
     world_class="kerv_cli.environments.insertion.world:InsertionWorld",
     expert_class="kerv_cli.environments.insertion.expert:InsertionExpert",
     packages=("mujoco",),

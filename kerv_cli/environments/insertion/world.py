@@ -1,7 +1,7 @@
 """The insertion simulator: a small MuJoCo model whose hand is pulled to a wanted pose.
 
-The gripper holds by a constraint rather than by friction: it is switched on when the fingers close around the peg's
-upper half. So one control step stays below 0.3 ms, and the physics that matters, peg against slot, is contact.
+The gripper holds the peg by a constraint instead of friction; the constraint is active while the fingers are closed
+around the peg's upper half. A control step so takes less than 0.3 ms; peg and slot interact by contact.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from kerv_cli.environments.world import MujocoWorld
 INSERTED = 0.03
 """Metres that the tip must be below the mouth."""
 LEAD, TURN_LEAD = 0.03, 0.25
-"""The wanted pose runs at most so far ahead of the hand, metres and radians: a blocked hand winds nothing up."""
+"""Largest lead of the wanted pose over the hand, metres and radians, so that a blocked hand builds up no force."""
 _WORKSPACE = np.array([[-0.25, -0.25, 0.02], [0.25, 0.25, 0.35]])  # metres, of the hand
 _CLOSING = 0.34  # of the opening, per control step
 _HOLDS = 0.5  # opening below which the fingers touch the peg
 _REACH, _REACH_ANGLE = 0.012, 0.25  # metres and radians from the grasp within which closing holds the peg
 _SIDEWAYS, _ASKEW = 0.006, 0.15  # metres and radians that an inserted peg may be off
-_FINGER = 0.023, 0.012  # metres: the fingers' distance from the middle when closed, and what opening adds
+_FINGER = 0.023, 0.012  # metres: the fingers' distance from the middle when closed, and the added one when open
 
 
 class InsertionWorld(MujocoWorld):
@@ -74,7 +74,7 @@ class InsertionWorld(MujocoWorld):
         return self._state()
 
     def _hold(self) -> None:
-        """Fixes the peg to the hand as it lies now."""
+        """Fixes the peg to the hand in its present pose."""
         relative = self._peg.seen_from(self._hand)
         self._model.eq_data[0, :3] = 0.0  # the weld's point, in the peg
         self._model.eq_data[0, 3:10] = np.concatenate([relative.position, relative.quaternion])
@@ -93,7 +93,7 @@ class InsertionWorld(MujocoWorld):
         return Pose(self._data.mocap_pos[0].copy(), self._data.mocap_quat[0].copy())
 
     def _state(self) -> NDArray[np.float64]:
-        """(19,) as the spec says."""
+        """The privileged state (19,), laid out as in `spec.py`."""
         hand, peg, slot = self._hand, self._peg, self._slot
         felt = [hand.position, hand.vector, [self._opening]]
         return np.concatenate([*felt, peg.position, slot.position, slot.vector, peg.vector])
@@ -116,7 +116,7 @@ class InsertionWorld(MujocoWorld):
         return Pose(np.clip(position, *_WORKSPACE), product(turn, hand.quaternion))
 
     def _grip(self, wanted: float, hand: Pose) -> None:
-        """Opens or closes the fingers; closing around the peg holds it, opening lets it go."""
+        """Moves the fingers towards the opening `wanted`; closing around the peg holds it, opening releases it."""
         before = self._opening
         self._opening += float(np.clip(wanted - before, -_CLOSING, _CLOSING))
         if self._opening >= _HOLDS:
@@ -127,8 +127,8 @@ class InsertionWorld(MujocoWorld):
                 self._hold()
 
     def _drawable(self) -> tuple[Any, Any]:
-        # A step leaves poses as they were before its last substep. The next step computes them anew: drawing changes
-        # nothing of the physics.
+        # A step leaves poses as they were before its last substep. The next step computes them anew, so drawing does
+        # not change the physics.
         for name, side in (("left", 1.0), ("right", -1.0)):
             self._model.geom(name).pos[0] = side * (_FINGER[0] + _FINGER[1] * self._opening)
         mujoco.mj_kinematics(self._model, self._data)
@@ -136,12 +136,14 @@ class InsertionWorld(MujocoWorld):
         return self._model, self._data
 
     def close(self) -> None:
+        """As `World.close`."""
         super().close()
         self._model = self._data = None
 
 
 def place(task: str, random: np.random.Generator) -> tuple[Pose, Pose, Pose]:
-    """Slot, peg and hand at the start of an episode. The slot is always turned too far for a peg that is not."""
+    """Poses of slot, peg and hand at the start of an episode. The slot is always turned, too far for an unturned
+    peg."""
     yaw = random.choice([-1.0, 1.0]) * random.uniform(0.35, 1.0)
     if task == "insert-peg":
         tilt = quaternion_of(np.array([*random.uniform(-0.2, 0.2, 2), 0.0]))

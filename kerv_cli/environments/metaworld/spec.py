@@ -1,9 +1,9 @@
-"""Meta-World v3: all numbers of it that anything else needs."""
+"""The specification of Meta-World v3."""
 
 from __future__ import annotations
 
 from kerv_cli.environments.metaworld.tasks import DIFFICULTIES, SUFFIX, SUITES, TASKS
-from kerv_cli.environments.spec import EnvironmentSpec, Seeds
+from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.spaces import ActionSpace, Group, ObservationSpace, Place
 
 _OBJECTS = 18  # numbers of a time step: hand xyz, gripper opening, then position and rotation of two objects
@@ -32,11 +32,10 @@ SPEC = EnvironmentSpec(
     tasks=TASKS,
     suites=SUITES,
     difficulties=DIFFICULTIES,
-    horizon=500,  # the simulator refuses the step after
-    # corner4 is the literature's view
+    horizon=500,  # the simulator raises at step 501
+    # corner4 is the view that publications use
     cameras=("corner4", "corner", "corner2", "corner3", "topview", "behindGripper", "gripperPOV"),
     upside_down=("corner", "corner2", "corner3", "corner4"),
-    seeds=Seeds(training=range(50_000), selection=range(50_000, 100_000), evaluation=range(100_000, 2**31)),
     world_class="kerv_cli.environments.metaworld.world:MetaWorld",
     expert_class="kerv_cli.environments.metaworld.world:MetaWorldExpert",
     suffix=SUFFIX,

@@ -11,11 +11,11 @@ from kerv_cli.environments.spec import Task
 
 SUFFIX = "-v3"
 DIFFICULTIES = ("easy", "medium", "hard", "very_hard")
-"""The groups that published macro averages use."""
+"""The groups of published macro averages."""
 
 
-# Lower-case words, ten at most, by stem of the task's name. The public table has one sentence for push and push-back;
-# these 50 are distinct, and say what the experts do.
+# Difficulty -> task name without suffix -> instruction: at most ten lower-case words. The public table has one sentence
+# for push and push-back; these 50 are distinct and describe what the experts do.
 _INSTRUCTIONS: dict[str, dict[str, str]] = {
     "easy": {
         "button-press": "press the button",

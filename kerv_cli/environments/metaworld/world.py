@@ -1,7 +1,7 @@
-"""One Meta-World task behind the World protocol: paired resets, control steps, scripted experts.
+"""Meta-World tasks behind the World protocol, and their scripted experts.
 
-What the simulator does and does not promise is written down from measurements: `env.reset(seed=...)` is ignored there,
-so an episode is a task's `rand_vec` (object and goal placement), taken from `MT1(task, seed // 50)`.
+Meta-World ignores `env.reset(seed=...)`. An episode is defined by its initial state (object and goal placement,
+Meta-World's `rand_vec`), taken from `MT1(task, seed // 50)`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
 
 @contextlib.contextmanager
 def _quiet_simulator() -> Any:
-    # One warning per two expert steps about a range that the world clips anyway.
+    # The experts warn in every second step about a range that the world clips anyway.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
         yield
@@ -51,7 +51,7 @@ class MetaWorld(MujocoWorld):
 
     @property
     def initial_state(self) -> NDArray[np.float64]:
-        """(3,) or (6,) float64: object and goal placement of this episode, all that distinguishes it from others."""
+        """(3,) or (6,) float64: object and goal placement of this episode, metres."""
         self.observation  # noqa: B018 - raises before the first reset
         return np.array(self._env._last_rand_vec, dtype=np.float64)
 
@@ -69,7 +69,7 @@ class MetaWorld(MujocoWorld):
 
     def _drawable(self) -> tuple[Any, Any]:
         # After a reset the bodies' poses are stale in some tasks (window-close: the window is off by 0.2 m) until the
-        # first step. They are recomputed in a copy: the physics must not depend on whether a frame was drawn.
+        # first step. They are recomputed in a copy, because the physics must not depend on whether a frame is drawn.
         model, data = self._env.model, self._env.data
         if self.steps == 0:
             import mujoco
@@ -79,6 +79,7 @@ class MetaWorld(MujocoWorld):
         return model, data
 
     def close(self) -> None:
+        """As `World.close`."""
         super().close()
         if self._env is not None:
             self._env.close()

@@ -1,8 +1,8 @@
-"""Where blocks run: on this machine, on a cluster. An executor is a registered part; nothing heavy is imported here.
+"""Executors run blocks, on this machine or on a cluster. Each is a registered part; nothing heavy is imported here.
 
 A new one is a class with the three members of `Executor` and a `build(options, slots, threads, folder)` that returns
-it: `options` its registered settings, filled from `runtime.executor_options`; `slots` is `runtime.workers`; `threads`
-what torch and its libraries may use in each process; `folder` a place for files of its own, not yet created.
+it. options: its registered settings, filled from `runtime.executor_options`. slots: `runtime.workers`. threads: for
+torch and its libraries in each process. folder: for files of its own, not yet created.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ from kerv_cli.settings import RuntimeSettings
 
 T = TypeVar("T")
 
-# Libraries read these when they load, before torch can be told its number.
+# Numerical libraries read these when they load, before torch.set_num_threads can be called.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 class WorkerLost(KervError):
-    """A worker ended before its result: killed, out of memory, taken away by the cluster."""
+    """A worker process ended before its result: killed, out of memory, or preempted by the cluster."""
 
 
 class Executor(Protocol):
-    """Runs functions elsewhere. What they run, what they write and how failures are told is a sweep's business."""
+    """Runs functions in worker processes; `execute` decides which, and handles their results and failures."""
 
     @property
     def slots(self) -> int:
         """How many functions may run at the same time."""
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Starts `work`, which is picklable. The future holds its result or what it raised; `WorkerLost` where its
-        process ended before."""
+        """Starts `work`, a picklable function. The future holds its result or exception, `WorkerLost` if its process
+        ended before."""
 
     def close(self, abandon: bool) -> None:
-        """Ends the workers. abandon: at once, whatever they do."""
+        """Ends the workers. abandon: kill them while they work."""
 
 
 def check_executor(runtime: RuntimeSettings) -> Any:
-    """The options of the chosen executor, before anything heavy is imported.
+    """The options of the chosen executor, checked without importing its package.
 
     Raises:
         UnknownName: no such executor.
-        UsageError: an option that it has not, a package that is not installed, fewer than one worker.
+        UsageError: an unknown option, a package that is not installed, fewer than one worker.
     """
     part = find("executor", runtime.executor)
     if runtime.workers < 1:
@@ -68,7 +68,7 @@ def open_executor(runtime: RuntimeSettings, threads: int, folder: Path) -> Execu
     """The chosen executor, ready.
 
     Raises:
-        UsageError: as `check_executor`, and a cluster that cannot be reached.
+        UsageError: as `check_executor`, or the cluster cannot be reached.
     """
     options = check_executor(runtime)
     executor: Executor = find("executor", runtime.executor).built(options, runtime.workers, threads, folder)

@@ -1,4 +1,4 @@
-"""Processes of this machine (loky). One worker needs none: everything then happens in this process."""
+"""Processes of this machine (loky); a single worker is this process itself."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ _WATCH_SECONDS = 1.0
 
 
 def build(options: Any, slots: int, threads: int, folder: Path) -> Executor:
-    """In this process for one slot, else that many worker processes."""
+    """This process for one slot, else that many worker processes."""
     return InProcess() if slots == 1 else Processes(slots, threads)
 
 
 class InProcess:
-    """Runs at once, here; Ctrl-C passes through."""
+    """Runs each function at once in this process; KeyboardInterrupt is raised to the caller."""
 
     slots = 1
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """A future that is done."""
+        """Runs `work` -> a future that is done."""
         future: Future[T] = Future()
         try:
             future.set_result(work())
-        except Exception as error:  # noqa: BLE001 - it is the future's, whatever it is
+        except Exception as error:  # noqa: BLE001 - the future holds any exception
             future.set_exception(error)
         return future
 
     def close(self, abandon: bool) -> None:
-        """Nothing was started."""
+        """Nothing to end."""
 
 
 class Processes:
-    """Pools of one persistent worker each: a worker that dies is known, and takes only its own work with it."""
+    """One loky pool per worker: when a worker dies, only its own work is lost, and which one is known."""
 
     def __init__(self, slots: int, threads: int) -> None:
         self.slots, self.threads = slots, threads
@@ -51,7 +51,7 @@ class Processes:
         self._all: list[Any] = []
 
     def submit(self, work: Callable[[], T], /) -> Future[T]:
-        """Takes a free worker, or starts one: there are never more than `slots` works at a time."""
+        """Gives `work` to a free worker or starts one; the caller keeps at most `slots` at work."""
         pool = self._free.pop() if self._free else self._new_pool()
         outer: Future[T] = Future()
         pool.submit(work).add_done_callback(lambda inner: self._settle(outer, inner, pool))
@@ -94,7 +94,7 @@ class Processes:
 
 
 def _begin_worker(parent: int) -> None:
-    """Ctrl-C is the parent's business; and a worker whose parent was killed ends instead of running on unseen."""
+    """Worker start-up: ignores SIGINT (the parent handles Ctrl-C) and exits when the parent process is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

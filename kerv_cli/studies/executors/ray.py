@@ -1,6 +1,6 @@
-"""Tasks of a Ray cluster, or of a Ray of its own on this machine: a block is a task.
+"""Tasks of a Ray cluster, or of a Ray that is started on this machine; a block is a task.
 
-The results folder must be one that the nodes share.
+The nodes must share the results folder.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
 
 
 def _check_reachable(address: str) -> None:
-    """Ray itself tries for many minutes.
+    """Fails within seconds where Ray itself would try for minutes.
 
     Raises:
         UsageError: nothing listens at `host:port` or `ray://host:port`.
@@ -54,7 +54,7 @@ def _check_reachable(address: str) -> None:
 
 
 class Tasks:
-    """Ray tasks that are not tried again: a sweep decides what to do with a block that is lost."""
+    """Ray tasks without Ray's retries: `execute` decides about lost blocks."""
 
     def __init__(self, slots: int, threads: int, gpus: float) -> None:
         import ray

@@ -1,6 +1,6 @@
-"""Jobs of a Slurm cluster through submitit: a block is a job. With `cluster: local` they are processes here.
+"""Jobs of a Slurm cluster through submitit; a block is a job. With `cluster: local` jobs are processes of this machine.
 
-The results folder must be one that the nodes share. A job that the cluster ends is a lost worker.
+The nodes must share the results folder. A job that the cluster ends is a lost worker.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def build(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Exec
     """Jobs of `threads` processors each.
 
     Raises:
-        UsageError: there is no Slurm here, or it refuses the options.
+        UsageError: this machine has no Slurm, or Slurm refuses the options.
     """
     import submitit
 
@@ -51,7 +51,7 @@ def _parameters(options: SlurmOptions, threads: int) -> dict[str, Any]:
 
 
 class Jobs:
-    """Submitted jobs; one thread asks after them all."""
+    """Submitted jobs; one thread polls them all."""
 
     def __init__(self, jobs: Any, slots: int, poll_seconds: float) -> None:
         self.slots = slots
@@ -78,7 +78,7 @@ class Jobs:
                 _settle(future, job)
 
     def close(self, abandon: bool) -> None:
-        """Cancels what still runs or waits."""
+        """Cancels the jobs that run or wait. abandon: waits until they have ended, at most ten seconds."""
         self._closed.set()
         with self._changed:
             left = list(self._open.values())
@@ -90,7 +90,7 @@ class Jobs:
 
 
 def _settle(future: Future[Any], job: Any) -> None:
-    """What the job returned or raised; without either, its process was lost."""
+    """Sets the job's result or exception, `WorkerLost` if it ended without either."""
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
     try:
@@ -99,5 +99,5 @@ def _settle(future: Future[Any], job: Any) -> None:
         future.set_exception(WorkerLost(f"its job {job.job_id} ended as {job.state}, see {job.paths.stderr}"))
     except FailedJobError as error:
         future.set_exception(RuntimeError(str(error).strip().splitlines()[-1]))
-    except Exception as error:  # noqa: BLE001 - it is the future's, whatever it is
+    except Exception as error:  # noqa: BLE001 - the future holds any exception
         future.set_exception(error)

@@ -1,12 +1,12 @@
-"""Packed weights: what a frozen float32 policy on a CPU keeps for speed, made once from its weights by `pack`.
+"""Packed weights: a second form of a frozen float32 policy's weights for speed on a CPU, made by `pack`.
 
 They are the same numbers in other layouts (oneDNN's blocked one, which halves the time of 30 tokens; input-major for a
-single token) with what is linear folded together: a norm's gain or a temperature into the weights behind it. At these
-widths half of a one-token forward goes into calls, the other half into reading the weights: so a layer has as few calls
-as possible, and no copy that a product does not need.
+single token), with linear factors folded together: a norm's gain or a temperature into the weights behind it. At these
+widths half of a one-token forward is the overhead of calls, the other half reading the weights: so a layer has as few
+calls and copies as possible.
 
-Packed weights are no part of the state: a copy, a pickle, another device, other weights or training go without, on the
-modules' own path.
+Packed weights are not part of the module's state: copying, pickling, moving, loading weights or training drops them,
+and the module computes without them.
 """
 
 from __future__ import annotations
@@ -39,25 +39,26 @@ def has_blocked_layouts() -> bool:
 
 
 def wants_gradient(x: Tensor) -> bool:
-    """Packed weights know no gradients: an input that wants one takes the modules."""
+    """Whether x needs gradients, which packed weights do not have: then the modules compute."""
     return x.requires_grad and torch.is_grad_enabled()
 
 
 class Packed:
-    """Copies and pickles as None: oneDNN's layouts can be neither copied nor pickled."""
+    """Base of packed weights. Copies and pickles as None, because oneDNN's layouts can be neither copied nor
+    pickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(None), ()
 
 
 class Packable(nn.Module):
-    """A module that may have packed weights. Moving it, loading weights, unfreezing or training it drops them; weights
-    written past these (`parameter.data`, a part's own `load_state_dict`) need another `pack`."""
+    """A module that can have packed weights. Moving it, loading weights, unfreezing or training it drops them. After
+    writing weights in another way (`parameter.data`, a part's own `load_state_dict`) call `pack` again."""
 
     packed: Any = None
 
     def pack_weights(self) -> Packed | None:
-        """The packed weights of this module, frozen float32 on a CPU; None where there is no way to be faster."""
+        """Packed weights of this module, which is frozen float32 on a CPU; None where they would not be faster."""
         raise NotImplementedError
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -69,11 +70,13 @@ class Packable(nn.Module):
         super()._load_from_state_dict(*arguments, **keywords)
 
     def train(self, mode: bool = True) -> Self:
+        """As `nn.Module.train`; training mode drops the packed weights."""
         if mode:
             self.packed = None
         return super().train(mode)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
+        """As `nn.Module.requires_grad_`; unfreezing drops the packed weights of all parts."""
         for part in self.modules():
             if requires_grad and isinstance(part, Packable):
                 part.packed = None
@@ -81,8 +84,8 @@ class Packable(nn.Module):
 
 
 def pack(module: nn.Module) -> None:
-    """Prepare a module whose weights are final: every linear weight on a CPU input-major, shapes unchanged, and packed
-    weights for every part that has them where all is frozen float32 on a CPU.
+    """Prepares a module whose weights are final: stores linear weights on a CPU input-major (shapes unchanged) and,
+    where all parameters are frozen float32 on a CPU, packs the weights of the parts that support it.
 
     One token times an output-major matrix is twice as slow (measured: 192 × 1024, 69 µs against 36 µs).
     """
@@ -125,7 +128,7 @@ class FastLinear:
 
 
 class RowNorm:
-    """x / √(Σ x² + E ε): RMSNorm without its gain and √E, which the next weight has taken."""
+    """x / √(Σ x² + E ε): RMSNorm without its gain and √E, which are folded into the next weight."""
 
     def __init__(self, norm: nn.RMSNorm) -> None:
         self.width_eps = norm.weight.shape[0] * (norm.eps or 0.0)
@@ -140,20 +143,20 @@ class RowNorm:
 
 
 def gain_of(norm: nn.RMSNorm) -> Tensor:
-    """What `RowNorm` leaves out, (E,)."""
+    """The factor (E,) that `RowNorm` leaves out: gain · √E."""
     return norm.weight * norm.weight.shape[0] ** 0.5
 
 
 @lru_cache(maxsize=128)
 def causal_mask(tokens: int) -> Tensor:
-    """Additive (T, T)."""
+    """Additive causal mask (T, T)."""
     with torch.inference_mode(False):
         return torch.full((tokens, tokens), -torch.inf).triu(1)
 
 
 class PackedLayer:
-    """A decoder layer. The two halves that RoPE turns lie side by side and are turned as complex numbers in place, keys
-    and values are written together, and the product adds the residual."""
+    """Packed weights of a decoder layer. The two halves that RoPE rotates lie side by side and are rotated in place as
+    complex numbers; keys and values are written together; the product adds the residual."""
 
     def __init__(self, layer: Layer) -> None:
         self.heads, self.channels = layer.heads, layer.channels
@@ -182,7 +185,7 @@ class PackedLayer:
         return self.down.added_to(rows, F.silu(gate).mul_(up)).view(batch, tokens, width)
 
     def attend(self, qkv: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
-        """qkv (B, T, 3, A, C), turned -> (B T, E)."""
+        """Attention of rotated qkv (B, T, 3, A, C) -> (B T, E)."""
         batch, tokens = qkv.shape[:2]
         q, k, v = qkv.permute(2, 0, 3, 1, 4)
         if cache is not None:
@@ -198,7 +201,7 @@ class PackedLayer:
         return attended.transpose(1, 2).reshape(batch * tokens, self.width)
 
     def step(self, x: Tensor, turn: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
-        """One token of one sequence, as a vector."""
+        """As `__call__` for one token of one sequence, as a vector."""
         row = x.reshape(self.width)
         qkv = self.qkv.of_vector(row, self.norm.of_vector(row))
         qkv.view(torch.complex64).mul_(turn.view(-1))
@@ -213,20 +216,20 @@ class PackedLayer:
 
 
 class PackedLayers(Packed):
-    """The layers of a stack, and its final norm. A cache written here holds keys with neighbouring pairs."""
+    """Packed weights of a stack's layers and its final norm. Keys in its caches have neighbouring channel pairs."""
 
     def __init__(self, stack: LayerStack) -> None:
         cos, sin = stack.rotary.cos, stack.rotary.sin
         half = cos.shape[-1] // 2
         turn = torch.complex(cos[:, :half], sin[:, half:])
-        # unit complex numbers for [q, k, v]; v is turned by nothing; rows of floats are gathered faster
+        # unit complex numbers for [q, k, v], 1 for v; rows of floats are gathered faster
         turns = torch.cat([turn.repeat(1, 2 * stack.heads), torch.ones_like(turn).repeat(1, stack.heads)], -1)
         self.turns = torch.view_as_real(turns).flatten(1)
         self.layers = [PackedLayer(layer) for layer in stack.layers]  # type: ignore[arg-type]
         self.rows, self.gain = RowNorm(stack.norm), gain_of(stack.norm)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """As `LayerStack.run_layers`, with its mask."""
+        """As `LayerStack.run_layers`; mask: from `attention_mask`."""
         turn = self.turns.index_select(0, positions).view(torch.complex64)
         start = cache.length if cache is not None else 0
         for i, layer in enumerate(self.layers):
@@ -239,7 +242,7 @@ class PackedLayers(Packed):
 
 
 class FastConv:
-    """A convolution on channels-last maps of one fixed size, weight blocked once; `pointwise` follows it for free."""
+    """A convolution on channels-last maps of one fixed size, with a blocked weight and a fused function `pointwise`."""
 
     def __init__(self, conv: nn.Conv2d, size: int, weight: Tensor | None = None, bias: Tensor | None = None) -> None:
         weight = conv.weight if weight is None else weight
@@ -253,14 +256,14 @@ class FastConv:
         return torch.ops.mkldnn._convolution_pointwise(x, self.weight, self.bias, *self.geometry, pointwise, [], "")
 
     def added_to(self, other: Tensor, x: Tensor) -> Tensor:
-        """other += the convolution, in place."""
+        """other += the convolution of x, in place -> other."""
         return torch.ops.mkldnn._convolution_pointwise_.binary(
             other, x, self.weight, self.bias, *self.geometry, "add", 1.0, None, [], None
         )
 
 
 class PackedStage:
-    """A strided convolution and the residual block behind it."""
+    """Packed weights of a strided convolution and the residual block behind it."""
 
     def __init__(self, stage: nn.Sequential, size: int, weight: Tensor | None = None) -> None:
         entry: Any = stage[0]
@@ -274,7 +277,7 @@ class PackedStage:
 
 
 class PackedVision(Packed):
-    """As `VisionEncoder.forward` for one frame, but from pixels in 0…255; heat maps are summed from coarse to fine.
+    """Packed weights of `VisionEncoder.forward` for one frame; heat maps are summed from coarse to fine.
 
     Softmax is taken to the base 2, which the temperature absorbs: 2^x is a fast vector loop where MKL's e^x is not
     (measured on an AMD CPU, 48 × 48 × 32 numbers: 12 µs against 48 µs).
@@ -335,19 +338,19 @@ def add_upsampled(heat: Tensor, coarse: Tensor, size: int) -> None:
 
 
 def affine(function: Callable[[Tensor], Tensor], inputs: int) -> Affine:
-    """(1, I) -> (1, O), known to be affine, as bias and weight; asked in float64."""
+    """Bias (O,) and weight (I, O) of an affine function (1, I) -> (1, O), found by evaluating it in float64."""
     offset = function(torch.zeros(1, inputs, dtype=torch.float64))
     weight = function(torch.eye(inputs, dtype=torch.float64)) - offset
     return offset[0].float(), weight.float()
 
 
 def affine_layers(net: nn.Sequential) -> list[Affine]:
-    """Its products, input-major."""
+    """Bias and input-major weight of each linear layer."""
     return [(part.bias, part.weight.t().contiguous()) for part in net if isinstance(part, nn.Linear)]
 
 
 def perceptron(x: Tensor, layers: list[Affine]) -> Tensor:
-    """x (1, I) through products with SiLU between them."""
+    """x (1, I) through linear layers with SiLU between them -> (1, O)."""
     for bias, weight in layers[:-1]:
         x = torch.addmm(bias, x, weight)
         F.silu(x, inplace=True)
@@ -355,7 +358,8 @@ def perceptron(x: Tensor, layers: list[Affine]) -> Tensor:
 
 
 class PackedPrompt(Packed):
-    """The prompt of one observation: what is affine in the scene is one small product, what saturates stands last."""
+    """Packed weights of `CompactTarget.encode_batch` for one observation of a vision policy. All affine steps of the
+    scene features are folded into one matrix product, whose last columns saturate."""
 
     def __init__(self, target: CompactTarget) -> None:
         centre, space = target.centre.double(), target.observation

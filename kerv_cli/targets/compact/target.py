@@ -50,9 +50,9 @@ class Inputs:
 
 
 class CompactTarget(Packable):
-    """The policy put together; see `targets/protocol.py`. Parameters in float32.
+    """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Parameters in float32.
 
-    cameras: of a vision policy, the one whose images it reads. segments: where the prompt's parts lie, in order.
+    cameras: of a vision policy, the one whose images it reads. segments: slice of the prompt by the name of its part.
     sha256: of the weights it was loaded with, else empty.
     """
 
@@ -108,17 +108,17 @@ class CompactTarget(Packable):
 
     @property
     def heads(self) -> int:
-        """A, of the trunk; a drafter has as many."""
+        """A, attention heads of the trunk; a drafter has as many."""
         return self.settings.heads
 
     @property
     def feed_forward(self) -> int:
-        """Hidden units of the trunk's layers; a drafter's has as many."""
+        """Hidden units of the trunk's feed-forward parts; a drafter has as many."""
         return self.settings.feed_forward
 
     @property
     def max_prompt(self) -> int:
-        """P, the same for every observation and instruction."""
+        """P, which is the same for every observation and instruction."""
         return self.segments["proprioception"].stop
 
     @property
@@ -135,19 +135,20 @@ class CompactTarget(Packable):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
+        """Device of the weights."""
         return self.head.weight.device
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights."""
+        """Number format of the weights."""
         return self.head.weight.dtype
 
     def pack(self) -> None:
-        """Prepare for inference: packed weights where it is frozen float32 on a CPU."""
+        """Prepares for inference, see `packed.pack`."""
         pack(self)
 
     def pack_weights(self) -> PackedPrompt | None:
+        """As `Packable.pack_weights`; None for a state policy."""
         return PackedPrompt(self) if self.cameras else None
 
     def inputs(self, observation: Observation) -> Inputs:
@@ -175,7 +176,7 @@ class CompactTarget(Packable):
         return Inputs(images, felt, state, self.words_of(observation.instruction))
 
     def words_of(self, instruction: str) -> Tensor:
-        """(1, L) int64."""
+        """The instruction's word ids (1, L) int64."""
         return torch.tensor([self.words.encode(instruction, self.settings.instruction_tokens)], device=self.device)
 
     def encode(self, observation: Observation) -> Tensor:
@@ -183,7 +184,8 @@ class CompactTarget(Packable):
         return self.encode_batch(self.inputs(observation))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Prompt embeddings (B, P, E) and the places' positions (B, K, 3) in metres they are built on."""
+        """Prompt embeddings (B, P, E), and the positions of the places (B, K, 3) in metres that their scene tokens
+        carry."""
         if self.packed is not None and len(inputs.proprioception) == 1:
             return self.packed(inputs)
         words = self.word_embedding(inputs.words)
@@ -224,13 +226,12 @@ class CompactTarget(Packable):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
     ) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind what the cache holds; seen
-        (T, T) bool as in `targets/protocol.py`."""
+        """As `Target.forward`: hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
         hidden: Tensor = self.trunk(x, positions, cache, seen)
         return hidden
 
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """tokens (B, N) -> logits (B, N, V) that predict them, and the places' positions (B, K, 3), metres."""
+        """tokens (B, N) -> logits (B, N, V) that predict them, and the positions of the places (B, K, 3), metres."""
         prompt, places = self.encode_batch(inputs)
         x = torch.cat([prompt, self.embedding(tokens[:, :-1]).to(prompt.dtype)], 1)
         hidden = self(x, torch.arange(x.shape[1], device=x.device))
@@ -246,7 +247,7 @@ def _segments(settings: TargetSettings) -> Mapping[str, slice]:
 
 
 def _smooth_table(tokens: int, width: int) -> Tensor:
-    """(V, E) initial embedding in which neighbouring bins are neighbours: cosines of the bin's value."""
+    """(V, E) initial embedding that is similar for neighbouring bins: cosines of the bin's value."""
     centres = torch.linspace(-1, 1, tokens)[:, None]
     generator = torch.Generator().manual_seed(0)
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit
@@ -255,7 +256,7 @@ def _smooth_table(tokens: int, width: int) -> Tensor:
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """The target in `folder`, ready for inference.
+    """The target in `folder`, frozen and packed for inference.
 
     Raises:
         CheckpointError: the description is not a compact target's, or the weights do not fit it.

@@ -17,18 +17,18 @@ PAD, UNKNOWN = 0, 1
 
 @dataclass(frozen=True)
 class WordTokenizer:
-    """Whole words as ids."""
+    """A fixed vocabulary of whole words."""
 
     words: tuple[str, ...]  # word of id i + 2; ids 0 and 1 are padding and unknown
 
     @classmethod
     def build(cls, sentences: Iterable[str]) -> WordTokenizer:
-        """The vocabulary of these sentences."""
+        """The vocabulary of the sentences' lower-case words, sorted."""
         return cls(tuple(sorted({word for s in sentences for word in s.lower().split()})))
 
     @property
     def size(self) -> int:
-        """How many ids there are."""
+        """Number of ids: words, padding and unknown."""
         return len(self.words) + 2
 
     @cached_property
@@ -37,7 +37,11 @@ class WordTokenizer:
         return {word: i + 2 for i, word in enumerate(self.words)}
 
     def encode(self, sentence: str, length: int) -> list[int]:
-        """Exactly `length` ids. A longer sentence is an error: truncating could drop the word that matters."""
+        """The sentence as exactly `length` ids, padded.
+
+        Raises:
+            UsageError: more words than `length`; truncating could drop the decisive one.
+        """
         ids = [self.index.get(word, UNKNOWN) for word in sentence.lower().split()]
         if len(ids) > length:
             raise UsageError(f"instruction '{sentence}' has {len(ids)} words, the policy takes {length}: shorten it")

@@ -2,8 +2,8 @@
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
-There are three paths to the same numbers (up to float32 rounding). A cache of fixed shapes writes at a tensor of slots
-and attends to its whole capacity under a mask, so that one captured graph can serve every step; it is what CUDA gets.
+Three implementations give the same numbers up to float32 rounding. On CUDA a cache of fixed shapes is written at a
+tensor of slots and attended to over its whole capacity under a mask, so that one captured graph can serve every step.
 On a CPU slices are faster, and a frozen float32 stack has packed weights (`packed.py`).
 """
 
@@ -20,10 +20,11 @@ from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradie
 
 
 class Cache:
-    """Keys and values of every layer in fixed buffers (layers, 2, B, A, capacity, C), and how many slots are valid.
+    """Keys and values of every layer in fixed buffers (layers, 2, B, A, capacity, C); the first `length` slots are
+    valid.
 
-    fixed: every forward has the same shapes. Who writes into a cache first, modules or packed weights, must go on
-    writing: their keys are laid out differently.
+    fixed: every forward has the same shapes. Modules and packed weights order key channels differently, so they must
+    not share a cache.
     """
 
     def __init__(
@@ -36,15 +37,16 @@ class Cache:
         self.fixed = like.is_cuda if fixed is None else fixed
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Commit a path: move the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, …; all
-        others behind `start` are dropped."""
+        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
+        sets the length behind them."""
         n = slots.shape[0]
         self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length = start + n
 
 
 class Slots:
-    """Where a forward writes into a cache's layers: a slice, or with `index` (T,) a tensor of slots."""
+    """The slots of a cache that a forward of `tokens` tokens writes: a slice, for fixed shapes a tensor `index`
+    (T,)."""
 
     def __init__(self, cache: Cache, tokens: int) -> None:
         self.start, self.stop = cache.length, cache.length + tokens
@@ -64,10 +66,11 @@ class Slots:
 
 
 def attention_mask(seen: np.ndarray | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
-    """Additive mask of `tokens` new tokens behind a cache: (T, S + T), for one of fixed shapes (T, capacity).
+    """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, capacity) for a cache of fixed shapes.
 
-    seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token sees; it sees all that are
-    cached before those. None: the new tokens are causal. The mask is None where attention without one does the same.
+    seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to
+    all cached ones before those. None: the new tokens are causal. The mask is None where attention without one does the
+    same.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens
@@ -97,12 +100,12 @@ class Rotary(nn.Module):
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
     def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """positions (T,) -> cos, sin (T, 1, C), to be reused by every layer."""
+        """positions (T,) -> cos and sin (T, 1, C) for all layers."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """x (B, T, heads, C) turned by its position."""
+    """x (B, T, heads, C) rotated by its positions' cos and sin (T, 1, C)."""
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
@@ -127,8 +130,8 @@ class Layer(nn.Module):
         slots: Slots | None = None,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """x (B, T, E); cache (2, B, A, capacity, C) of this layer, written at `slots`; mask as `attention_mask` gives
-        it: without one attention is causal."""
+        """x (B, T, E) -> (B, T, E). cache: (2, B, A, capacity, C) of this layer, written at `slots`. mask: from
+        `attention_mask`; without one attention is causal."""
         batch, tokens, width = x.shape
         qkv = self.qkv(self.attention_norm(x)).view(batch, tokens, 3 * self.heads, self.channels)
         qk = rotate(qkv[:, :, : 2 * self.heads], *rotary)
@@ -145,7 +148,7 @@ class Layer(nn.Module):
 
 
 class LayerStack(Packable):
-    """Decoder layers and their rotary embedding: what the trunk and the drafter have in common."""
+    """Decoder layers and their rotary embedding, the base of the trunk and the drafter."""
 
     packed: PackedLayers | None
 
@@ -157,6 +160,7 @@ class LayerStack(Packable):
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
     def pack_weights(self) -> Any:
+        """As `Packable.pack_weights`."""
         return PackedLayers(self)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
@@ -165,11 +169,12 @@ class LayerStack(Packable):
         return Cache(len(self.layers), batch, self.heads, capacity, channels, self.norm.weight, fixed)
 
     def packed_for(self, x: Tensor, cache: Cache | None) -> PackedLayers | None:
-        """The packed weights, where this input can take them."""
+        """The packed weights where they can compute x: without gradients, and with no cache of fixed shapes."""
         return None if wants_gradient(x) or (cache is not None and cache.fixed) else self.packed
 
     def run_layers(self, x: Tensor, positions: Tensor, cache: Cache | None, seen: np.ndarray | None) -> Tensor:
-        """x (B, T, E) at `positions` (T,) through all layers; the cache grows by T. seen as in `attention_mask`."""
+        """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
+        `attention_mask`."""
         mask = attention_mask(seen, x.shape[1], cache, x)
         packed = self.packed_for(x, cache)
         if packed is not None:
@@ -184,7 +189,7 @@ class LayerStack(Packable):
 
 
 class Trunk(LayerStack):
-    """The stack and its final norm. What leaves it is the hidden state that the head and the drafter read."""
+    """The stack and its final norm; its output is the hidden state that the head and the drafter read."""
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, layers, heads, feed_forward)
@@ -197,7 +202,7 @@ class Trunk(LayerStack):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
     ) -> Tensor:
-        """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,), behind what is cached."""
+        """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,), behind the cached ones."""
         packed = self.packed_for(x, cache)
         x = self.run_layers(x, positions, cache, seen)
         return self.norm(x) if packed is None else packed.norm(x)

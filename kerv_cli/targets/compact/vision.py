@@ -1,8 +1,8 @@
 """Frames -> vision tokens and image points.
 
 A small convolutional stem. Two things leave it: a coarse grid of tokens for the trunk, and K image points by spatial
-soft-argmax (Finn et al. 2016) on the finest map, because what decides success is where a marker of 4 pixels lies. No
-augmentation moves the image: a shift is a lie about where things are.
+soft-argmax (Finn et al. 2016) on the finest map, because success depends on the position of markers of 4 pixels. Images
+are not shifted for augmentation: positions in the image carry that information.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from kerv_cli.targets.compact.packed import Packable, PackedVision, has_blocked_
 
 
 class Residual(nn.Module):
-    """Two convolutions beside the identity."""
+    """Residual block: group norm and two 3 × 3 convolutions."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -24,11 +24,13 @@ class Residual(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """x (B, C, h, w) -> the same shape."""
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
 class VisionEncoder(Packable):
-    """(B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
+    """The convolutional stem. size: of the frames, pixels. grid: vision tokens per side. keypoints: K. channels: of the
+    first stage. width: E. Raises ValueError where size and grid do not fit."""
 
     columns: Tensor
     packed: PackedVision | None
@@ -50,10 +52,11 @@ class VisionEncoder(Packable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def pack_weights(self) -> PackedVision | None:
+        """As `Packable.pack_weights`; None where torch lacks oneDNN's fused operators."""
         return PackedVision(self) if has_blocked_layouts() else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Tokens and points of frames, as the class says."""
+        """images (B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
         if self.packed is not None and len(images) == 1:
             return self.packed(images)
         images = images.to(self.patch.weight.dtype) / 255.0 - 0.5
@@ -69,7 +72,7 @@ class VisionEncoder(Packable):
         return tokens, self.points(heat)
 
     def points(self, heat: Tensor) -> Tensor:
-        """(B, K, h, w) -> (B, 2K): each map's expected column and row under its softmax."""
+        """heat maps (B, K, h, w) -> (B, 2K): each map's expected column and row under its softmax, in [-1, 1]."""
         batch, keypoints, height, width = heat.shape
         scaled = heat.float() * self.temperature[:, None, None].float()
         weight = scaled.flatten(2).softmax(-1).view(batch, keypoints, height, width)

@@ -1,0 +1,159 @@
+"""Reads demonstrations as a policy takes them: the one reader of training, distillation, datastore and calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.environments import spec_of
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.settings import TargetSettings
+from kerv_cli.spaces import ActionSpace, ObservationSpace
+from kerv_cli.targets.compact.target import Inputs
+from kerv_cli.targets.compact.text import WordTokenizer
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Base of dataclasses of tensors that have one row per sample; an optional one may be None."""
+
+    def __len__(self) -> int:
+        return next(len(x) for x in vars(self).values() if x is not None)
+
+    def where(self, chosen: Tensor) -> Self:
+        """The rows that `chosen` selects: a mask (n,) bool, or indices."""
+        return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """All rows of `parts`, in order."""
+        columns = ([getattr(part, field.name) for part in parts] for field in fields(cls))
+        return cls(*(None if column[0] is None else torch.cat(column) for column in columns))
+
+
+@dataclass(frozen=True)
+class Observations(Rows):
+    """n observations, in the order of episodes and control steps."""
+
+    frames: Tensor | None  # (n, size, size, 3) uint8; None for a state policy
+    proprioception: Tensor  # (n, p) float32
+    states: Tensor  # (n, s) float32, privileged
+    words: Tensor  # (n, L) int64
+    steps: Tensor  # (n,) int64, control steps since the start of the episode
+
+    def inputs(self, indices: Tensor, device: torch.device) -> Inputs:
+        """The observations at `indices` (B,) as a batch on `device`."""
+        images = None
+        if self.frames is not None:
+            images = self.frames[indices].to(device).permute(0, 3, 1, 2)
+        return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
+
+
+def observed_steps(episode: DemoEpisode, settings: TargetSettings) -> np.ndarray:
+    """Control steps (n,) that such a policy learns from: those with a frame, for a state policy every step."""
+    return episode.frame_steps if settings.observation == "vision" else np.arange(episode.steps)
+
+
+def read_observations(
+    episode: DemoEpisode,
+    settings: TargetSettings,
+    space: ObservationSpace,
+    words: WordTokenizer,
+    chosen: slice | np.ndarray = slice(None),
+) -> Observations:
+    """The observations of an episode that a policy of these settings learns from. chosen: which of them, default all.
+
+    Raises:
+        CheckpointError: frames of another size than the policy takes.
+    """
+    steps, frames = observed_steps(episode, settings)[chosen], None
+    if settings.observation == "vision":
+        check_frames(episode, settings.image_size)
+        frames = torch.from_numpy(episode.frames[chosen])
+    states = torch.from_numpy(episode.states[steps]).float()
+    ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
+    felt = states[:, : len(space.proprioception)]
+    return Observations(frames, felt, states, ids.repeat(len(steps), 1), torch.from_numpy(steps))
+
+
+def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
+    """(n, H, D) float32: the expert's next H = `chunk` clean actions from each of `steps` (n,), environment units. A
+    chunk that begins near the end takes labels recorded beyond the success, never those of another episode.
+
+    Raises:
+        CheckpointError: too few labels were recorded beyond the success.
+    """
+    check_tail(episode, chunk, f"chunks of {chunk}")
+    return np.stack([episode.labels[t : t + chunk] for t in steps])
+
+
+def check_tail(episode: DemoEpisode, steps: int, what: str) -> None:
+    """Checks that an episode has `steps` labels from each of its control steps on. what: their use, for the message.
+
+    Raises:
+        CheckpointError: too few labels were recorded beyond the success.
+    """
+    tail = len(episode.labels) - episode.steps
+    if tail < steps - 1:
+        raise CheckpointError(
+            f"the demonstrations have {tail} labels behind an episode's end, {what} need {steps - 1}: "
+            "record them again with a longer tail"
+        )
+
+
+def check_frames(episode: DemoEpisode, size: int) -> None:
+    """Checks that an episode's frames have the policy's size in pixels.
+
+    Raises:
+        CheckpointError: they have another one.
+    """
+    if episode.frames.shape[1] != size:
+        raise CheckpointError(
+            f"the demonstrations' frames have {episode.frames.shape[1]} pixels, the policy takes {size}: "
+            "set target.image_size or record again with world.camera.size"
+        )
+
+
+def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
+    """Refuses demonstrations of another environment. actions, observation: spaces of `owner`, e.g. "the target".
+
+    Raises:
+        CheckpointError: other actions or observations.
+    """
+    where = f"the demonstrations in {dataset.path}"
+    dataset.manifest.actions.check_same(actions, where, owner)
+    if observation != dataset.manifest.observation:
+        raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
+
+
+def instruction_of(name: str) -> str:
+    """The instruction of a task."""
+    return spec_of(name).task(name).instruction
+
+
+S = TypeVar("S", bound=Rows)
+
+
+def split(samples: S, share: float) -> tuple[S, S]:
+    """(training, held out) by whole episodes, of samples with a tensor `episodes`. Every k-th episode is held out, so
+    that each task, plain and perturbed, is in both parts.
+
+    Raises:
+        UsageError: a share out of range. CheckpointError: a single episode.
+    """
+    episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
+    count = int(episodes.max()) + 1
+    if count < 2:
+        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
+    if not 0 < share <= 0.5:
+        raise UsageError(f"train.held_out={share}: more than 0, at most 0.5")
+    every = min(max(2, round(1 / share)), count)
+    held = episodes % every == every - 1
+    return samples.where(~held), samples.where(held)
