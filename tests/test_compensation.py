@@ -1,4 +1,4 @@
-"""Accepted prefix + prediction (METHODS §3.1) for every rejection position, and what the loop does with it."""
+"""Accepted prefix + prediction (docs/methods.md §3.1) for every rejection position, and what the loop does with it."""
 
 from __future__ import annotations
 

@@ -77,14 +77,14 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "acceptance": p.RelaxedAcceptanceSettings(strict_dofs=False),
     },
     "early_unverified": {
-        "prefill_draft": p.EarlyProposerSettings(),
+        "prefill_draft": NoSettings("early"),
         "acceptance": RELAXED,
-        "skip": p.AlwaysSkipSettings(),
+        "skip": NoSettings("always"),
     },
     "retrieval_unverified": {
         "prefill_draft": p.RetrievalProposerSettings(),
         "acceptance": RELAXED,
-        "skip": p.AlwaysSkipSettings(),
+        "skip": NoSettings("always"),
     },
     "one_pass": ONE_PASS,
     "one_pass_skip": {**ONE_PASS, "skip": SKIP},

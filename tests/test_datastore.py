@@ -612,7 +612,7 @@ def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
 
 
 def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[tuple[int, ...]]:
-    """METHODS §4.2 read aloud: one neighbour per group; a strict group from one that gave the group before it."""
+    """docs/methods.md §4.2 read aloud: one neighbour per group; a strict group from one that gave the group before it."""
     found = set()
     for owners in product(range(len(chunks)), repeat=len(cuts)):
         parts = [tuple(chunks[i, a:b].tolist()) for i, (a, b, _) in zip(owners, cuts, strict=True)]
@@ -664,7 +664,7 @@ def test_the_nearest_neighbours_chunk_comes_first() -> None:
 def plain_tree(
     chunks: np.ndarray, start: int, space: ActionSpace, nodes: int, depth: int | None, cross: float
 ) -> tuple[list[int], list[int]]:
-    """The tree of METHODS §4.2 without a thought for speed -> tokens, parents."""
+    """The tree of docs/methods.md §4.2 without a thought for speed -> tokens, parents."""
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     cuts = list(space.segments(start, stop))
     rows, order = chunks.tolist(), count()

@@ -317,7 +317,7 @@ def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:
 def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path: Path) -> None:
     save_tensors(tmp_path / "model.safetensors", {"nothing": torch.zeros(1)})
     description = {
-        "format": 1,
+        "format": 2,
         "kind": "target",
         "sha256": sha256_of(tmp_path / "model.safetensors"),
         "family": "mock",

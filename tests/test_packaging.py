@@ -183,11 +183,11 @@ def test_an_interrupted_installation_leaves_no_stamp(checkout: Checkout) -> None
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not checkout.log and time.monotonic() < deadline:
         time.sleep(0.02)
     os.killpg(running.pid, signal.SIGINT)
-    assert running.wait(timeout=20) != 0
+    assert running.wait(timeout=60) != 0
     assert checkout.log, "the installation never started"
     assert not checkout.stamped
 

@@ -1,4 +1,4 @@
-"""The `sequence` rule against METHODS §2.1 read aloud, and the kinematic groups that it judges by."""
+"""The `sequence` rule against docs/methods.md §2.1 read aloud, and the kinematic groups that it judges by."""
 
 from __future__ import annotations
 

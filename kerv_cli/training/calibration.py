@@ -49,15 +49,15 @@ Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
 
 
-def reference_level(levels: Sequence[float], bin_width: float) -> float:
-    """K_S: the median K of pre-sampled decodes, at least the width of one bin so that it can divide.
+def reference_level(levels: Sequence[float], least: float) -> float:
+    """K_S: the median K of pre-sampled decodes, at least `least` so that it can divide.
 
     Raises:
         ValueError: no decode compared anything.
     """
     if not levels:
         raise ValueError("no decode compared a draft with a target token")
-    return max(float(np.median(levels)), bin_width)
+    return max(float(np.median(levels)), least)
 
 
 def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
@@ -186,6 +186,9 @@ class CalibrationRun:
         decoder, space = self.decoder(), self.dataset.manifest.observation
         pixels = self.described.settings.get("image_size", 0)
         share = math.ceil(self.settings.decodes / PRESAMPLED)
+        # the smallest K above 0: one token of a chunk is off by one bin
+        actions = self.described.actions
+        least = 2.0 / actions.tokens / (self.described.chunk * int((~actions.is_strict).sum()))
         found: dict[str, Variability] = {}
         for number, name in enumerate(self.tasks):
             levels: list[float] = []
@@ -199,7 +202,7 @@ class CalibrationRun:
                     break
             if not levels:
                 raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K for K_S")
-            found[name] = spread(levels, 2.0 / self.described.actions.tokens)
+            found[name] = spread(levels, least)
             progress(number + 1, len(self.tasks))
         return found
 
@@ -281,7 +284,7 @@ def _check_settings(settings: CalibrateSettings) -> None:
         raise UsageError("proposer.kind=none drafts nothing to compare: choose a proposer, or decodes=0")
 
 
-def spread(levels: Sequence[float], bin_width: float) -> Variability:
+def spread(levels: Sequence[float], least: float) -> Variability:
     """K_S and the quartiles of pre-sampled levels of K."""
     low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
-    return Variability(reference_level(levels, bin_width), len(levels), low, high, top)
+    return Variability(reference_level(levels, least), len(levels), low, high, top)
