@@ -612,7 +612,7 @@ def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
 
 
 def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[tuple[int, ...]]:
-    """docs/methods.md §4.2 read aloud: one neighbour per group; a strict group from one that gave the group before it."""
+    """docs/methods.md §4.2: one neighbour per group; a strict group from one that gave the group before it."""
     found = set()
     for owners in product(range(len(chunks)), repeat=len(cuts)):
         parts = [tuple(chunks[i, a:b].tolist()) for i, (a, b, _) in zip(owners, cuts, strict=True)]

@@ -106,7 +106,7 @@ def test_a_merged_tree_holds_exactly_the_prefixes(chains: list[list[int]]) -> No
 
 
 def slow_acceptance(tree: TokenTree, target_tokens: list[int], start: int, limits: list[int]) -> tuple[int, int]:
-    """docs/methods.md §2.1 read aloud: the longest root path whose tokens are all within their limits, then the nearest."""
+    """docs/methods.md §2.1: the longest root path whose tokens are all within their limits, then the nearest."""
     best = (0, 0)
     for node in range(len(tree)):
         path = tree.path_to(node)
