@@ -146,10 +146,10 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
     assert "1 cells run, 6 reused, 0 failed" in kerv(*command).stdout
     told = kerv("report", "study=demo", f"results={results}")
     assert told.returncode == 0, told.stderr
-    table = pd.read_csv(results / "tables/demo.csv")
+    table = pd.read_csv(results / "report/tables/demo.csv")
     assert set(table["averaging"]) == {"micro over tasks", "macro over difficulty groups"}
     assert {"ar", "spec_vla r=0", "spec_vla r=20"} <= set(table["label"])
-    assert list((results / "plots").glob("demo*.png"))
+    assert list((results / "report/plots").glob("demo*.png"))
 
 
 def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:

@@ -141,8 +141,8 @@ def test_the_page_shows_what_its_methods_use(tmp_path: Path) -> None:
     calibrate(tmp_path)
     write_study(tmp_path, "used")
     written = names(tmp_path, report(tmp_path, "used").files)
-    assert {"tables/prediction_made-here.csv", "plots/prediction_made-here.png"} <= set(written)
-    assert {"tables/boundary_radius.csv", "plots/boundary_radius.png"} <= set(written)
+    assert {"report/tables/prediction_made-here.csv", "report/plots/prediction_made-here.png"} <= set(written)
+    assert {"report/tables/boundary_radius.csv", "report/plots/boundary_radius.png"} <= set(written)
     assert len(written) == len(set(written))
     page = (tmp_path / "studies/used/report.html").read_text(encoding="utf-8")
     assert "Prediction of the next actions, made-here" in page
@@ -150,7 +150,7 @@ def test_the_page_shows_what_its_methods_use(tmp_path: Path) -> None:
     assert "Synthetic arcs and lines" in page
     ids = [part.split('"')[0] for part in page.split(' id="')[1:]]
     assert len(ids) == len(set(ids))
-    table = pd.read_csv(tmp_path / "tables/prediction_made-here.csv")
+    table = pd.read_csv(tmp_path / "report/tables/prediction_made-here.csv")
     assert list(table.columns[:6]) == ["target", "predictor", "task", "dof", "steps_ahead", "error"]
 
 
@@ -159,7 +159,7 @@ def test_without_a_study_every_calibration_is_reported(tmp_path: Path) -> None:
     assert names(tmp_path, report(tmp_path).files) == [
         f"{folder}/{name}.{kind}"
         for name in ("prediction_made-here", "boundary_radius")
-        for folder, kind in (("tables", "csv"), ("plots", "png"), ("plots", "svg"))
+        for folder, kind in (("report/tables", "csv"), ("report/plots", "png"), ("report/plots", "svg"))
         if (name, kind) != ("boundary_radius", "svg")  # too large
     ]
 

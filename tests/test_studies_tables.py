@@ -354,15 +354,15 @@ def test_report_writes_the_same_bytes_again(results: Path) -> None:
     written = report(results).files
     names = [path.relative_to(results).as_posix() for path in written]
     assert names == [
-        "tables/threshold.csv",
-        "tables/threshold_per_task.csv",
-        "plots/threshold.png",
-        "plots/threshold.svg",
-        "plots/threshold_phases.png",
-        "plots/threshold_phases.svg",
+        "report/tables/threshold.csv",
+        "report/tables/threshold_per_task.csv",
+        "report/plots/threshold.png",
+        "report/plots/threshold.svg",
+        "report/plots/threshold_phases.png",
+        "report/plots/threshold_phases.svg",
         "studies/threshold/report.html",
-        "tables/boundary_radius.csv",  # without study=
-        "plots/boundary_radius.png",  # as SVG it would be too large
+        "report/tables/boundary_radius.csv",  # without study=
+        "report/plots/boundary_radius.png",  # as SVG it would be too large
     ]
     before = {path: path.read_bytes() for path in written}
     for path in written:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 from kerv_cli.commands.common import Overrides, ShowConfig, composed, console, edge
 
+Publish = Annotated[
+    bool,
+    typer.Option(
+        "--publish", help="Write tables and plots where they are committed; refuse what may not be published."
+    ),
+]
+
 
 @edge
-def report(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+def report(overrides: Overrides = None, cfg: ShowConfig = False, publish: Publish = False) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
     from kerv_cli.settings import ReportSettings
 
@@ -19,7 +28,7 @@ def report(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     from kerv_cli.reporting.report import report as write_report
     from kerv_cli.reporting.summary import summary_table
 
-    written = write_report(results_dir(settings.results), settings.only)
+    written = write_report(results_dir(settings.results), settings.only, publish)
     for table in written.tables.values():
         console().print(summary_table(table))
     for path in written.files:

@@ -18,6 +18,7 @@ from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
 from kerv_cli.reporting.measures import MACRO, MICRO
 from kerv_cli.reporting.plots import study_figures
+from kerv_cli.reporting.publish import check_publishable
 from kerv_cli.reporting.summary import summary_frame
 from kerv_cli.reporting.tables import StudyData, load_study, per_task_table, study_table, write_csv
 from kerv_cli.studies.store import StudyStore, begun_studies
@@ -31,19 +32,21 @@ class Report:
     tables: dict[str, pd.DataFrame]
 
 
-def report(results: Path | str, study: str | None = None) -> Report:
+def report(results: Path | str, study: str | None = None, publish: bool = False) -> Report:
     """Writes a study's files, or those of every study that has a complete cell and of every calibration.
 
-    tables/<study>.csv and <study>_per_task.csv, plots/<study>*.png and, where small, .svg, and
-    studies/<study>/report.html. Tables and plots of prediction_<target> are added for a study whose methods predict
-    actions, and of boundary_radius for one that compares boundaries. The same cells give the same bytes.
+    In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
+    plots/<study>*.png and, where small, .svg. Always studies/<study>/report.html. Tables and plots of
+    prediction_<target> are added for a study whose methods predict actions, and of boundary_radius for one that
+    compares boundaries. The same cells give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
+        Unpublishable: a study that may not be published; nothing of it is written.
         CheckpointError: a cell is damaged.
         StorageError: the disk refused.
     """
-    reporter = _Reporter(Path(results))
+    reporter = _Reporter(Path(results), publish)
     if study:
         reporter.report_study(study)
         return reporter.report
@@ -72,8 +75,9 @@ class Section:
 class _Reporter:
     """Writes the files of studies; sections that several of them share are computed and written once."""
 
-    def __init__(self, results: Path) -> None:
-        self.results = results
+    def __init__(self, results: Path, publish: bool) -> None:
+        self.results, self.publish = results, publish
+        self.folder = results if publish else results / "report"
         self.report = Report([], {})
         self._sections: dict[str, Section | None] = {}
 
@@ -82,6 +86,8 @@ class _Reporter:
         store = StudyStore(self.results, name)
         data = load_study(store)
         whole, per_task = study_table(data), per_task_table(data)
+        if self.publish:
+            check_publishable(data, whole)
         self.report.tables[name] = whole
         self._save_table(whole, name)
         self._save_table(per_task, f"{name}_per_task")
@@ -129,11 +135,11 @@ class _Reporter:
         return section
 
     def _save_table(self, table: pd.DataFrame, name: str) -> None:
-        self.report.files.append(write_csv(table, self.results / "tables" / f"{name}.csv"))
+        self.report.files.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
 
     def _save_plot(self, figure: Figure, name: str) -> str:
         """The figure's HTML element."""
-        plot = save_plot(figure, self.results / "plots", name)
+        plot = save_plot(figure, self.folder / "plots", name)
         self.report.files.extend(plot.files)
         return plot.html
 
