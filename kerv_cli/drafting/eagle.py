@@ -20,8 +20,8 @@ from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
-from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.checkpoint import Description, read_description, save_module
+from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.compact.trunk import Cache, LayerStack
 from kerv_cli.targets.protocol import ReadableTarget, Target
 
@@ -167,10 +167,7 @@ def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tu
     """The drafter, ready for inference, and its description; errors as `read_drafter`."""
     description = read_drafter(folder, target_sha256, target.actions)
     drafter = Drafter.beside(description.settings, target)
-    load_state(drafter, folder, "drafter")
-    drafter = drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)
-    pack(drafter)
-    return drafter, description
+    return load_packed(drafter, folder, "drafter", target.device, target.dtype), description
 
 
 def _check(folder: Path, request: Request) -> str:

@@ -21,8 +21,8 @@ from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
-from kerv_cli.targets.checkpoint import Description, TargetDescription, load_state, read_description, save_module
-from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.checkpoint import Description, TargetDescription, read_description, save_module
+from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.protocol import ReadableTarget
 
 
@@ -191,10 +191,7 @@ def load_early(
     """The early drafter of `target`, ready for inference, and its own description; errors as `read_early`."""
     own = read_early(folder, description)
     early = EarlyDrafter.beside(own.settings, target)
-    load_state(early, folder, "early")
-    early = early.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)
-    pack(early)
-    return early, own
+    return load_packed(early, folder, "early", target.device, target.dtype), own
 
 
 def _load(folder: Path, request: Request) -> EarlyDrafter:

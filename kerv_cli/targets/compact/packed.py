@@ -14,18 +14,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
 
 if TYPE_CHECKING:
     from kerv_cli.targets.compact.target import CompactTarget, Inputs
     from kerv_cli.targets.compact.trunk import Cache, Layer, LayerStack
     from kerv_cli.targets.compact.vision import VisionEncoder
+
+M = TypeVar("M", bound=nn.Module)
 
 BLOCKED_FROM = 600_000  # multiplications below which a plain product beats oneDNN's call overhead of 15 µs (measured)
 EXPLICIT = range(24, 513)  # query tokens for which three plain calls beat the fused attention of a CPU (measured)
@@ -97,6 +101,18 @@ def pack(module: nn.Module) -> None:
             for part in module.modules():
                 if isinstance(part, Packable):
                     part.packed = part.pack_weights()
+
+
+def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
+    """The module with the folder's weights, on its device, frozen and packed for inference.
+
+    Raises:
+        CheckpointError: as `load_state`.
+    """
+    load_state(module, folder, kind)
+    module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)
+    pack(module)
+    return module
 
 
 class FastLinear:

@@ -23,7 +23,7 @@ from kerv_cli.errors import CheckpointError
 from kerv_cli.manifests import read
 from kerv_cli.settings import TargetSettings
 from kerv_cli.spaces import ActionSpace, Observation, ObservationSpace
-from kerv_cli.targets.checkpoint import TargetDescription, load_state
+from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import (
     hand_features,
     places_of,
@@ -32,7 +32,7 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.packed import Packable, PackedPrompt, pack
+from kerv_cli.targets.compact.packed import Packable, PackedPrompt, load_packed, pack
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
@@ -265,8 +265,5 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     camera = description.cameras[0] if description.cameras else ""
     words = WordTokenizer(description.words)
     target = CompactTarget(settings, description.actions, description.observation, words, camera)
-    load_state(target, folder, "target")
-    target = target.to(device=device, dtype=dtype).eval().requires_grad_(False)
     target.sha256 = description.sha256
-    target.pack()
-    return target
+    return load_packed(target, folder, "target", device, dtype)
