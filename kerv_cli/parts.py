@@ -373,6 +373,7 @@ _add("boundary", "fused", _BUILD + "boundary", FusedBoundarySettings, ("calibrat
 _add("boundary", "random", _BUILD + "boundary", RandomBoundarySettings, chooses=True)
 
 _add("skip", "none", _BUILD + "nothing")
+_add("skip", "parallel", _BUILD + "parallel_pass", colour=0x17BECF, parallel=True)  # a parallel target's own decoding
 _add("skip", "always", _BUILD + "always_skip", takes_draft=True)  # what prefill_draft drafts is never verified
 _add(
     *("skip", "similarity", _BUILD + "similarity_skip", SimilaritySkipSettings),

@@ -156,6 +156,7 @@ class TargetSettings:
     scene_tokens: int = 4  # tokens that carry the places' positions, estimated (vision) or given (state)
     instruction_tokens: int = 10
     image_size: int = 96
+    parallel: bool = False  # decodes all tokens of a chunk at once, each without the others (docs/methods.md §6)
 
 
 @dataclass

@@ -25,11 +25,11 @@ from kerv_cli.decoding.proposers import (
     RetrievalProposer,
 )
 from kerv_cli.decoding.rectify import DRAFT, Compensation
-from kerv_cli.decoding.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
+from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass, SkipLevels, VerifySkip
 from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import METHOD_KINDS, PREFILL, RetrievalProposerSettings, part_of
-from kerv_cli.registry import find
+from kerv_cli.registry import Part, find
 from kerv_cli.targets.protocol import Target
 
 LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: kinematics.MINIMUM
@@ -52,10 +52,11 @@ class Context:
         return loaded
 
 
-def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
+def check(method: Mapping[str, Any], chunk: int, trained: int, parallel: bool = False) -> None:
     """Refuses parts that do not belong together, and numbers out of range, before anything heavy is loaded.
 
-    method: kind -> settings, for every kind of METHOD_KINDS. chunk: asked for; trained: H of the target.
+    method: kind -> settings, for every kind of METHOD_KINDS. chunk: asked for; trained: H of the target. parallel:
+    whether the target decodes all tokens at once.
 
     Raises:
         UnknownName: no such part. UsageError: a composition that cannot work, or a number out of range.
@@ -77,11 +78,36 @@ def check(method: Mapping[str, Any], chunk: int, trained: int) -> None:
             f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
             f"proposer={draft.name}"
         )
+    check_parallel(chosen, parallel)
     if chosen["skip"].traits.get("takes_draft") and not draft.traits.get("chains"):
         raise UsageError(
             f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before "
             "the prefill, e.g. prefill_draft=early"
         )
+
+
+def check_parallel(chosen: Mapping[str, Part], parallel: bool) -> None:
+    """A parallel target has one way to decode, and no other target has it.
+
+    Raises:
+        UsageError: the method and the target differ, or a part would never be asked.
+    """
+    asked = bool(chosen["skip"].traits.get("parallel"))
+    if asked and not parallel:
+        raise UsageError(
+            "skip=parallel: this target decodes token by token; policy=parallel is the shipped one that does not, "
+            "kerv train target target.parallel=true trains one"
+        )
+    if parallel and not asked:
+        raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
+    idle = [kind for kind in ("prefill_draft", "proposer") if chosen[kind].name != "none"]
+    if asked and idle:
+        raise UsageError(f"skip=parallel with {idle[0]}={chosen[idle[0]].name}: nothing is drafted, leave it out")
+
+
+def is_parallel(target: Any) -> bool:
+    """Whether a target decodes all tokens at once; see `targets.protocol.ParallelTarget`."""
+    return bool(getattr(target, "parallel", False))
 
 
 def needs(method: Mapping[str, Any]) -> tuple[str, ...]:
@@ -105,7 +131,7 @@ def compose(
     Raises:
         UsageError: as `check`. CheckpointError: an artifact is missing or belongs to another target.
     """
-    check(method, chunk, target.chunk)
+    check(method, chunk, target.chunk, is_parallel(target))
     context = Context(target, artifact, task)
     for kind in METHOD_KINDS:
         context.built[kind] = part_of(kind, method[kind].kind).built(method[kind], context)
@@ -217,6 +243,11 @@ def boundary(settings: Any, context: Context) -> boundaries.Boundary:
 def always_skip(settings: Any, context: Context) -> AlwaysSkip:
     """skip=always."""
     return AlwaysSkip(context.built["prefill_draft"])
+
+
+def parallel_pass(settings: Any, context: Context) -> ParallelPass:
+    """skip=parallel."""
+    return ParallelPass(context.target)
 
 
 def similarity_skip(settings: Any, context: Context) -> VerifySkip:

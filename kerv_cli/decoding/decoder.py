@@ -13,7 +13,7 @@ from kerv_cli.decoding.acceptance import Acceptance
 from kerv_cli.decoding.boundary import Boundary
 from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Rejection, Situation, steps_of
 from kerv_cli.decoding.proposers import EMPTY
-from kerv_cli.decoding.record import DecodeRecord, Round
+from kerv_cli.decoding.record import PARALLEL, DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.decoding.thresholds import Fixed, Threshold
 from kerv_cli.decoding.verify_skip import Skip
@@ -30,7 +30,7 @@ class Parts:
 
     prefill_draft: makes the in-prefill draft, which the prefill verifies (§5). proposer: drafts behind committed
     tokens. rectifier: ends a chunk after a rejection; without one the target decodes on. boundary: chooses between the
-    sides of a hybrid proposer. skip: executes a retrieved chunk without verification.
+    sides of a hybrid proposer. skip: executes a chunk without verification.
     """
 
     acceptance: Acceptance | None = None  # None: strict
@@ -110,7 +110,7 @@ class Decoder:
             size=chunk.size,
             forwards=chunk.forwards,
             rounds=tuple(chunk.rounds),
-            mode=next((r.mode if r.mode == "skip" else r.proposer for r in chunk.rounds if r.drafted), "ar"),
+            mode=mode_of(chunk.rounds),
             seconds=seconds,
             phases=clock.phases,
             compensated=predicted,
@@ -137,10 +137,12 @@ class Decoder:
             choice = parts.boundary.choose(np.array(self.situation.path), self.situation.random)
         limits = self.acceptance.limits(self.threshold.radius())
         chunk = Chunk(prompt, self.steps, self.target.actions, self.cache, self.situation, limits, choice)
-        skipped = parts.skip is not None and parts.skip.take(chunk)
         clock.lap("propose")
-        if skipped:
-            return chunk
+        if parts.skip is not None:
+            taken = parts.skip.take(chunk)
+            clock.lap(parts.skip.phase)
+            if taken:
+                return chunk
         self.prefill(chunk, clock)
         if parts.proposer is not None and chunk.left > 1:
             parts.proposer.begin(chunk)
@@ -248,3 +250,13 @@ class Decoder:
         # where the target's token filled the last place nothing is missing, if it may be used
         if chunk.left or not rectifier.settings.use_target_token:
             rectifier.close(chunk)
+
+
+def mode_of(rounds: Sequence[Round]) -> str:
+    """`DecodeRecord.mode` of a chunk's rounds."""
+    for played in rounds:
+        if played.mode in ("skip", PARALLEL):
+            return played.mode
+        if played.drafted:
+            return played.proposer
+    return "ar"

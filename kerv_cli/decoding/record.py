@@ -11,6 +11,9 @@ import numpy as np
 
 from kerv_cli.spaces import ActionSpace
 
+PARALLEL = "parallel"
+"""Mode of a round, and of its decode, in which the target decoded all tokens at once."""
+
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
 
@@ -24,7 +27,7 @@ class Round:
     the whole path was accepted and places are left, one more: the bonus.
     """
 
-    mode: str  # "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward)
+    mode: str  # "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward), PARALLEL
     proposer: str  # which proposer drafted: "none", "drafter", "retrieval", "early", "hold", "kalman", ...
     start: int  # tokens committed before this round
     drafted: tuple[int, ...]
@@ -52,7 +55,7 @@ class DecodeRecord:
     actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps <= H
     forwards: int  # target forwards, prefill included
     rounds: tuple[Round, ...]
-    mode: str  # proposer of the first round that drafted; "skip": not verified; "ar": no draft; "expert"
+    mode: str  # proposer of the first round that drafted; "skip": not verified; PARALLEL; "ar": no draft; "expert"
     seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
@@ -65,9 +68,9 @@ class DecodeRecord:
 
     @property
     def unverified(self) -> int:
-        """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's,
-        else what a prediction or a rejected draft filled."""
-        return len(self.tokens) if self.skipped else self.compensated
+        """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's and
+        of a parallel one's, else what a prediction or a rejected draft filled."""
+        return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
 
     @property
     def verifications(self) -> int:

@@ -7,8 +7,10 @@ from typing import Protocol
 
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks
 from kerv_cli.decoding.proposers import RetrievalProposer
+from kerv_cli.decoding.record import PARALLEL, Round
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import SimilaritySkipSettings
+from kerv_cli.targets.protocol import ParallelTarget
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class SkipLevels:
 
 
 class Skip(Protocol):
-    """Decides, before the target's trunk runs, whether a draft is executed as it is."""
+    """Decides, before the target verifies anything, whether a chunk is executed as it is. phase: of its time."""
+
+    phase: str
 
     def reset(self) -> None:
         """A new episode begins."""
@@ -38,12 +42,38 @@ class Skip(Protocol):
         """An episode ended."""
 
     def take(self, chunk: Chunk) -> bool:
-        """Completes the chunk with a draft's tokens, if it may be executed unverified."""
+        """Completes the chunk, if it may be executed unverified -> whether it did."""
+
+
+class ParallelPass:
+    """Decodes all tokens by one bidirectional pass of a parallel target, as OpenVLA-OFT does (§6): each is chosen
+    without knowing the others, and none is verified."""
+
+    phase = "prefill"
+
+    def __init__(self, target: ParallelTarget) -> None:
+        self.target = target
+
+    def reset(self) -> None:
+        """Nothing is kept between decodes."""
+
+    def finish(self, success: bool) -> None:
+        """Nothing is kept between episodes."""
+
+    def take(self, chunk: Chunk) -> bool:
+        """As `Skip.take`; always."""
+        chunk.cache.length = 0
+        hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
+        tokens = self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist()
+        chunk.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, chunk.size, 0, ()), tokens)
+        return True
 
 
 class AlwaysSkip:
     """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
     whole chunk yet, the target decodes."""
+
+    phase = "propose"
 
     def __init__(self, source: DraftsChunks) -> None:
         self.source = source
@@ -71,6 +101,8 @@ class VerifySkip:
     0 s_min carries over between episodes: after a failure it rises by `up` times the calibrated range, after a success
     it falls by `down` times it. Results then depend on the order of episodes and on the evaluator's flag.
     """
+
+    phase = "propose"
 
     def __init__(self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:
         self.settings, self.retrieval, self.levels = settings, retrieval, levels

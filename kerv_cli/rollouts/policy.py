@@ -82,7 +82,9 @@ def check(settings: RolloutSettings) -> None:
         raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
     target.actions.check_same(spec.actions, f"target '{settings.policy.target}'", f"environment {spec.name}")
     method = settings.parts()
-    check_method(method, settings.chunk, target.chunk)
+    if settings.deviation_every > 0:
+        target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
+    check_method(method, settings.chunk, target.chunk, target.parallel)
     wanted = needs(method)
     artifacts.check(wanted)
     if "calibration" in wanted and method["threshold"].kind in ("kinematic", "change"):

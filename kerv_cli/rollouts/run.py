@@ -5,18 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.decoding.build import is_parallel
+from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.decoding.verify_skip import ParallelPass
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
 from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.policy import decoder_for
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
-from kerv_cli.targets.protocol import Target
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:
@@ -78,9 +80,10 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
     return settings.record < 0 or seed - settings.seed < settings.record
 
 
-def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Share in [0, 1] of successful episodes, decoded autoregressively, over tasks and seeds. Closes the worlds."""
-    decoder = Decoder(target)
+def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
+    """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to:
+    autoregressively or in parallel. Closes the worlds."""
+    decoder = Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
     outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
     close_worlds()
     return float(np.mean(outcomes))

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
 from kerv_cli.manifests import read
 from kerv_cli.registry import find
@@ -52,6 +52,22 @@ class TargetDescription(Description):
     def chunk(self) -> int:
         """H, control steps it was trained to decode at once."""
         return int(self.settings["chunk"])
+
+    @property
+    def parallel(self) -> bool:
+        """Whether it decodes all tokens of a chunk at once, and only so."""
+        return bool(self.settings.get("parallel"))
+
+    def check_autoregressive(self, asked: str, why: str) -> None:
+        """Refuses a target that decodes in parallel. asked: what wants another one; why: what it would lack.
+
+        Raises:
+            UsageError: it is parallel.
+        """
+        if self.parallel:
+            raise UsageError(
+                f"{asked}: the target decodes all tokens at once, {why}; choose one that is autoregressive"
+            )
 
 
 T = TypeVar("T", bound=Description)

@@ -104,3 +104,15 @@ class ReadableTarget(Target, Protocol):
 
     def pooled(self, prompt: Tensor) -> Tensor:
         """prompt (B, P, E) -> (B, F): the prompt as one vector, the input of the early drafter."""
+
+
+class ParallelTarget(Target, Protocol):
+    """A target that was trained to decode all N tokens of a chunk at once, and only so."""
+
+    @property
+    def parallel(self) -> bool:
+        """True."""
+
+    def parallel_pass(self, prompt: Tensor, cache: Any = None) -> Tensor:
+        """prompt (B, P, E) -> hidden states (B, N, E) of the chunk's tokens, in one forward. cache: an empty one with
+        room for P + N tokens."""

@@ -111,6 +111,7 @@ class CalibrationRun:
         self.tasks = resolve_tasks(settings.task)
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.described = self.artifacts.description
+        self.described.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
         if not 0 <= settings.fit_steps <= self.described.chunk:
             raise UsageError(
                 f"fit_steps={settings.fit_steps}: at most the target's chunk of {self.described.chunk}, 0 for all of it"

@@ -163,25 +163,27 @@ def new_target(
 
 
 def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:
-    """Checks that the target in `folder`, with this description, can be fine-tuned to `settings`. All of them but the
-    chunk length must agree; no weight depends on that.
+    """Checks that the target in `folder`, with this description, can be fine-tuned to `settings`. All of them but
+    the chunk length, on which no weight depends, and `parallel`, whose queries begin fresh, must agree.
 
     Raises:
         UsageError: the first shape that differs.
     """
     for name, wanted in asdict(settings).items():
         there = description.settings.get(name)
-        if name not in ("size", "chunk") and there != wanted:
+        if name not in ("size", "chunk", "parallel") and there != wanted:
             raise UsageError(
                 f"train.init: the target in {folder} has {name}={there}, the run target.{name}={wanted}: set both alike"
             )
 
 
 def continued_target(settings: TargetSettings, init: CompactTarget) -> CompactTarget:
-    """A policy of `settings` that begins with a copy of the weights of `init` and shares its statistics and words."""
+    """A policy of `settings` that begins with a copy of the weights of `init` and shares its statistics and words. Only
+    the queries of a parallel target are fresh."""
     camera = init.cameras[0] if init.cameras else ""
     target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
-    target.load_state_dict(init.state_dict())
+    fresh = {k: v for k, v in target.state_dict().items() if k == "queries"}
+    target.load_state_dict({**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}})
     return target
 
 

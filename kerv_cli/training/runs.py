@@ -237,6 +237,9 @@ class DrafterRun(Run):
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         described = read_target(self.target_folder)
         check_spaces(self.dataset, described.actions, described.observation, "the target")
+        described.check_autoregressive(
+            f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
+        )
 
     def place(self) -> Path:
         """Folder of the drafter."""

@@ -95,11 +95,19 @@ class CompactTarget(Packable):
         self.trunk = Trunk(s.width, s.layers, s.heads, s.feed_forward)
         self.head = nn.Linear(s.width, actions.tokens, bias=False)
         nn.init.normal_(self.head.weight, std=0.02)
+        if s.parallel:
+            queries = self.embedding.weight.data.mean(0).repeat(s.chunk * actions.dofs, 1)
+            self.queries = nn.Parameter(queries + 0.02 * torch.randn_like(queries))
 
     @property
     def chunk(self) -> int:
         """H, control steps it was trained to decode at once."""
         return self.settings.chunk
+
+    @property
+    def parallel(self) -> bool:
+        """Whether it decodes by `parallel_pass` alone; it has not learnt to continue action tokens."""
+        return self.settings.parallel
 
     @property
     def width(self) -> int:
@@ -230,9 +238,20 @@ class CompactTarget(Packable):
         hidden: Tensor = self.trunk(x, positions, cache, seen)
         return hidden
 
+    def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
+        """prompt (B, P, E) -> hidden states (B, N, E) of the chunk's tokens in one forward (docs/methods.md §6). No action
+        token is embedded: learned queries stand in their places and see the prompt and each other."""
+        x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
+        seen = np.tri(x.shape[1], dtype=bool)
+        seen[prompt.shape[1] :] = True
+        return self(x, torch.arange(x.shape[1], device=x.device), cache, seen)[:, prompt.shape[1] :]
+
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """tokens (B, N) -> logits (B, N, V) that predict them, and the positions of the places (B, K, 3), metres."""
+        """tokens (B, N) -> logits (B, N, V) that predict them, and the positions of the places (B, K, 3), metres. A
+        parallel target is shown none of the tokens."""
         prompt, places = self.encode_batch(inputs)
+        if self.parallel:
+            return self.head(self.parallel_pass(prompt)), places
         x = torch.cat([prompt, self.embedding(tokens[:, :-1]).to(prompt.dtype)], 1)
         hidden = self(x, torch.arange(x.shape[1], device=x.device))
         return self.head(hidden[:, prompt.shape[1] - 1 :]), places

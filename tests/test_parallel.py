@@ -1,0 +1,144 @@
+"""A target that decodes all tokens of a chunk at once (docs/methods.md §6)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from kerv_cli.config import compose
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.verify_skip import ParallelPass
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import UsageError
+from kerv_cli.rollouts.policy import check, decoder_for
+from kerv_cli.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.spaces import Observation
+from kerv_cli.targets.checkpoint import save_target
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.training.imitation import check_init, continued_target
+from kerv_cli.training.runs import drafter_run
+
+WORDS = WordTokenizer.build(["pull the drawer open"])
+
+
+def nano(*overrides: str) -> TargetSettings:
+    words = ["target=nano", "target.observation=state", "target.chunk=2", *overrides]
+    return compose("train_target", words, TrainTargetSettings).target
+
+
+def target(*overrides: str) -> CompactTarget:
+    torch.manual_seed(1)
+    made = CompactTarget(nano(*overrides), SPEC.actions, SPEC.observation, WORDS)
+    torch.nn.init.normal_(made.head.weight, std=1.0)
+    return made.eval()
+
+
+def some_observation(seed: int = 0) -> Observation:
+    rng = np.random.default_rng(seed)
+    space = SPEC.observation
+    return Observation(
+        rng.normal(size=len(space.proprioception)), rng.normal(size=space.state), "pull the drawer open", {}
+    )
+
+
+def oracle(policy: CompactTarget, prompt: torch.Tensor) -> list[int]:
+    """The tokens by explicit loops over rows: the prompt is causal, every query sees everything."""
+    x = torch.cat([prompt, policy.queries[None]], 1)
+    length, size = x.shape[1], prompt.shape[1]
+    mask = torch.full((length, length), -torch.inf)
+    for row in range(length):
+        mask[row, : row + 1 if row < size else length] = 0
+    rotary = policy.trunk.rotary(torch.arange(length))
+    for layer in policy.trunk.layers:
+        x = layer(x, rotary, mask=mask)
+    return policy.head(policy.trunk.norm(x))[0, size:].argmax(-1).tolist()
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("packed", [False, True])
+def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed: bool) -> None:
+    policy = target("target.parallel=true")
+    wanted = oracle(policy, policy.encode(some_observation()))
+    if packed:
+        policy.pack()
+    decoder = Decoder(policy, Parts(skip=ParallelPass(policy)))
+    decoder.reset("", 0, np.zeros(3))
+    record = decoder.decode(some_observation())
+    assert list(record.tokens) == wanted
+    assert len(set(wanted)) > 1
+    assert (record.forwards, record.mode, record.unverified) == (1, "parallel", policy.chunk * policy.actions.dofs)
+    assert record.phases["prefill"] > record.phases["propose"]
+
+
+@torch.inference_mode()
+def test_a_later_query_changes_the_first_token_s_logits() -> None:
+    policy = target("target.parallel=true")
+    prompt = policy.encode(some_observation())
+    before = policy.parallel_pass(prompt)[0, 0].clone()
+    policy.queries[-1] += 1.0
+    assert not torch.allclose(before, policy.parallel_pass(prompt)[0, 0])
+
+
+def test_training_shows_it_no_action_token() -> None:
+    policy = target("target.parallel=true")
+    one = some_observation()
+    inputs: Inputs = policy.inputs(one)
+    first = torch.zeros(1, 8, dtype=torch.long)
+    logits = [policy.teacher_forced(inputs, tokens)[0] for tokens in (first, first + 5)]
+    assert torch.equal(*logits)
+
+
+def test_it_continues_an_autoregressive_target_with_fresh_queries() -> None:
+    plain = target()
+    made = continued_target(nano("target.parallel=true"), plain)
+    assert torch.equal(made.head.weight, plain.head.weight)
+    assert made.queries.shape == (8, plain.width)
+    described = type("D", (), {"settings": vars(plain.settings)})()
+    check_init(nano("target.parallel=true"), described, Path("x"))
+    with pytest.raises(UsageError, match=r"width"):
+        check_init(nano("target.parallel=true", "target.width=64"), described, Path("x"))
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    for name, policy in (("plain", target()), ("parallel", target("target.parallel=true"))):
+        save_target(tmp_path / "artifacts/target" / name, policy, "metaworld", {})
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("policy.target=plain method=parallel", "decodes token by token"),
+        ("policy.target=parallel method=ar", "use method=parallel"),
+        ("policy.target=parallel method=spec_vla", "use method=parallel"),
+        ("policy.target=parallel method=parallel proposer=jacobi", "proposer=jacobi: nothing is drafted"),
+        ("policy.target=parallel method=parallel deviation_every=2", "no AR to differ from"),
+    ],
+)
+def test_target_and_method_must_fit(results: Path, words: str, message: str) -> None:
+    settings = compose("rollout", [f"results={results}", "task=drawer-open-v3", *words.split()], RolloutSettings)
+    with pytest.raises(UsageError, match=message):
+        check(settings)
+
+
+def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from kerv_cli.environments.demos.dataset import DemoDataset
+
+    same = type("M", (), {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name})
+    demos = type("D", (), {"manifest": same, "path": Path("demos")})()
+    monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: demos))
+    settings = compose("train_drafter", [f"results={results}", "policy.target=parallel"], TrainDrafterSettings)
+    with pytest.raises(UsageError, match="no greedy decodes to imitate"):
+        drafter_run(settings)
+
+
+def test_a_rollout_of_it_is_composed_by_name(results: Path) -> None:
+    words = [f"results={results}", "task=drawer-open-v3", "policy.target=parallel", "method=parallel"]
+    settings = compose("rollout", words, RolloutSettings)
+    check(settings)
+    assert decoder_for(settings, "drawer-open-v3").cameras == ()
