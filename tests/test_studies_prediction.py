@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import html
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
 from kerv_cli.artifacts import MadeFor
 from kerv_cli.decoding.calibration_file import Calibration, Demonstrations, save_calibration
+from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.drafting.kinematics import FILTERS, Noise
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
@@ -101,7 +105,7 @@ def test_summary_and_figure_average_position_over_tasks(tmp_path: Path) -> None:
     # (1 + 2 + 3) / 3 per DoF, (1 + 2) / 2 per task
     assert summary.loc["hold"].to_list() == ["0.3000", "0.6000"]
     assert summary.loc["kalman"].to_list() == ["0.0750 (25 %)", "0.1500 (25 %)"]
-    ahead, by_task = prediction_figure(predictions, table).axes
+    ahead, by_task = prediction_figure("Prediction", table).axes
     lines = {line.get_label(): list(line.get_ydata()) for line in ahead.get_lines()}
     assert lines["linear"] == pytest.approx([0.15, 0.30])
     assert set(lines) == {"hold", "linear", "kalman"}
@@ -152,6 +156,42 @@ def test_the_page_shows_what_its_methods_use(tmp_path: Path) -> None:
     assert len(ids) == len(set(ids))
     table = pd.read_csv(tmp_path / "report/tables/prediction_made-here.csv")
     assert list(table.columns[:6]) == ["target", "predictor", "task", "dof", "steps_ahead", "error"]
+
+
+def test_what_the_policy_itself_executed_is_predicted_too(tmp_path: Path) -> None:
+    """Its actions rise by 0.01 a step: a line is exact, holding is wrong by 0.01 a step."""
+    calibrate(tmp_path)
+    settings = {"kerv": settings_of("kerv", 9, episodes=2), "ar": settings_of("ar", episodes=2)}
+    for s in settings.values():
+        s.policy.target = "made-here"
+    settings["kerv"].rectifier = part("rectifier", "compensate")
+    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar")
+    store = StudyStore(tmp_path, "own")
+    for cell in cells:
+        rising = [ramp(record) if cell.label == "ar" else record for record in run_cell(cell)]
+        store.write_cell(cell, rising, STATUS)
+    store.write_plan(StudySettings("own", "own", "ar"), cells)
+
+    written = names(tmp_path, report(tmp_path, "own").files)
+
+    assert {"report/tables/own_own_actions.csv", "report/plots/own_own_actions.png"} <= set(written)
+    table = pd.read_csv(tmp_path / "report/tables/own_own_actions.csv")
+    errors = table.set_index(["predictor", "task", "dof", "steps_ahead"])
+    assert set(table["task"]) == {"reach-v3"}
+    assert errors.loc[("hold", "reach-v3", "dx", 2), "error"] == pytest.approx(0.02, abs=1e-6)
+    assert errors.loc[("linear", "reach-v3", "dx", 2), "error"] == pytest.approx(0.0, abs=1e-6)
+    assert errors.loc[("hold", "reach-v3", "dz", 1), "labels_error"] == pytest.approx(0.1 * 3)
+    assert (table["run"] == "r1").all()
+    assert "the policy's own actions" in html.unescape((store.root / "report.html").read_text(encoding="utf-8"))
+
+
+def ramp(record: EpisodeRecord) -> EpisodeRecord:
+    """Rising actions in every DoF; the last chunk goes beyond its end, where the action is another."""
+    values = -0.9 + 0.01 * np.arange(record.steps + 4, dtype=np.float32)[:, None].repeat(4, axis=1)
+    values[record.steps - 2 :] = 1.0
+    chunks = (values[4 * i : 4 * i + 4] for i in range(len(record.decodes)))
+    decodes = tuple(replace(d, actions=chunk) for d, chunk in zip(record.decodes, chunks, strict=True))
+    return replace(record, decodes=decodes, steps=record.steps - 2)
 
 
 def test_without_a_study_every_calibration_is_reported(tmp_path: Path) -> None:

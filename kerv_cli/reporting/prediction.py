@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kerv_cli.decoding.calibration_file import Calibration, calibration_place, read_calibration
+from kerv_cli.decoding.calibration_file import Calibration, Errors, calibration_place, read_calibration
 from kerv_cli.drafting.kinematics import PREDICTORS
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import sha256_of
@@ -84,17 +84,22 @@ def prediction_table(predictions: Predictions) -> pd.DataFrame:
         "demos_sha256": calibration.demos.sha256,
         "git_commit": calibration.provenance.get("git_commit", ""),
     }
+    return pd.DataFrame(error_rows(predictions.target, errors, calibration.demos.tasks)).assign(**origin)
+
+
+def error_rows(target: str, errors: Errors, episodes: Mapping[str, Mapping[str, int]]) -> list[dict[str, Any]]:
+    """Errors as rows. episodes: task -> how many were held_out and how many training."""
     rows = []
     for predictor, tasks in errors.items():
         for task, dofs in tasks.items():
-            counts = calibration.demos.tasks.get(task, {})
+            counts = episodes.get(task, {})
             held_out = {"held_out_episodes": counts.get("held_out"), "training_episodes": counts.get("training")}
             for dof, steps in dofs.items():
                 for step, error in enumerate(steps):
                     hold = errors.get(REFERENCE, {}).get(task, {}).get(dof, [])
-                    head = {"target": predictions.target, "predictor": predictor, "task": task, "dof": dof}
+                    head = {"target": target, "predictor": predictor, "task": task, "dof": dof}
                     rows.append(head | {"steps_ahead": step + 1} | _against(error, hold[step : step + 1]) | held_out)
-    return pd.DataFrame(rows).assign(**origin)
+    return rows
 
 
 def _against(error: float, hold: list[float]) -> dict[str, float]:
@@ -130,8 +135,9 @@ def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows.values())
 
 
-def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
-    """Error against steps ahead, one line per predictor, and every task's error one step ahead."""
+def prediction_figure(title: str, table: pd.DataFrame, of: str = "held-out episodes") -> Figure:
+    """Error against steps ahead, one line per predictor, and every task's error one step ahead. of: the episodes that
+    were predicted."""
     means = predicted_means(table)
     predictors, tasks = list(dict.fromkeys(means["predictor"])), list(dict.fromkeys(means["task"]))
     with mpl.rc_context(STYLE):
@@ -143,9 +149,9 @@ def prediction_figure(predictions: Predictions, table: pd.DataFrame) -> Figure:
         handles, labels = ahead.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         held_out = table.drop_duplicates("task")["held_out_episodes"].sum()
-        about = f"mean of {', '.join(predicted_dofs(table))} · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
+        about = f"mean of {', '.join(predicted_dofs(table))} · {len(tasks)} tasks, {held_out:.0f} {of}"
         about += f" · from the last {table['window'][0]} steps"
-        entitle(figure, f"Prediction of the next actions, {predictions.target}", about)
+        entitle(figure, title, about)
     return figure
 
 

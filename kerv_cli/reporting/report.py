@@ -17,6 +17,7 @@ from kerv_cli.reporting import prediction
 from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
 from kerv_cli.reporting.measures import MACRO, MICRO
+from kerv_cli.reporting.own_actions import own_errors
 from kerv_cli.reporting.plots import study_figures
 from kerv_cli.reporting.publish import check_publishable
 from kerv_cli.reporting.summary import summary_frame
@@ -94,7 +95,9 @@ class _Reporter:
         figures = study_figures(whole, data.plan.axis, data.plan.title or name)
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
-        sections = [self.prediction_section(target) for target in prediction.predicting_targets(settings)]
+        sections = []
+        for target in prediction.predicting_targets(settings):
+            sections += [self.prediction_section(target), self.own_actions_section(store, data, target)]
         if _varies_boundary(settings):
             sections.append(self.curvature_section())
         page = store.root / "report.html"
@@ -113,10 +116,26 @@ class _Reporter:
     def _predictions(self, found: prediction.Predictions) -> Section:
         table = prediction.prediction_table(found)
         self._save_table(table, found.name)
+        title = f"Prediction of the next actions, {found.target}"
         return Section(
-            title=f"Prediction of the next actions, {found.target}",
+            title=title,
             note=_prediction_note(found, table),
-            figure=self._save_plot(prediction.prediction_figure(found, table), found.name),
+            figure=self._save_plot(prediction.prediction_figure(title, table), found.name),
+            table=prediction.prediction_summary(table),
+        )
+
+    def own_actions_section(self, store: StudyStore, data: StudyData, target: str) -> Section | None:
+        """Writes the prediction errors on what the study's autoregressive episodes executed; None without any."""
+        found = prediction.read_predictions(self.results, target)
+        table = own_errors(store, data, found) if found is not None else None
+        if found is None or table is None:
+            return None
+        name, title = f"{store.name}_own_actions", f"Prediction of the policy's own actions, {target}"
+        self._save_table(table, name)
+        return Section(
+            title=title,
+            note=f"As above, on what the autoregressive episodes of this study executed: tables/{name}.csv.",
+            figure=self._save_plot(prediction.prediction_figure(title, table, "episodes of the policy"), name),
             table=prediction.prediction_summary(table),
         )
 

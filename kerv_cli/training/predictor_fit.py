@@ -54,13 +54,22 @@ def episode_windows(
     Raises:
         CheckpointError: too few labels were recorded beyond the episode's end.
     """
-    steps, dofs = episode.executed.shape
+    steps = len(episode.executed)
     check_tail(episode, horizon, f"predictions of {horizon} steps")
-    if steps <= window:
-        return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
     labels = actions.normalise(episode.labels)
     source = labels[:steps] if history == "labels" else actions.normalise(episode.executed)
-    past = np.lib.stride_tricks.sliding_window_view(source[:-1], window, axis=0)
+    return windows_of(source, labels, window, horizon, steps)
+
+
+def windows_of(
+    source: np.ndarray, labels: np.ndarray, window: int, horizon: int, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(past (n, window, D), future (n, horizon, D)) of the moments window … steps − 1 of an episode: the past is from
+    `source` (≥ steps, D), the future from `labels` (≥ steps + horizon − 1, D)."""
+    if steps <= window:
+        dofs = source.shape[1]
+        return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))
+    past = np.lib.stride_tricks.sliding_window_view(source[: steps - 1], window, axis=0)
     future = np.lib.stride_tricks.sliding_window_view(labels[window : steps + horizon - 1], horizon, axis=0)
     return past.swapaxes(1, 2), future.swapaxes(1, 2)
 

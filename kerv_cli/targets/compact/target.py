@@ -239,7 +239,7 @@ class CompactTarget(Packable):
         return hidden
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
-        """prompt (B, P, E) -> hidden states (B, N, E) of the chunk's tokens in one forward (docs/methods.md §6). No action
+        """prompt (B, P, E) -> hidden states (B, N, E) of all tokens, in one forward (docs/methods.md §6). No action
         token is embedded: learned queries stand in their places and see the prompt and each other."""
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         seen = np.tri(x.shape[1], dtype=bool)
