@@ -171,6 +171,7 @@ class TrainSettings:
     clip: float = 1.0
     ema: float = 0.999
     init: str | None = None  # target that gives the initial weights; its chunk may be shorter or longer
+    freeze: list[str] = field(default_factory=list)  # modules of the target that keep the weights of `init`
     label_sigma: float = 1.0  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
     scene_weight: float = 1.0  # weight of the position loss (vision only)
     scene_steps: int = 0  # first steps that train only the vision encoder, on positions

@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,12 +31,13 @@ from studies_synthetic import (
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import StorageError, UsageError
 from kerv_cli.settings import RuntimeSettings
+from kerv_cli.studies.adopt import adopt
 from kerv_cli.studies.block import RunEpisode
 from kerv_cli.studies.claims import is_claimed
 from kerv_cli.studies.estimate import estimate
 from kerv_cli.studies.events import BlockStarted, CellDone, CellFailed, CellReused, Event, SweepFinished, SweepStarted
 from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Cell, blocks_of
+from kerv_cli.studies.plan import Block, Cell, blocks_of
 from kerv_cli.studies.progress import ProgressDisplay
 from kerv_cli.studies.store import StudyStore
 
@@ -263,6 +265,49 @@ def test_workers_of_a_killed_sweep_end_and_complete_cells_stay(
     assert not is_claimed(store.claims, cells[4])
     assert [store.has_cell(cell.id) for cell in cells] == [True] * 4 + [False] * 4
     assert len(execute(cells, prepare, store).done) == 4
+
+
+def test_a_block_that_another_study_measured_is_taken_over_whole(store: StudyStore) -> None:
+    """`wide` measured a superset; `store` takes its blocks over, with the other run's id, and runs nothing."""
+    wide = StudyStore(store.root.parent.parent, "wide")
+    cells = threshold_study(["reach-v3"])
+    execute(cells, prepare, wide)
+    part_of_them = [cell for cell in cells if cell.label != "naive_sd"]
+
+    run, calls = count_calls()
+    outcome = execute(part_of_them, run, store)
+
+    assert (len(outcome.reused), outcome.done, outcome.failed, calls) == (3, [], [], [])
+    theirs = {wide.status_of(cell.id)["run"] for cell in cells}
+    assert {store.status_of(cell.id)["run"] for cell in part_of_them} == theirs
+    assert len(list(store.cells.iterdir())) == 3
+
+
+def test_a_block_is_not_taken_over_in_part(store: StudyStore) -> None:
+    """Ratios within it would have sides of two runs."""
+    other = StudyStore(store.root.parent.parent, "small")
+    cells = threshold_study(["reach-v3"])
+    execute(cells[:2], prepare, other)
+
+    outcome = execute(cells, prepare, store)
+
+    assert len(outcome.done) == len(cells)
+    assert len({store.status_of(cell.id)["run"] for cell in cells}) == 1
+
+
+def test_a_block_of_two_runs_is_not_taken_over_and_a_begun_one_is_completed(store: StudyStore) -> None:
+    other = StudyStore(store.root.parent.parent, "wide")
+    cells = threshold_study(["reach-v3"])
+    for some in (cells[:2], cells):  # two runs
+        execute(some, prepare, other)
+    assert not adopt(store, Block(tuple(cells)))
+
+    again = StudyStore(store.root.parent.parent, "again")
+    execute(cells, prepare, again)
+    store.cells.mkdir(parents=True)
+    shutil.copytree(again.cells / cells[0].id, store.cells / cells[0].id)  # as after a kill
+    assert adopt(store, Block(tuple(cells)))
+    assert all(store.has_cell(cell.id) for cell in cells)
 
 
 def test_estimates_say_what_they_rest_on(store: StudyStore) -> None:

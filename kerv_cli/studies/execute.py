@@ -17,6 +17,7 @@ from kerv_cli.errors import CheckpointError, StorageError
 from kerv_cli.provenance import git_commit
 from kerv_cli.settings import RuntimeSettings
 from kerv_cli.studies import events
+from kerv_cli.studies.adopt import adopt
 from kerv_cli.studies.block import BlockRun, CellResult, Gauge, Prepare, failed
 from kerv_cli.studies.claims import is_claimed, release, running_cell
 from kerv_cli.studies.executors import Executor, WorkerLost, check_executor, open_executor
@@ -86,6 +87,8 @@ class _Sweep:
     def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
         """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
         damaged: dict[str, tuple[Cell, CellResult]] = {}
+        for block in blocks_of(cells):
+            adopt(self.store, block)
         for cell in (cell for block in blocks_of(cells) for cell in block.cells):
             try:
                 if self.store.has_cell(cell.id):

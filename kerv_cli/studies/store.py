@@ -119,14 +119,18 @@ class StudyStore:
         Raises:
             CheckpointError: its folder is damaged; the message names it and the remedy.
         """
-        folder = self.cells / name
-        if not folder.exists():
+        if not (self.cells / name).exists():
             return False
-        self._status(folder)
+        self.status_of(name)
         return True
 
-    def _status(self, folder: Path) -> dict[str, Any]:
-        """status.json, after every other file was compared with the hash in it."""
+    def status_of(self, name: str) -> dict[str, Any]:
+        """status.json of a complete cell, after every other file was compared with the hash in it.
+
+        Raises:
+            CheckpointError: as `has_cell`.
+        """
+        folder = self.cells / name
         try:
             status = read_json(folder / _STATUS)
             for file in _CELL_FILES:
@@ -173,7 +177,7 @@ class StudyStore:
                 for file, content in files.items():
                     _write_synced(temporary / file, content)
                 sync(temporary)
-                return _rename_once(temporary, folder)
+                return rename_once(temporary, folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
@@ -215,7 +219,7 @@ class StudyStore:
         folder = self.cells / name
         if not folder.exists():
             raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
-        status = self._status(folder)
+        status = self.status_of(name)
         try:
             config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
             episodes = pq.read_table(folder / "episodes.parquet", columns=rows.EPISODE_SCHEMA.names).to_pandas()
@@ -312,7 +316,7 @@ def _write_synced(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _rename_once(temporary: Path, folder: Path) -> bool:
+def rename_once(temporary: Path, folder: Path) -> bool:
     """Renames `temporary` to `folder`; False if `folder` exists already."""
     try:
         os.rename(temporary, folder)

@@ -7,7 +7,8 @@ of the tasks), so the score is the success of closed-loop episodes where the set
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from kerv_cli.environments import specs
 from kerv_cli.environments.demos.dataset import DemoDataset
@@ -91,16 +93,21 @@ class Imitation:
         encoded = self.target.actions.encode(samples.chunks[indices].numpy())
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
-    def autocast(self) -> torch.autocast:
-        """bfloat16 autocast where the settings ask for it."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16)
+    @contextlib.contextmanager
+    def precision(self) -> Iterator[None]:
+        """bfloat16 autocast where the settings ask for it. On a CPU attention is then computed by its formula: the
+        backward pass of the fused kernel takes four times as long there."""
+        fused = self.device.type != "cpu" or not self.settings.bf16
+        kernels = [SDPBackend.MATH] + [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION] * fused
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16), sdpa_kernel(kernels):
+            yield
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Token loss and weighted position loss at `indices` (B,); in the first `scene_steps` the position
         loss alone."""
         inputs = self.training.inputs(indices, self.device)
         scene = self.settings.scene_weight if self.target.cameras else 0.0
-        with self.autocast():
+        with self.precision():
             places = places_of(inputs.states, self.target.observation)
             if scene and step < self.settings.scene_steps:
                 loss = position_loss(self.target.encode_batch(inputs)[1], places)

@@ -101,6 +101,19 @@ class Run(ABC):
         self.write(module, made)
 
 
+def freeze(target: CompactTarget, names: list[str]) -> None:
+    """Keeps the weights of the named modules of a target as they are.
+
+    Raises:
+        UsageError: it has no such module.
+    """
+    known = dict(target.named_children())
+    for name in names:
+        if name not in known:
+            raise UnknownName("train.freeze", name, known)
+        known[name].requires_grad_(False)
+
+
 class TargetRun(Run):
     """`kerv train target`. The constructor checks that the run is possible.
 
@@ -154,8 +167,10 @@ class TargetRun(Run):
         Raises:
             UsageError: the run would overwrite it, or another shape. CheckpointError: no such target.
         """
-        name = self.settings.train.init
+        name, frozen = self.settings.train.init, self.settings.train.freeze
         if name is None:
+            if frozen:
+                raise UsageError(f"train.freeze={frozen}: fresh weights would stay as they are; set train.init too")
             return None
         folder = find_target(self.settings.results, name)
         if name == self.settings.name or folder.resolve() == self.folder.resolve():
@@ -197,6 +212,7 @@ class TargetRun(Run):
             target = new_target(settings.target, self.dataset, self.samples, self.words, camera, seed)
         else:
             target = continued_target(settings.target, self.begun)
+            freeze(target, settings.train.freeze)
         run = Imitation(target.to(self.device), self.samples, settings.train, torch.device(self.device))
         return imitation_job(run, self.save, self.closed_loop if settings.train.closed_loop else None)
 
@@ -232,6 +248,8 @@ class DrafterRun(Run):
         self.settings = settings
         if settings.train.init is not None:
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
+        if settings.train.freeze:
+            raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
         self.folder = self.place()
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))

@@ -1,0 +1,64 @@
+"""Takes over blocks that another study of the same results folder has measured: a study whose settings are among those
+of a larger one needs no run of its own."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+from kerv_cli.errors import CheckpointError
+from kerv_cli.files import storage_errors
+from kerv_cli.studies.plan import Block
+from kerv_cli.studies.store import StudyStore, rename_once
+
+
+def adopt(store: StudyStore, block: Block) -> bool:
+    """Copies a block's cells from a study that measured all of them in one run -> whether there is one. A block is
+    taken over whole or not at all: with single cells of it the sides of a ratio would come from different runs.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    if all((store.cells / cell.id).exists() for cell in block.cells):
+        return False
+    here = _runs(store, block)
+    for other in _others(store):
+        runs = _runs(other, block)
+        if len(runs) == len(block.cells) and len({*runs.values(), *here.values()}) == 1:
+            for name in runs.keys() - here.keys():
+                _copy(other.cells / name, store.cells / name)
+            return True
+    return False
+
+
+def _others(store: StudyStore) -> Iterator[StudyStore]:
+    for folder in sorted(store.root.parent.glob("*/cells")):
+        if folder.parent.name != store.name:
+            yield StudyStore(store.root.parent.parent, folder.parent.name)
+
+
+def _runs(store: StudyStore, block: Block) -> dict[str, str]:
+    """Id -> run of the block's cells that are complete in a study; damaged ones are left out."""
+    found = {}
+    for cell in block.cells:
+        try:
+            if store.has_cell(cell.id):
+                found[cell.id] = str(store.status_of(cell.id)["run"])
+        except (CheckpointError, KeyError):
+            continue
+    return found
+
+
+def _copy(source: Path, folder: Path) -> None:
+    temporary = folder.parent / f".{folder.name}.{socket.gethostname()}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+    try:
+        with storage_errors(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copytree(source, temporary)
+            rename_once(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
