@@ -246,6 +246,7 @@ class ReportSettings(CommandSettings):
     """`kerv report`."""
 
     only: str | None = None  # name of one study (study=NAME on the command line); default: all that are there
+    against: str | None = None  # results folder with another run of that study: how far the two agree
 
 
 @dataclass

@@ -25,11 +25,14 @@ def report(overrides: Overrides = None, cfg: ShowConfig = False, publish: Publis
     words = [f"only={o[6:]}" if o.startswith("study=") else o for o in overrides or []]
     settings = composed("report", words, ReportSettings, cfg)
     from kerv_cli.places import results_dir
+    from kerv_cli.reporting.agreement import agreement_summary
     from kerv_cli.reporting.report import report as write_report
     from kerv_cli.reporting.summary import summary_table
 
-    written = write_report(results_dir(settings.results), settings.only, publish)
+    written = write_report(results_dir(settings.results), settings.only, publish, settings.against)
     for table in written.tables.values():
         console().print(summary_table(table))
+    if written.agreement is not None:
+        console().print(agreement_summary(written.agreement))
     for path in written.files:
         typer.echo(str(path))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from kerv_cli.errors import UsageError
 from kerv_cli.files import atomic_path
 from kerv_cli.reporting import prediction
+from kerv_cli.reporting.agreement import agreement_table
 from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
 from kerv_cli.reporting.measures import MACRO, MICRO
@@ -27,19 +28,21 @@ from kerv_cli.studies.store import StudyStore, begun_studies
 
 @dataclass(frozen=True)
 class Report:
-    """files: those written, in order. tables: study -> its `study_table`."""
+    """files: those written, in order. tables: study -> its `study_table`. agreement: with another run of the study."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
+    agreement: pd.DataFrame | None = None
 
 
-def report(results: Path | str, study: str | None = None, publish: bool = False) -> Report:
+def report(results: Path | str, study: str | None = None, publish: bool = False, against: str | None = None) -> Report:
     """Writes a study's files, or those of every study that has a complete cell and of every calibration.
 
     In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
     plots/<study>*.png and, where small, .svg. Always studies/<study>/report.html. Tables and plots of
     prediction_<target> are added for a study whose methods predict actions, and of boundary_radius for one that
-    compares boundaries. The same cells give the same bytes.
+    compares boundaries; with `against`, the results folder of another run of the study, tables/<study>_agreement.csv.
+    The same cells give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
@@ -50,7 +53,11 @@ def report(results: Path | str, study: str | None = None, publish: bool = False)
     reporter = _Reporter(Path(results), publish)
     if study:
         reporter.report_study(study)
-        return reporter.report
+        if against is None:
+            return reporter.report
+        return replace(reporter.report, agreement=reporter.agreement(study, Path(against)))
+    if against is not None:
+        raise UsageError(f"against={against}: name the study of which it holds another run, study=NAME")
     names = begun_studies(results)
     calibrated = prediction.calibrated_targets(Path(results))
     if not names and not calibrated:
@@ -105,6 +112,16 @@ class _Reporter:
             shown = [section for section in sections if section is not None]
             temporary.write_text(_page(store, data, whole, per_task, drawn, shown), encoding="utf-8")
         self.report.files.append(page)
+
+    def agreement(self, name: str, against: Path) -> pd.DataFrame:
+        """Writes how far the study's run in another results folder agrees with the one reported here."""
+        data = load_study(StudyStore(against, name))
+        other = study_table(data)
+        if self.publish:
+            check_publishable(data, other)
+        table = agreement_table(self.report.tables[name], other)
+        self._save_table(table, f"{name}_agreement")
+        return table
 
     def prediction_section(self, target: str) -> Section | None:
         """Writes a target's prediction errors; None where it was not calibrated."""
