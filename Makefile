@@ -8,7 +8,7 @@ CODE := kerv_cli tests scripts
 test: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test demo lint format clean
+.PHONY: help setup test demo lint format pages clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -34,6 +34,9 @@ lint: setup ## check style and types
 format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
+
+pages: ## fill the figures of README.md and results/README.md from results/tables
+	@$(BIN)/python scripts/figures.py README.md results/README.md
 
 clean: ## remove caches and built packages; keeps .venv and results
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis MUJOCO_LOG.TXT

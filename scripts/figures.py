@@ -1,0 +1,166 @@
+"""Fills the figures of Markdown pages from the committed tables: `scripts/figures.py PAGE…`, `--check` changes nothing.
+
+    <!-- table main: setting success speedup -->      becomes a table with these columns, a row per setting
+    <!-- /table -->
+    <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
+
+A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
+instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+TABLES = Path(__file__).resolve().parent.parent / "results" / "tables"
+_TABLE = re.compile(r"(<!-- table (\S+)((?: \S+)*?): ([^>]*?) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
+_FIGURE = re.compile(r"(<!-- figure (\S+)( macro)? (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
+
+Row = Mapping[str, str]
+
+
+class BadReference(Exception):
+    """A page names a table, setting or column that does not exist."""
+
+
+@functools.cache
+def table_of(study: str, macro: bool) -> tuple[dict[str, str], ...]:
+    """The rows of one averaging of a study's table; all rows of a table without averaging."""
+    path = TABLES / f"{study}.csv"
+    if not path.is_file():
+        raise BadReference(f"no table {path.name} in {TABLES}")
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    wanted = "macro over difficulty groups" if macro else "micro over tasks"
+    return tuple(row for row in rows if row.get("averaging", wanted) == wanted)
+
+
+def _number(row: Row, name: str, form: str, scale: float = 1.0, unit: str = "") -> str:
+    if name not in row:
+        raise BadReference(f"no column {name}")
+    text = row[name]
+    return f"{scale * float(text):{form}}{unit}" if text not in ("", "nan") else ""
+
+
+def _interval(row: Row, name: str, form: str, scale: float = 1.0, between: str = "–") -> str:
+    value, low, high = (_number(row, f"{name}{end}", form, scale) for end in ("", "_low", "_high"))
+    return f"{value} ({low}{between}{high})" if value and low else value
+
+
+def _own(text: Callable[[Row], str]) -> Callable[[Row], str]:
+    """Empty for the baseline, which is not compared with itself."""
+    return lambda row: "" if row["label"] == row["baseline"] else text(row)
+
+
+def _lost_won(row: Row) -> str:
+    p = float(row["mcnemar_p"] or "nan")
+    return f"{row['only_baseline']} / {row['only_method']}, {'<0.001' if p < 0.001 else f'{p:.2g}'}"
+
+
+def _rate(row: Row) -> str:
+    """Decodes per second that the 95th percentile of the latency allows."""
+    latency = _number(row, "latency_p95_ms", ".6f")
+    return f"{1000 / float(latency):.0f}" if latency and float(latency) else ""
+
+
+def _again(row: Row) -> str:
+    value, low, high = (_number(row, f"speedup{end}_again", ".2f") for end in ("", "_low", "_high"))
+    return f"{value} ({low}–{high})"
+
+
+COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
+    "setting": ("setting", lambda row: row["label"]),
+    "success": ("success", lambda row: f"{row['successes']}/{row['episodes']}"),
+    "percent": ("success, %", lambda row: _interval(row, "success", ".1f", 100)),
+    "lost/won": ("lost / won, p", _own(_lost_won)),
+    "difference": ("difference, points", _own(lambda row: _interval(row, "difference", "+.1f", 100, " to "))),
+    "non-inferior": ("non-inferior", _own(lambda row: {"True": "yes", "False": "no"}.get(row["non_inferior"], ""))),
+    "pairs": ("pairs to settle", _own(lambda row: _number(row, "pairs_to_settle", ".0f"))),
+    "speedup": ("speedup", lambda row: _interval(row, "speedup", ".2f")),
+    "per-episode": ("per episode", lambda row: _interval(row, "episode_speedup", ".2f")),
+    "ceiling": ("ceiling", lambda row: _number(row, "ceiling", ".1f")),
+    "ms": ("ms per step", lambda row: _number(row, "time_per_step_ms", ".2f")),
+    "ms-episode": ("ms per episode", lambda row: _number(row, "time_per_episode_ms", ".0f")),
+    "p50": ("p50, ms", lambda row: _number(row, "latency_p50_ms", ".1f")),
+    "p95": ("p95, ms", lambda row: _number(row, "latency_p95_ms", ".1f")),
+    "worst": ("worst, ms", lambda row: _number(row, "latency_worst_ms", ".0f")),
+    "rate": ("chunks per s at p95", _rate),
+    "AL": ("AL", lambda row: _number(row, "AL", ".1f")),
+    "forwards": ("forwards per step", lambda row: _number(row, "forwards_per_step", ".2f")),
+    "skipped": ("skipped", lambda row: _number(row, "skip_rate", ".0f", 100, " %")),
+    "unverified": ("unverified", lambda row: _number(row, "unverified_share", ".0f", 100, " %")),
+    "compensated": ("compensated", lambda row: _number(row, "compensation_rate", ".0f", 100, " %")),
+    "retrieved": ("retrieved", lambda row: _number(row, "retrieval_share", ".0f", 100, " %")),
+    "deviation": ("deviation", lambda row: _number(row, "deviation", ".4f")),
+    # of an agreement table
+    "again": ("again", _again),
+    "ratio": ("difference, %", lambda row: f"{100 * (float(row['ratio']) - 1):+.1f}"),
+    "overlap": ("intervals overlap", lambda row: {"True": "yes", "False": "no"}[row["overlap"]]),
+}
+
+
+def _column(name: str) -> tuple[str, Callable[[Row], str]]:
+    if name not in COLUMNS:
+        raise BadReference(f"no column {name}; known: {', '.join(COLUMNS)}")
+    return COLUMNS[name]
+
+
+def _named(label: str) -> str:
+    return label.replace(" ", "_")
+
+
+def markdown_table(study: str, options: list[str], names: list[str]) -> str:
+    """The table as Markdown lines."""
+    only = [word[5:].split(",") for word in options if word.startswith("only=")]
+    rows = [r for r in table_of(study, "macro" in options) if not only or _named(r["label"]) in only[0]]
+    if not rows:
+        raise BadReference(f"{study} has none of these settings")
+    columns = [_column(name) for name in names]
+    lines = [[title for title, _ in columns], ["---"] * len(columns)]
+    lines += [[text(row) for _, text in columns] for row in rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def figure(study: str, macro: bool, label: str, column: str) -> str:
+    """One number."""
+    found = [row for row in table_of(study, macro) if _named(row["label"]) == label]
+    if len(found) != 1:
+        raise BadReference(f"{study} has {len(found)} settings {label}")
+    return _column(column)[1](found[0])
+
+
+def filled(text: str) -> str:
+    """A page with its tables and figures renewed.
+
+    Raises:
+        BadReference: a table, setting or column that does not exist.
+    """
+    text = _TABLE.sub(lambda m: m[1] + markdown_table(m[2], m[3].split(), m[4].split()) + m[6], text)
+    return _FIGURE.sub(lambda m: m[1] + figure(m[2], bool(m[3]), m[4], m[5]) + m[7], text)
+
+
+def main(words: list[str]) -> int:
+    """Fills the pages, or with --check says which differ -> exit status."""
+    check, status = "--check" in words, 0
+    for page in [Path(word) for word in words if not word.startswith("--")]:
+        before = page.read_text(encoding="utf-8")
+        try:
+            after = filled(before)
+        except BadReference as error:
+            print(f"{page}: {error}", file=sys.stderr)
+            return 1
+        if after != before and check:
+            print(f"{page} differs from results/tables: run 'make pages'", file=sys.stderr)
+            status = 1
+        elif after != before:
+            page.write_text(after, encoding="utf-8")
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,93 @@
+"""The figures on the committed pages are those of the committed tables."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = ("README.md", "results/README.md")
+
+
+def script() -> Any:
+    """The module scripts/figures.py."""
+    spec = importlib.util.spec_from_file_location("figures", ROOT / "scripts/figures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The script over a table of two settings."""
+    module = script()
+    module.table_of.cache_clear()
+    monkeypatch.setattr(module, "TABLES", tmp_path)
+    head = "averaging,label,baseline,successes,episodes,speedup,speedup_low,speedup_high,mcnemar_p"
+    (tmp_path / "small.csv").write_text(
+        f"{head},only_baseline,only_method\nmicro over tasks,ar,ar,9,10,1,,,,0,0\nmicro over tasks,one pass,ar,8,10,2.044,1.97,2.106,0.5,2,1\n"
+        "macro over difficulty groups,one pass,ar,8,10,3,2,4,0.5,2,1\n",
+        encoding="utf-8",
+    )
+    return module
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_figure_on_a_page_is_the_tables(page: str) -> None:
+    command = [sys.executable, str(ROOT / "scripts/figures.py"), "--check", str(ROOT / page)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -> None:
+    page = (
+        "<!-- table small: setting success lost/won speedup -->\nold\n<!-- /table -->\n"
+        "It is <!-- figure small one_pass speedup -->9<!-- /figure -->× as fast, macro "
+        "<!-- figure small macro one_pass speedup -->9<!-- /figure -->.\n"
+    )
+    filled = figures.filled(page)
+    assert "| ar | 9/10 |  | 1.00 |\n" in filled
+    assert "| one pass | 8/10 | 2 / 1, 0.5 | 2.04 (1.97–2.11) |\n" in filled
+    assert "-->2.04 (1.97–2.11)<!-- /figure -->×" in filled
+    assert "-->3.00 (2.00–4.00)<!--" in filled
+    assert "old" not in filled
+    assert figures.filled(filled) == filled
+
+
+def test_only_some_settings(figures: Any) -> None:
+    filled = figures.filled("<!-- table small only=one_pass: setting -->\n<!-- /table -->")
+    assert "one pass" in filled
+    assert "| ar |" not in filled
+
+
+@pytest.mark.parametrize(
+    ("page", "says"),
+    [
+        ("<!-- table none: setting -->\n<!-- /table -->", "no table none.csv"),
+        ("<!-- table small: colour -->\n<!-- /table -->", "no column colour"),
+        ("<!-- figure small two_pass speedup --><!-- /figure -->", "0 settings two_pass"),
+    ],
+)
+def test_a_wrong_reference_is_named(figures: Any, page: str, says: str) -> None:
+    with pytest.raises(figures.BadReference, match=says):
+        figures.filled(page)
+
+
+def test_a_page_that_differs_fails_the_check_and_is_mended_without(
+    figures: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("<!-- figure small one_pass success -->7/10<!-- /figure -->", encoding="utf-8")
+    assert figures.main(["--check", str(page)]) == 1
+    assert "make pages" in capsys.readouterr().err
+    assert "7/10" in page.read_text(encoding="utf-8")
+    assert figures.main([str(page)]) == 0
+    assert "8/10" in page.read_text(encoding="utf-8")
+    assert figures.main(["--check", str(page)]) == 0
