@@ -31,11 +31,13 @@ def figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     module.table_of.cache_clear()
     monkeypatch.setattr(module, "TABLES", tmp_path)
     head = "averaging,label,baseline,successes,episodes,speedup,speedup_low,speedup_high,mcnemar_p"
-    (tmp_path / "small.csv").write_text(
-        f"{head},only_baseline,only_method\nmicro over tasks,ar,ar,9,10,1,,,,0,0\nmicro over tasks,one pass,ar,8,10,2.044,1.97,2.106,0.5,2,1\n"
-        "macro over difficulty groups,one pass,ar,8,10,3,2,4,0.5,2,1\n",
-        encoding="utf-8",
+    rows = (
+        f"{head},only_baseline,only_method",
+        "micro over tasks,ar,ar,9,10,1,,,,0,0",
+        "micro over tasks,one pass,ar,8,10,2.044,1.97,2.106,0.5,2,1",
+        "macro over difficulty groups,one pass,ar,8,10,3,2,4,0.5,2,1",
     )
+    (tmp_path / "small.csv").write_text("\n".join(rows), encoding="utf-8")
     return module
 
 
