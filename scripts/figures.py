@@ -3,6 +3,8 @@
     <!-- table main: setting success speedup -->      becomes a table with these columns, a row per setting
     <!-- /table -->
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
+    <!-- errors prediction_mt10-vision -->           becomes a table of the predictors' errors by steps ahead
+    <!-- /errors -->
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
 instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space.
@@ -20,6 +22,7 @@ from pathlib import Path
 TABLES = Path(__file__).resolve().parent.parent / "results" / "tables"
 _TABLE = re.compile(r"(<!-- table (\S+)((?: \S+)*?): ([^>]*?) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 _FIGURE = re.compile(r"(<!-- figure (\S+)( macro)? (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
+_ERRORS = re.compile(r"(<!-- errors (\S+) -->\n)(.*?)(<!-- /errors -->)", re.DOTALL)
 
 Row = Mapping[str, str]
 
@@ -134,6 +137,23 @@ def figure(study: str, macro: bool, label: str, column: str) -> str:
     return _column(column)[1](found[0])
 
 
+def error_table(name: str) -> str:
+    """Mean errors by predictor and steps ahead, over all tasks and the DoFs in which some predictor differs from hold,
+    with their share of hold's."""
+    rows = table_of(name, macro=False)
+    dofs = {row["dof"] for row in rows if row["error"] != row["hold_error"]}
+    errors: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        if row["dof"] in dofs:
+            errors.setdefault(row["predictor"], {}).setdefault(row["steps_ahead"], []).append(float(row["error"]))
+    means = {name: {step: sum(x) / len(x) for step, x in steps.items()} for name, steps in errors.items()}
+    lines = [["predictor", *(f"{step} ahead" for step in means["hold"])], ["---"] * (1 + len(means["hold"]))]
+    for predictor, steps in means.items():
+        shares = {step: f" ({100 * x / means['hold'][step]:.0f} %)" for step, x in steps.items() if predictor != "hold"}
+        lines.append([predictor, *(f"{x:.4f}{shares.get(step, '')}" for step, x in steps.items())])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
 def filled(text: str) -> str:
     """A page with its tables and figures renewed.
 
@@ -141,6 +161,7 @@ def filled(text: str) -> str:
         BadReference: a table, setting or column that does not exist.
     """
     text = _TABLE.sub(lambda m: m[1] + markdown_table(m[2], m[3].split(), m[4].split()) + m[6], text)
+    text = _ERRORS.sub(lambda m: m[1] + error_table(m[2]) + m[4], text)
     return _FIGURE.sub(lambda m: m[1] + figure(m[2], bool(m[3]), m[4], m[5]) + m[7], text)
 
 

@@ -63,6 +63,17 @@ def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -
     assert figures.filled(filled) == filled
 
 
+def test_errors_are_averaged_over_the_dofs_that_differ(figures: Any, tmp_path: Path) -> None:
+    rows = (
+        "predictor,dof,steps_ahead,error,hold_error",
+        *("hold,dx,1,0.2,0.2", "hold,dy,1,0.4,0.4", "hold,grip,1,9,9"),
+        *("line,dx,1,0.1,0.2", "line,dy,1,0.2,0.4", "line,grip,1,9,9"),
+    )
+    (tmp_path / "errors.csv").write_text("\n".join(rows), encoding="utf-8")
+    filled = figures.filled("<!-- errors errors -->\n<!-- /errors -->")
+    assert "| hold | 0.3000 |\n| line | 0.1500 (50 %) |\n" in filled
+
+
 def test_only_some_settings(figures: Any) -> None:
     filled = figures.filled("<!-- table small only=one_pass: setting -->\n<!-- /table -->")
     assert "one pass" in filled
