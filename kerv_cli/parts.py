@@ -204,6 +204,16 @@ class SimilaritySkipSettings:
     down: float = number(0.0, 0)  # and falls after a successful one; above 0 results depend on the order of episodes
 
 
+@dataclass
+class StreakSkipSettings:
+    """Verified chunks that agree with their draft allow 1, 2, 4, … unverified decodes (§4.5). The draft is the
+    in-prefill one, of `merged` its first source's."""
+
+    kind: str = "streak"
+    most: int = number(8, 1)  # decodes in a row without a verification
+    tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
+
+
 # --- what searches the datastore (§4.1): every backend gives the same neighbours
 
 
@@ -374,6 +384,7 @@ _add("boundary", "random", _BUILD + "boundary", RandomBoundarySettings, chooses=
 
 _add("skip", "none", _BUILD + "nothing")
 _add("skip", "parallel", _BUILD + "parallel_pass", colour=0x17BECF, parallel=True)  # a parallel target's own decoding
+_add("skip", "streak", _BUILD + "streak_skip", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
 _add("skip", "always", _BUILD + "always_skip", takes_draft=True)  # what prefill_draft drafts is never verified
 _add(
     *("skip", "similarity", _BUILD + "similarity_skip", SimilaritySkipSettings),

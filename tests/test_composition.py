@@ -88,6 +88,13 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
     },
     "one_pass": ONE_PASS,
     "one_pass_skip": {**ONE_PASS, "skip": SKIP},
+    "one_pass_streak": {
+        "prefill_draft": ONE_PASS["prefill_draft"],
+        "proposer": CHAIN,
+        "acceptance": RELAXED,
+        "skip": p.StreakSkipSettings(most=8, tolerance=0.05),
+    },
+    "parallel": {"skip": NoSettings("parallel")},
     "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": p.JacobiProposerSettings(depth=0)},
 }
 
@@ -107,7 +114,7 @@ def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
     assert asked.policy.kind == ("expert" if method == "expert" else "model")
     assert asked.parts() == {**AR, **PRESETS[method]}
     assert (asked.chunk, asked.datastore) == (0, NoSettings("exact"))
-    check(asked.parts(), asked.chunk, 4)
+    check(asked.parts(), asked.chunk, 4, parallel=method == "parallel")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -195,7 +202,7 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
 def test_what_does_not_belong_together_is_refused(overrides: str, says: str) -> None:
     asked = composed(*overrides.split())
     with pytest.raises(KervError) as refused:
-        check(asked.parts(), asked.chunk, 4)
+        check(asked.parts(), asked.chunk, 4, parallel=method == "parallel")
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 

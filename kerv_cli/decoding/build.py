@@ -25,7 +25,7 @@ from kerv_cli.decoding.proposers import (
     RetrievalProposer,
 )
 from kerv_cli.decoding.rectify import DRAFT, Compensation
-from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass, SkipLevels, VerifySkip
+from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass, SkipLevels, StreakSkip, VerifySkip
 from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import METHOD_KINDS, PREFILL, RetrievalProposerSettings, part_of
@@ -79,7 +79,9 @@ def check(method: Mapping[str, Any], chunk: int, trained: int, parallel: bool = 
             f"proposer={draft.name}"
         )
     check_parallel(chosen, parallel)
-    if chosen["skip"].traits.get("takes_draft") and not draft.traits.get("chains"):
+    skip = chosen["skip"].traits
+    joined = bool(skip.get("merges")) and draft.name == "merged"
+    if skip.get("takes_draft") and not draft.traits.get("chains") and not joined:
         raise UsageError(
             f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before "
             "the prefill, e.g. prefill_draft=early"
@@ -248,6 +250,12 @@ def always_skip(settings: Any, context: Context) -> AlwaysSkip:
 def parallel_pass(settings: Any, context: Context) -> ParallelPass:
     """skip=parallel."""
     return ParallelPass(context.target)
+
+
+def streak_skip(settings: Any, context: Context) -> StreakSkip:
+    """skip=streak."""
+    draft = context.built["prefill_draft"]
+    return StreakSkip(settings, draft.sources[0] if isinstance(draft, MergedProposer) else draft)
 
 
 def similarity_skip(settings: Any, context: Context) -> VerifySkip:

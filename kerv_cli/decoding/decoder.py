@@ -168,6 +168,8 @@ class Decoder:
         target_tokens = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
         clock.lap("prefill")
         path = self.accept(chunk, tree, target_tokens, draft)
+        if self.parts.skip is not None:
+            self.parts.skip.verified(chunk)
         clock.lap("accept")
         if not len(tree):
             return

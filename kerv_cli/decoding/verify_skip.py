@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks
 from kerv_cli.decoding.proposers import RetrievalProposer
 from kerv_cli.decoding.record import PARALLEL, Round
 from kerv_cli.errors import UsageError
-from kerv_cli.parts import SimilaritySkipSettings
+from kerv_cli.parts import SimilaritySkipSettings, StreakSkipSettings
 from kerv_cli.targets.protocol import ParallelTarget
 
 
@@ -44,6 +46,9 @@ class Skip(Protocol):
     def take(self, chunk: Chunk) -> bool:
         """Completes the chunk, if it may be executed unverified -> whether it did."""
 
+    def verified(self, chunk: Chunk) -> None:
+        """Told when the prefill of a chunk that was not taken has judged the in-prefill draft."""
+
 
 class ParallelPass:
     """Decodes all tokens by one bidirectional pass of a parallel target, as OpenVLA-OFT does (§6): each is chosen
@@ -68,6 +73,9 @@ class ParallelPass:
         chunk.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, chunk.size, 0, ()), tokens)
         return True
 
+    def verified(self, chunk: Chunk) -> None:
+        """Nothing is learnt from a verification."""
+
 
 class AlwaysSkip:
     """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
@@ -91,6 +99,60 @@ class AlwaysSkip:
             return False
         chunk.skip(chains[0], self.source.name)
         return True
+
+    def verified(self, chunk: Chunk) -> None:
+        """Nothing is learnt from a verification."""
+
+
+class StreakSkip:
+    """Executes drafts unverified for as long as verification keeps agreeing (§4.5): a chunk whose draft agrees with the
+    target's tokens allows one unverified decode before the next verification, the next one in a row two, then four, up
+    to `most`; a chunk that does not agree ends it. An episode begins with a verification."""
+
+    phase = "propose"
+
+    def __init__(self, settings: StreakSkipSettings, source: DraftsChunks) -> None:
+        self.settings, self.source = settings, source
+        self.allowed = self.left = 0  # after the last verification, and of these still
+        self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self.allowed = self.left = 0
+
+    def finish(self, success: bool) -> None:
+        """Nothing is kept between episodes."""
+
+    def take(self, chunk: Chunk) -> bool:
+        """As `Skip.take`."""
+        chains = self.source.chains(chunk, chunk.size)
+        self.chain = tuple(chains[0]) if chains else ()
+        if not self.left or len(self.chain) < chunk.size:
+            return False
+        self.left -= 1
+        chunk.skip(self.chain, self.source.name)
+        return True
+
+    def verified(self, chunk: Chunk) -> None:
+        """As `Skip.verified`: doubles what is allowed, or ends it."""
+        self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
+        self.left = self.allowed
+
+    def _agrees(self, chunk: Chunk) -> bool:
+        """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's
+        tokens on its own path, strict DoFs equal."""
+        played, rejection = chunk.rounds[-1], chunk.rejection
+        path = (*played.drafted, *rejection.draft)
+        if len(path) < chunk.size - 1 or path != self.chain[: len(path)]:
+            return False
+        if played.accepted == len(played.drafted):
+            return True
+        wanted = np.array((*played.target_tokens[: len(played.drafted)], *rejection.target[: len(rejection.draft)]))
+        strict = chunk.space.strict_tokens(len(path))
+        if (np.array(path) != wanted)[strict].any():
+            return False
+        off = np.abs(chunk.space.values_of(np.array(path)) - chunk.space.values_of(wanted))
+        return bool(off.mean() <= self.settings.tolerance)
 
 
 class VerifySkip:
@@ -136,3 +198,6 @@ class VerifySkip:
             self.ended.add(seed)
         chunk.skip(found.chunks[0].tolist(), self.retrieval.name)
         return True
+
+    def verified(self, chunk: Chunk) -> None:
+        """Nothing is learnt from a verification."""
