@@ -202,7 +202,7 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
 def test_what_does_not_belong_together_is_refused(overrides: str, says: str) -> None:
     asked = composed(*overrides.split())
     with pytest.raises(KervError) as refused:
-        check(asked.parts(), asked.chunk, 4, parallel=method == "parallel")
+        check(asked.parts(), asked.chunk, 4)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 

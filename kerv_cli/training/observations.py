@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.demos.frames import EncodedFrames
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import TargetSettings
 from kerv_cli.spaces import ActionSpace, ObservationSpace
@@ -22,7 +23,8 @@ from kerv_cli.targets.compact.text import WordTokenizer
 
 @dataclass(frozen=True)
 class Rows:
-    """Base of dataclasses of tensors that have one row per sample; an optional one may be None."""
+    """Base of dataclasses of tensors that have one row per sample; an optional one may be None, frames may be left
+    encoded."""
 
     def __len__(self) -> int:
         return next(len(x) for x in vars(self).values() if x is not None)
@@ -35,14 +37,20 @@ class Rows:
     def joined(cls, parts: Sequence[Self]) -> Self:
         """All rows of `parts`, in order."""
         columns = ([getattr(part, field.name) for part in parts] for field in fields(cls))
-        return cls(*(None if column[0] is None else torch.cat(column) for column in columns))
+        return cls(*map(_joined, columns))
+
+
+def _joined(column: Sequence[Any]) -> Any:
+    if isinstance(column[0], EncodedFrames):
+        return EncodedFrames.joined(column)
+    return None if column[0] is None else torch.cat(list(column))
 
 
 @dataclass(frozen=True)
 class Observations(Rows):
     """n observations, in the order of episodes and control steps."""
 
-    frames: Tensor | None  # (n, size, size, 3) uint8; None for a state policy
+    frames: Tensor | EncodedFrames | None  # (n, size, size, 3) uint8; None for a state policy
     proprioception: Tensor  # (n, p) float32
     states: Tensor  # (n, s) float32, privileged
     words: Tensor  # (n, L) int64
@@ -52,7 +60,9 @@ class Observations(Rows):
         """The observations at `indices` (B,) as a batch on `device`."""
         images = None
         if self.frames is not None:
-            images = self.frames[indices].to(device).permute(0, 3, 1, 2)
+            chosen = self.frames[indices]
+            pixels = torch.from_numpy(chosen.pixels()) if isinstance(chosen, EncodedFrames) else chosen
+            images = pixels.to(device).permute(0, 3, 1, 2)
         return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
@@ -76,7 +86,8 @@ def read_observations(
     steps, frames = observed_steps(episode, settings)[chosen], None
     if settings.observation == "vision":
         check_frames(episode, settings.image_size)
-        frames = torch.from_numpy(episode.frames[chosen])
+        kept = episode.frames[chosen]
+        frames = kept if isinstance(kept, EncodedFrames) else torch.from_numpy(kept)
     states = torch.from_numpy(episode.states[steps]).float()
     ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
     felt = states[:, : len(space.proprioception)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import itertools
 import json
 import struct
 from collections.abc import Mapping
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.environments.demos.frames import EncodedFrames, encode_png
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path
 from kerv_cli.spaces import ActionSpace, ObservationSpace
@@ -31,7 +30,7 @@ class DemoEpisode:
     Attributes:
         task, seed: of the episode. perturbed: whether its execution was noisy.
         steps: T.
-        frames: (n, size, size, 3) uint8, the frames before the actions of `frame_steps`.
+        frames: (n, size, size, 3) uint8, the frames before the actions of `frame_steps`; encoded where loaded.
         frame_steps: (n,) int64.
         states: (T, s) float32, privileged state before each action; it begins with the proprioception.
         labels: (T + tail, D) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
@@ -43,7 +42,7 @@ class DemoEpisode:
     seed: int
     perturbed: bool
     steps: int
-    frames: NDArray[np.uint8]
+    frames: NDArray[np.uint8] | EncodedFrames
     frame_steps: NDArray[np.int64]
     states: NDArray[np.float32]
     labels: NDArray[np.float32]
@@ -64,7 +63,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
     """
     from safetensors.numpy import save
 
-    pictures = [_encode_png(frame) for frame in episode.frames]
+    pictures = [encode_png(frame) for frame in episode.frames]
     tensors = {
         "png": np.frombuffer(b"".join(pictures), dtype=np.uint8),
         "png_offsets": np.cumsum([0, *map(len, pictures)], dtype=np.int64),
@@ -112,17 +111,17 @@ def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace
             metadata = file.metadata() or {}
             if metadata.get("format") != str(FORMAT):
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-        return _episode_from(arrays, metadata, actions.dofs, observation.state)
+            names = [name for name in file.keys() if name != "png"]  # noqa: SIM118 - not a mapping
+            arrays = {name: file.get_tensor(name) for name in names}
+        frames = EncodedFrames.of_file(path, arrays["png_offsets"], int(metadata["frame_size"]))
+        return _episode_from(arrays, frames, metadata, actions.dofs, observation.state)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error
 
 
 def _episode_from(
-    arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, str], dofs: int, state: int
+    arrays: Mapping[str, NDArray[Any]], frames: EncodedFrames, metadata: Mapping[str, str], dofs: int, state: int
 ) -> DemoEpisode:
-    offsets, png = arrays["png_offsets"], arrays["png"].tobytes()
-    frames = [_decode_png(png[start:end]) for start, end in itertools.pairwise(offsets)]
     steps = int(metadata["steps"])
     if arrays["states"].shape != (steps, state) or arrays["executed"].shape != (steps, dofs):
         raise ValueError(f"the arrays do not hold {steps} steps of {state} state numbers and {dofs} DoFs")
@@ -134,25 +133,10 @@ def _episode_from(
         seed=int(metadata["seed"]),
         perturbed=metadata["perturbed"] == "true",
         steps=steps,
-        frames=np.stack(frames),
+        frames=frames,
         frame_steps=arrays["frame_steps"],
         states=arrays["states"],
         labels=labels,
         executed=arrays["executed"],
         initial_state=arrays[_INITIAL_STATE],
     )
-
-
-def _encode_png(frame: NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
-    return buffer.getvalue()
-
-
-def _decode_png(data: bytes) -> NDArray[np.uint8]:
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data)) as image:
-        return np.asarray(image)

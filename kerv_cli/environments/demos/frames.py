@@ -1,0 +1,122 @@
+"""Frames of demonstrations as they lie on disk: PNG in memory-mapped files, decoded when they are asked for. Training
+keeps none of them in memory, so it does not depend on the size of the dataset."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kerv_cli.errors import CheckpointError
+
+_LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
+
+
+class EncodedFrames:
+    """n frames (size, size, 3) uint8. sources: the bytes of each file; of frame i sources[source[i]] holds the PNG at
+    start[i] … end[i]."""
+
+    def __init__(
+        self,
+        sources: Sequence[NDArray[np.uint8]],
+        source: NDArray[np.int64],
+        start: NDArray[np.int64],
+        end: NDArray[np.int64],
+        size: int,
+    ) -> None:
+        self.sources, self.source, self.start, self.end, self.size = sources, source, start, end, size
+
+    @classmethod
+    def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int) -> EncodedFrames:
+        """The frames of an episode's file; offsets (n + 1,): in its tensor `png`.
+
+        Raises:
+            CheckpointError: the file has no such bytes.
+        """
+        try:
+            mapped = np.memmap(path, dtype=np.uint8, mode="r")
+            header = _LENGTH.unpack(bytes(mapped[: _LENGTH.size]))[0]
+            first, last = json.loads(bytes(mapped[_LENGTH.size : _LENGTH.size + header]))["png"]["data_offsets"]
+        except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
+            raise CheckpointError(f"{path} is missing or damaged: {error}") from error
+        places = offsets + _LENGTH.size + header + first
+        if len(offsets) < 1 or (np.diff(offsets) <= 0).any() or offsets[0] < 0 or offsets[-1] > last - first:
+            raise CheckpointError(f"{path} is damaged: its frames lie outside their tensor")
+        return cls([mapped], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size)
+
+    @classmethod
+    def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
+        """All frames of `parts`, in order."""
+        sources = [source for part in parts for source in part.sources]
+        first = np.cumsum([0, *(len(part.sources) for part in parts)])
+        columns = [(part.source + base, part.start, part.end) for part, base in zip(parts, first, strict=False)]
+        source, start, end = (np.concatenate(column) for column in zip(*columns, strict=True))
+        return cls(sources, source, start, end, parts[0].size)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(n, size, size, 3)."""
+        return len(self), self.size, self.size, 3
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+        return (self[i] for i in range(len(self)))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self.pixels().astype(dtype or np.uint8, copy=False)
+
+    @overload
+    def __getitem__(self, chosen: int) -> NDArray[np.uint8]: ...
+
+    @overload
+    def __getitem__(self, chosen: Any) -> EncodedFrames: ...
+
+    def __getitem__(self, chosen: Any) -> NDArray[np.uint8] | EncodedFrames:
+        """One frame, decoded, or those that a slice, mask or indices select, still encoded."""
+        if isinstance(chosen, int | np.integer):
+            return self._decoded(int(chosen))
+        at = np.asarray(chosen) if not isinstance(chosen, slice) else chosen
+        return EncodedFrames(self.sources, self.source[at], self.start[at], self.end[at], self.size)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """(n, size, size, 3), decoded on as many threads as this process may use.
+
+        Raises:
+            CheckpointError: a frame is damaged.
+        """
+        if not len(self):
+            return np.zeros(self.shape, np.uint8)
+        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if workers == 1 or len(self) < 16:
+            return np.stack([self._decoded(i) for i in range(len(self))])
+        with ThreadPoolExecutor(min(workers, 8)) as pool:
+            return np.stack(list(pool.map(self._decoded, range(len(self)))))
+
+    def _decoded(self, i: int) -> NDArray[np.uint8]:
+        from PIL import Image
+
+        data = self.sources[self.source[i]][self.start[i] : self.end[i]].tobytes()
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                return np.asarray(image)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise CheckpointError(f"a frame of the demonstrations is damaged: {error}") from error
+
+
+def encode_png(frame: NDArray[np.uint8]) -> bytes:
+    """frame (size, size, 3) uint8 -> PNG."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
+    return buffer.getvalue()

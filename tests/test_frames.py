@@ -1,0 +1,97 @@
+"""Frames that stay encoded in their files: the same pixels, whatever is chosen of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode, save_episode
+from kerv_cli.environments.demos.frames import EncodedFrames
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import CheckpointError
+from kerv_cli.settings import TargetSettings
+from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.training.observations import Observations, read_observations
+
+SIZE = 96
+
+
+def episode(path: Path, seed: int, frames: int = 5) -> DemoEpisode:
+    """Writes an episode of random frames -> as it was before."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 255, (frames, SIZE, SIZE, 3), dtype=np.uint8)
+    steps, labels = 2 * frames, rng.uniform(-1, 1, (2 * frames + 8, 4)).astype(np.float32)
+    states = rng.uniform(size=(steps, 39)).astype(np.float32)
+    made = DemoEpisode(
+        *("reach-v3", seed, False, steps, pixels, np.arange(0, steps, 2)), states, labels, labels[:steps], np.zeros(3)
+    )
+    save_episode(path, made)
+    return made
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> tuple[list[DemoEpisode], list[DemoEpisode]]:
+    """Two episodes as written, and as read."""
+    paths = [tmp_path / f"{seed}.safetensors" for seed in range(2)]
+    written = [episode(path, seed, 5 + seed) for seed, path in enumerate(paths)]
+    return written, [load_episode(path, SPEC.actions, SPEC.observation) for path in paths]
+
+
+def test_pixels_are_those_that_were_written(two: tuple[list[DemoEpisode], list[DemoEpisode]]) -> None:
+    for written, found in zip(*two, strict=True):
+        assert isinstance(found.frames, EncodedFrames)
+        assert found.frames.shape == written.frames.shape
+        assert np.array_equal(found.frames.pixels(), written.frames)
+        assert np.array_equal(found.frames[3], written.frames[3])
+        assert np.array_equal(found.frames[1:3].pixels(), written.frames[1:3])
+        assert np.array_equal(np.stack(list(found.frames)), written.frames)
+
+
+def test_observations_of_several_files_keep_none_of_them_in_memory(
+    two: tuple[list[DemoEpisode], list[DemoEpisode]],
+) -> None:
+    written, found = two
+    words = WordTokenizer.build(["reach the goal"])
+    parts = [read_observations(e, TargetSettings(), SPEC.observation, words) for e in found]
+    joined = Observations.joined(parts)
+    everything = np.concatenate([e.frames for e in written])
+    assert isinstance(joined.frames, EncodedFrames)
+    assert all(isinstance(source, np.memmap) for source in joined.frames.sources)
+    chosen = torch.tensor([10, 0, 7, 7])
+    images = joined.inputs(chosen, torch.device("cpu")).images
+    assert images is not None
+    assert np.array_equal(images.permute(0, 2, 3, 1).numpy(), everything[chosen.numpy()])
+    masked = joined.where(torch.arange(len(joined)) % 3 == 1)
+    assert isinstance(masked.frames, EncodedFrames)
+    assert np.array_equal(masked.frames.pixels(), everything[1::3])
+
+
+def test_frames_are_decoded_alike_by_one_thread_and_many(
+    two: tuple[list[DemoEpisode], list[DemoEpisode]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = EncodedFrames.joined([e.frames for e in two[1] if isinstance(e.frames, EncodedFrames)] * 3)
+    pixels = []
+    for cores in ({0}, {0, 1, 2}):
+        monkeypatch.setattr("os.sched_getaffinity", lambda _, cores=cores: cores)
+        pixels.append(frames.pixels())
+    assert len(frames) == 33
+    assert np.array_equal(*pixels)
+
+
+def test_damaged_files_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "0.safetensors"
+    episode(path, 0)
+    whole = path.read_bytes()
+    offsets = np.array([0, 10, 10**9])
+    with pytest.raises(CheckpointError, match="outside their tensor"):
+        EncodedFrames.of_file(path, offsets, SIZE)
+    path.write_bytes(whole[:5])
+    with pytest.raises(CheckpointError, match="missing or damaged"):
+        EncodedFrames.of_file(path, offsets, SIZE)
+    path.write_bytes(whole)
+    frames = EncodedFrames.of_file(path, np.array([0, 50]), SIZE)  # a picture that is cut short
+    with pytest.raises(CheckpointError, match="frame of the demonstrations is damaged"):
+        frames.pixels()
