@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -141,6 +142,7 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
     first = kerv(*command)
     assert first.returncode == 0, first.stderr
     assert "7 cells run, 0 reused, 0 failed" in first.stdout
+    assert re.search(r"\d+ episodes in \d+\.\d min: \d+ per minute", first.stdout)
     cells = sorted((results / "studies/demo/cells").iterdir())
     shutil.rmtree(cells[0])
     assert "1 cells run, 6 reused, 0 failed" in kerv(*command).stdout

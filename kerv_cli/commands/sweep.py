@@ -87,6 +87,10 @@ def _run(resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, runtime:
         outcome = execute(cells, CellRunner(store.rollouts), store, runtime, display, reference_decode)
     if outcome.done or outcome.reused:
         console().print(summary_table(study_table(load_study(store, cells))))
+    episodes = sum(len(cell.seeds) for cell in outcome.done)
+    if episodes:
+        minutes = outcome.seconds / 60
+        typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
     typer.echo(
         f"{len(outcome.done)} cells run, {len(outcome.reused)} reused, {len(outcome.failed)} failed; "
         f"tables and plots: {called()} report study={store.name}"

@@ -1,4 +1,8 @@
-"""Runs the episodes of a study's cell, and gauges the machine's load, in the process that the executor chose."""
+"""Runs the episodes of a study's cell, and gauges the machine's load, in the process that the executor chose.
+
+Weights, datastores and worlds are shared by all settings of a process. Frames and decoders are not: a setting that got
+its frames from another would decode with warm caches, and a skip's level may follow the episodes of its own block.
+"""
 
 from __future__ import annotations
 
