@@ -62,7 +62,7 @@ class Packable(nn.Module):
     packed: Any = None
 
     def pack_weights(self) -> Packed | None:
-        """Packed weights of this module, which is frozen float32 on a CPU; None where they would not be faster."""
+        """Packed weights of this module, which is frozen on a CPU; None where they would not be faster."""
         raise NotImplementedError
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -89,14 +89,15 @@ class Packable(nn.Module):
 
 def pack(module: nn.Module) -> None:
     """Prepares a module whose weights are final: stores linear weights on a CPU input-major (shapes unchanged) and,
-    where all parameters are frozen float32 on a CPU, packs the weights of the parts that support it.
+    where all parameters are frozen and of one number format on a CPU, packs the weights of the parts that support it.
 
     One token times an output-major matrix is twice as slow (measured: 192 × 1024, 69 µs against 36 µs).
     """
+    parameters = list(module.parameters())
     for part in module.modules():
-        if isinstance(part, nn.Linear) and part.weight.device.type == "cpu":
+        if isinstance(part, nn.Linear) and part.weight.device.type == "cpu" and part.weight.dtype == torch.float32:
             part.weight.data = part.weight.data.t().contiguous().t()
-    if all(p.device.type == "cpu" and p.dtype == torch.float32 and not p.requires_grad for p in module.parameters()):
+    if all(p.device.type == "cpu" and p.dtype == parameters[0].dtype and not p.requires_grad for p in parameters):
         with torch.no_grad():
             for part in module.modules():
                 if isinstance(part, Packable):

@@ -156,8 +156,8 @@ class CompactTarget(Packable):
         pack(self)
 
     def pack_weights(self) -> PackedPrompt | None:
-        """As `Packable.pack_weights`; None for a state policy."""
-        return PackedPrompt(self) if self.cameras else None
+        """As `Packable.pack_weights`; None for a state policy and in other number formats than float32."""
+        return PackedPrompt(self) if self.cameras and self.dtype == torch.float32 else None
 
     def inputs(self, observation: Observation) -> Inputs:
         """One observation as a batch of one.

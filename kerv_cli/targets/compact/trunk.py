@@ -2,9 +2,9 @@
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
-Three implementations give the same numbers up to float32 rounding. On CUDA a cache of fixed shapes is written at a
+These implementations give the same numbers up to rounding. On CUDA a cache of fixed shapes is written at a
 tensor of slots and attended to over its whole capacity under a mask, so that one captured graph can serve every step.
-On a CPU slices are faster, and a frozen float32 stack has packed weights (`packed.py`).
+On a CPU slices are faster, and a frozen stack has packed weights (`packed.py`, `packed_bfloat16.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradient
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 
 
 class Cache:
@@ -150,25 +151,32 @@ class Layer(nn.Module):
 class LayerStack(Packable):
     """Decoder layers and their rotary embedding, the base of the trunk and the drafter."""
 
-    packed: PackedLayers | None
+    packed: PackedLayers | BlockedLayers | None
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__()
-        self.width, self.heads = width, heads
+        self.width, self.heads, self.depth = width, heads, layers
         self.rotary = Rotary(width // heads)
         self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(layers))
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
     def pack_weights(self) -> Any:
         """As `Packable.pack_weights`."""
-        return PackedLayers(self)
+        if self.norm.weight.dtype == torch.float32:
+            return PackedLayers(self)
+        if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
+            return BlockedLayers(self.rotary, self.layers, self.norm)  # type: ignore[arg-type]
+        return None
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
         """An empty cache. fixed: of fixed shapes; default: on CUDA."""
         channels = self.width // self.heads
-        return Cache(len(self.layers), batch, self.heads, capacity, channels, self.norm.weight, fixed)
+        like = self.norm.weight
+        if isinstance(self.packed, BlockedLayers):
+            like = like.to(self.packed.cache_dtype)
+        return Cache(self.depth, batch, self.heads, capacity, channels, like, fixed)
 
-    def packed_for(self, x: Tensor, cache: Cache | None) -> PackedLayers | None:
+    def packed_for(self, x: Tensor, cache: Cache | None) -> PackedLayers | BlockedLayers | None:
         """The packed weights where they can compute x: without gradients, and with no cache of fixed shapes."""
         return None if wants_gradient(x) or (cache is not None and cache.fixed) else self.packed
 

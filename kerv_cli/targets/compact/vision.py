@@ -52,8 +52,9 @@ class VisionEncoder(Packable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def pack_weights(self) -> PackedVision | None:
-        """As `Packable.pack_weights`; None where torch lacks oneDNN's fused operators."""
-        return PackedVision(self) if has_blocked_layouts() else None
+        """As `Packable.pack_weights`; None where torch lacks oneDNN's fused operators and in other number formats than
+        float32."""
+        return PackedVision(self) if has_blocked_layouts() and self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """images (B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""
