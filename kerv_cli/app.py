@@ -6,7 +6,7 @@ import os
 
 import typer
 
-from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, sweep, train, view
+from kerv_cli.commands import bench, build, calibrate, demos, doctor, report, rollout, sweep, train, view
 
 # Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -28,6 +28,7 @@ app.command("rollout")(rollout.rollout)
 app.command("sweep")(sweep.sweep)
 app.command("report")(report.report)
 app.command("view")(view.view)
+app.command("bench")(bench.bench)
 app.command("doctor")(doctor.doctor)
 
 

@@ -242,6 +242,27 @@ class DoctorSettings(RunSettings):
 
 
 @dataclass
+class BenchSettings(RunSettings):
+    """`kerv bench`: how far a target is from what the device can do."""
+
+    model: str = "mt10-vision"  # target=: a policy, or a shape of conf/target with random weights
+    dtype: str = "auto"  # of a shape: float32 | bfloat16 | auto, the faster one here; a policy has runtime.dtype
+    repeats: int = 30  # of every measurement; medians and 95th percentiles are over them
+    tokens: list[int] = field(default_factory=lambda: [7, 16])  # N, of a chunk
+    drafter_depth: int = 6  # tokens of the drafter's chain whose time counts in the ceilings
+
+
+@dataclass
+class BenchReplaySettings(BenchSettings):
+    """`kerv bench replay`: a study's recorded decodes, executed on another target."""
+
+    recorded: str = "main"  # study=: whose decodes
+    decodes: int = 40  # of every setting, evenly over tasks and seeds
+    model: str = "vla-150m"
+    drafter: DrafterSettings = field(default_factory=DrafterSettings)  # shape of the drafter beside a shape
+
+
+@dataclass
 class ReportSettings(CommandSettings):
     """`kerv report`."""
 

@@ -1,0 +1,58 @@
+"""The highest speedup that a method can reach at measured latencies: every draft accepted whole (docs/methods.md §5)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from kerv_cli.bench.profile import Profile
+from kerv_cli.config import compose, groups
+from kerv_cli.settings import EXPERT, RolloutSettings
+
+
+@dataclass(frozen=True)
+class MethodCeiling:
+    """free: drafting costs nothing. drafted: the drafter's own forwards count, where the method drafts with it; else
+    equal to free. Ratios of times per decode, AR over the method."""
+
+    method: str
+    how: str
+    free: float
+    drafted: float
+
+
+def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
+    """Of every method of conf/method that decodes, at N = `tokens`."""
+    found = []
+    for name in groups()["method"]:
+        if name in (EXPERT, "ar"):
+            continue
+        settings = compose("rollout", [f"method={name}"], RolloutSettings)
+        ceiling = _ceiling(name, settings, profile, tokens)
+        if ceiling is not None:
+            found.append(ceiling)
+    return found
+
+
+def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int) -> MethodCeiling | None:
+    autoregressive, encode = profile.decode(tokens), profile.seconds("encode", 1)
+    if settings.skip.kind == "always":
+        return None  # executed unverified: nothing of the target's trunk runs
+    if settings.prefill_draft.kind != "none":
+        least = encode + profile.seconds("prefill", profile.prompt + tokens - 1)
+        return MethodCeiling(name, "in the prefill", autoregressive / least, autoregressive / least)
+    prefill = encode + profile.seconds("prefill", profile.prompt)
+    least = prefill + profile.seconds("verify", tokens - 1)
+    free = autoregressive / least
+    if settings.proposer.kind not in ("drafter", "hybrid"):
+        return MethodCeiling(name, "one verification", free, free)
+    rounds, depth = _rounds(settings.proposer, tokens)
+    own = prefill + rounds * (profile.seconds("verify", 1 + depth) + profile.drafting(depth))
+    return MethodCeiling(name, f"{rounds} × {depth} drafted", free, autoregressive / own)
+
+
+def _rounds(proposer: Any, tokens: int) -> tuple[int, int]:
+    """Rounds of a chain of the drafter's depth that is always accepted whole, for the tokens behind the first."""
+    depth = min(int(getattr(proposer, "depth", tokens)), tokens - 2)
+    return math.ceil((tokens - 1) / (depth + 1)), depth

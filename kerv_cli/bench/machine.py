@@ -1,0 +1,73 @@
+"""What the device can do, measured: bytes read per second, multiply-adds per second; and the stopwatch of the bench."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from kerv_cli.targets.compact.packed import FastLinear
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear, multiplies_bfloat16
+
+_BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: a server's caches hold 100 MB and more
+_ROWS, _WIDTH = 256, 4096
+
+
+@dataclass(frozen=True)
+class Machine:
+    """bandwidth: bytes per second that one pass over a large buffer reads. flops: per second, of a product of 256 rows
+    with a matrix of 4096 × 4096 in the weights' number format. Both are the best of the repeats."""
+
+    bandwidth: float
+    flops: float
+
+    def floor(self, read: float, flops: float) -> float:
+        """Seconds below which a forward of so many bytes and operations cannot come."""
+        return max(read / self.bandwidth, flops / self.flops)
+
+
+def synchronise(device: torch.device) -> None:
+    """Waits for the device's work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.ndarray:
+    """(repeats,) seconds of `work`, after two runs that do not count."""
+    for _ in range(2):
+        work()
+    seconds = np.empty(repeats)
+    for i in range(repeats):
+        synchronise(device)
+        begin = time.perf_counter()
+        work()
+        synchronise(device)
+        seconds[i] = time.perf_counter() - begin
+    return seconds
+
+
+def median_seconds(work: Callable[[], object], device: torch.device, repeats: int) -> float:
+    """Median of `timed`."""
+    return float(np.median(timed(work, device, repeats)))
+
+
+@torch.inference_mode()
+def measure_machine(device: torch.device, dtype: torch.dtype, repeats: int = 7) -> Machine:
+    """The device's rates with this process's threads."""
+    buffer = torch.ones(_BUFFER, device=device)
+    read = timed(buffer.sum, device, repeats).min()
+    del buffer
+    x, weight = torch.ones(_ROWS, _WIDTH, dtype=dtype, device=device), torch.ones(_WIDTH, _WIDTH, device=device)
+    if device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
+        blocked = BlockedLinear(weight)
+        product = timed(lambda: blocked(x), device, repeats)
+    elif device.type == "cpu" and dtype == torch.float32:
+        full = FastLinear(weight)
+        product = timed(lambda: full(x), device, repeats)
+    else:
+        plain = weight.to(dtype)
+        product = timed(lambda: x @ plain, device, repeats)
+    return Machine(4.0 * _BUFFER / float(read), 2.0 * _ROWS * _WIDTH**2 / float(product.min()))

@@ -1,0 +1,206 @@
+"""The model under measurement: a policy's target, or a shape with random weights, and the drafter beside it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.config import compose, groups
+from kerv_cli.drafting.eagle import Drafter
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.runtime import DTYPES, set_up
+from kerv_cli.settings import (
+    BenchSettings,
+    DrafterSettings,
+    PolicySettings,
+    TargetSettings,
+    TrainTargetSettings,
+)
+from kerv_cli.spaces import Observation
+from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.trunk import Layer
+from kerv_cli.training.imitation import vocabulary
+
+_SPARE = 1.15  # memory that must be free, over the weights: the prompt's encoder, caches, one layer twice
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is measured. name: as asked for. target: a ReadableTarget. drafter: EAGLE-style, of the target's width.
+    observation: any, of the target's environment. is_shape: its weights are random."""
+
+    name: str
+    target: Any
+    drafter: Drafter
+    observation: Observation
+    is_shape: bool
+
+    @property
+    def trunk_weights(self) -> int:
+        """Weights that every forward reads: the layers' matrices and the head."""
+        s: TargetSettings = self.target.settings
+        return layer_weights(s) * s.layers + s.width * self.target.actions.tokens
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the trunk's weights."""
+        found: torch.dtype = self.target.head.weight.dtype
+        return found
+
+
+class ShapeTarget(CompactTarget):
+    """A compact target with random weights, made layer by layer in its final form: 7 B parameters are never there twice.
+
+    On a CPU the prompt's encoder stays float32, where its packed weights are fastest. Layers after the first are the
+    first one's numbers shifted by a few rows: in other memory, which is what a measurement needs.
+    """
+
+    def __init__(self, settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> None:
+        super().__init__(replace(settings, layers=0), SPEC.actions, SPEC.observation, vocabulary(SPEC.name), "corner4")
+        self.requires_grad_(False).eval()
+        if device.type == "cuda":
+            self.to(device=device, dtype=dtype)
+        else:
+            pack(self)
+        self.settings, self.trunk.depth = settings, settings.layers
+        layers = shifted_layers(settings, device, dtype)
+        if device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
+            self.trunk.packed = BlockedLayers(self.trunk.rotary, layers, self.trunk.norm)
+        else:
+            self.trunk.layers = torch.nn.ModuleList(layers)
+            self.trunk.to(dtype=dtype)
+            pack(self.trunk)
+        for part in (self.embedding, self.head, self.trunk.norm):
+            part.to(device=device, dtype=dtype)
+
+    def encode(self, observation: Observation) -> Tensor:
+        """As `Target.encode`, in the trunk's number format."""
+        return super().encode(observation).to(self.dtype)
+
+
+def shifted_layers(settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> Iterator[Layer]:
+    """The trunk's layers, frozen, one after the other."""
+    torch.manual_seed(0)
+    first = Layer(settings.width, settings.heads, settings.feed_forward).requires_grad_(False)
+    for parameter in first.parameters():
+        if parameter.dim() == 2:
+            parameter.normal_(std=0.02)
+    for place in range(settings.layers):
+        with torch.device("meta"):
+            layer = Layer(settings.width, settings.heads, settings.feed_forward)
+        for name, part in first.named_children():
+            weight: Any = part.weight
+            shifted = weight.roll(place, 0).to(device=device, dtype=dtype)
+            layer.get_submodule(name).register_parameter("weight", torch.nn.Parameter(shifted, False))
+        yield layer
+
+
+def layer_weights(settings: TargetSettings) -> int:
+    """Numbers in one decoder layer's matrices."""
+    return 4 * settings.width**2 + 3 * settings.width * settings.feed_forward
+
+
+def open_model(settings: BenchSettings, drafter: DrafterSettings | None = None) -> Model:
+    """The policy or shape of `settings.model`, ready for inference. drafter: its shape beside a random target.
+
+    Raises:
+        UsageError: too little memory for the shape. UnknownName: neither a policy nor a shape.
+        CheckpointError: a damaged policy.
+    """
+    shapes = groups()["target"]
+    if settings.model in shapes:
+        return _shape(settings, drafter or DrafterSettings())
+    device, _ = set_up(settings.runtime)
+    try:
+        artifacts = Artifacts(
+            settings.results, PolicySettings(target=settings.model), None, device, settings.runtime.dtype
+        )
+        target: Any = artifacts.target
+    except CheckpointError as error:
+        if "/" not in settings.model and "is damaged" not in str(error):
+            raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
+        raise
+    beside = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target, DrafterSettings())
+    return Model(settings.model, target, beside, blank(target), False)
+
+
+def _policies(results: str) -> list[str]:
+    from kerv_cli.places import results_dir, shipped_dir
+
+    folders = (results_dir(results) / "artifacts" / "target", shipped_dir())
+    return sorted(path.name for folder in folders for path in folder.glob("*") if path.is_dir())
+
+
+def _shape(settings: BenchSettings, drafter: DrafterSettings) -> Model:
+    if settings.dtype not in ("auto", *DTYPES):
+        raise UsageError(f"dtype={settings.dtype}: known are auto, {', '.join(DTYPES)}")
+    words = [f"target={settings.model}"]
+    shape = compose("train_target", words, TrainTargetSettings).target
+    device, _ = set_up(settings.runtime)
+    dtype = DTYPES[settings.dtype] if settings.dtype != "auto" else fastest(torch.device(device))
+    needed = _SPARE * dtype.itemsize * layer_weights(shape) * (shape.layers + 1)
+    free = free_memory(torch.device(device))
+    if needed > free:
+        raise UsageError(
+            f"target={settings.model} needs {needed / 1e9:.1f} GB in {str(dtype).removeprefix('torch.')}, "
+            f"{free / 1e9:.1f} GB are free on {device}: take a smaller shape, e.g. target=vla-150m"
+        )
+    with torch.inference_mode():
+        target = ShapeTarget(shape, torch.device(device), dtype)
+        return Model(settings.model, target, _drafter(target, drafter), blank(target), True)
+
+
+def _drafter(target: Any, settings: DrafterSettings) -> Drafter:
+    drafter = Drafter.beside(settings, target).to(device=target.device, dtype=target.dtype)
+    drafter.eval().requires_grad_(False)
+    pack(drafter)
+    return drafter
+
+
+def blank(target: Any) -> Observation:
+    """A black image and zeros."""
+    size, space = target.settings.image_size, target.observation
+    images = {name: np.zeros((size, size, 3), np.uint8) for name in target.cameras}
+    return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+
+
+def fastest(device: torch.device) -> torch.dtype:
+    """The number format in which one row times a matrix larger than the processor's caches takes less time here,
+    measured; bfloat16 on CUDA."""
+    if device.type == "cuda":
+        return torch.bfloat16
+    if not multiplies_bfloat16():
+        return torch.float32
+    from kerv_cli.bench.machine import median_seconds
+    from kerv_cli.targets.compact.packed import FastLinear
+    from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear
+
+    weight, row = torch.ones(8192, 4096), torch.ones(1, 4096)
+    half, full = BlockedLinear(weight), FastLinear(weight)
+    seconds = {
+        torch.bfloat16: median_seconds(lambda: half(row.bfloat16()), device, 7),
+        torch.float32: median_seconds(lambda: full(row), device, 7),
+    }
+    return min(seconds, key=seconds.__getitem__)
+
+
+def free_memory(device: torch.device) -> float:
+    """Bytes that an allocation may take."""
+    if device.type == "cuda":
+        return float(torch.cuda.mem_get_info(device)[0])
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            fields = dict(line.split(":", 1) for line in file)
+        return 1024.0 * int(fields["MemAvailable"].split()[0])
+    except (OSError, KeyError):
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -1,0 +1,137 @@
+"""One bench: the card, cold start, every phase, ceilings, and the document that holds them all."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from kerv_cli.bench.ceilings import MethodCeiling, ceilings
+from kerv_cli.bench.machine import Machine, measure_machine, synchronise
+from kerv_cli.bench.model import Model, open_model
+from kerv_cli.bench.phases import Phase, Stage, costs, flipped, measure
+from kerv_cli.bench.profile import Profile
+from kerv_cli.errors import UsageError
+from kerv_cli.places import results_dir
+from kerv_cli.provenance import stamp
+from kerv_cli.settings import BenchSettings
+
+FLIP_CHUNKS = 8
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N. ties: flipped
+    tokens, and compared ones."""
+
+    model: Model
+    machine: Machine
+    card: dict[str, float]
+    cold: dict[str, float]
+    phases: list[Phase]
+    ceilings: dict[int, list[MethodCeiling]]
+    ties: tuple[int, int]
+
+    @property
+    def dtype(self) -> str:
+        """Number format of the trunk."""
+        return str(self.model.dtype).removeprefix("torch.")
+
+    @property
+    def title(self) -> str:
+        """What was measured where, in words."""
+        device = self.model.target.device
+        return f"{self.model.name}, {self.dtype}, {stamp(str(device))['device_name']}, {torch.get_num_threads()} thread"
+
+    def document(self) -> dict[str, Any]:
+        """For JSON."""
+        device = self.model.target.device
+        return {
+            "target": self.model.name,
+            "random_weights": self.model.is_shape,
+            "dtype": self.dtype,
+            "device": str(device),
+            "threads": torch.get_num_threads(),
+            **stamp(str(device)),
+            "card": self.card,
+            "cold_start": self.cold,
+            "phases": [phase.as_dict() for phase in self.phases],
+            "ceilings": {str(n): [asdict(c) for c in found] for n, found in self.ceilings.items()},
+            "ties": {"flipped": self.ties[0], "compared": self.ties[1]},
+            "profile": Profile.of(int(self.card["prompt"]), self.phases).as_dict(),
+        }
+
+
+def check(settings: BenchSettings) -> None:
+    """Refuses numbers that cannot be measured.
+
+    Raises:
+        UsageError: the first of them.
+    """
+    if settings.repeats < 3:
+        raise UsageError(f"repeats={settings.repeats}: at least 3, medians are over them")
+    if not settings.tokens or min(settings.tokens) < 3 or max(settings.tokens) > 256:
+        raise UsageError(f"tokens={settings.tokens}: chunks of 3 to 256 tokens, e.g. tokens=[7,16]")
+    if settings.drafter_depth < 1:
+        raise UsageError(f"drafter_depth={settings.drafter_depth}: at least 1")
+
+
+def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
+    """Bytes, operations and floors of the model on this machine; needs no forward of the trunk."""
+    prompt, s = model.target.max_prompt, model.target.settings
+    size = 4 if model.target.device.type == "cpu" else model.dtype.itemsize
+    floors = {
+        "floor_token": costs(model, 1, prompt),
+        "floor_verify": costs(model, tokens, prompt),
+        "floor_prefill": costs(model, prompt, 0),
+        "floor_both": costs(model, prompt + tokens - 1, 0),
+    }
+    return {
+        "weights": model.trunk_weights,
+        "weight_bytes": model.trunk_weights * model.dtype.itemsize,
+        "cache_bytes": 2.0 * s.layers * s.width * (prompt + tokens) * size,
+        "prompt": prompt,
+        "tokens": tokens,
+        "bandwidth": machine.bandwidth,
+        "flops": machine.flops,
+        **{name: machine.floor(*needs) for name, needs in floors.items()},
+    }
+
+
+def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, float], float]:
+    """The model, its machine, the card and the seconds that opening took. Errors as `open_model` and `check`."""
+    check(settings)
+    began = time.perf_counter()
+    model = open_model(settings)
+    synchronise(model.target.device)
+    opened = time.perf_counter() - began
+    machine = measure_machine(model.target.device, model.dtype)
+    return model, machine, card_of(model, machine, max(settings.tokens)), opened
+
+
+@torch.inference_mode()
+def run(
+    settings: BenchSettings, model: Model, machine: Machine, card: dict[str, float], opened: float
+) -> Bench:
+    """Measures the opened model."""
+    began = time.perf_counter()
+    stage = Stage(model, max(settings.tokens) + 2)
+    stage.prefill()
+    stage.verify()
+    synchronise(model.target.device)
+    cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
+    phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
+    profile = Profile.of(stage.length, phases)
+    found = {n: ceilings(profile, n) for n in settings.tokens}
+    return Bench(model, machine, card, cold, phases, found, flipped(model, FLIP_CHUNKS, max(settings.tokens)))
+
+
+def place_of(results: str, model: str, dtype: str, kind: str) -> Path:
+    """results/bench/<model>-<dtype>.<kind>: of the document, the plot, the table of a replay."""
+    name = model.rstrip("/").rsplit("/", 1)[-1]
+    return results_dir(results) / "bench" / f"{name}-{dtype}{kind}"
+
+
