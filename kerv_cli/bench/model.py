@@ -110,8 +110,8 @@ def layer_weights(settings: TargetSettings) -> int:
     return 4 * settings.width**2 + 3 * settings.width * settings.feed_forward
 
 
-def open_model(settings: BenchSettings, drafter: DrafterSettings | None = None) -> Model:
-    """The policy or shape of `settings.model`, ready for inference. drafter: its shape beside a random target.
+def open_model(settings: BenchSettings) -> Model:
+    """The policy or shape of `settings.model`, ready for inference, with its drafter; where there is none a random one.
 
     Raises:
         UsageError: too little memory for the shape. UnknownName: neither a policy nor a shape.
@@ -119,7 +119,7 @@ def open_model(settings: BenchSettings, drafter: DrafterSettings | None = None) 
     """
     shapes = groups()["target"]
     if settings.model in shapes:
-        return _shape(settings, drafter or DrafterSettings())
+        return _shape(settings)
     device, _ = set_up(settings.runtime)
     try:
         artifacts = Artifacts(
@@ -130,7 +130,7 @@ def open_model(settings: BenchSettings, drafter: DrafterSettings | None = None) 
         if "/" not in settings.model and "is damaged" not in str(error):
             raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
         raise
-    beside = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target, DrafterSettings())
+    beside = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target)
     return Model(settings.model, target, beside, blank(target), False)
 
 
@@ -141,7 +141,7 @@ def _policies(results: str) -> list[str]:
     return sorted(path.name for folder in folders for path in folder.glob("*") if path.is_dir())
 
 
-def _shape(settings: BenchSettings, drafter: DrafterSettings) -> Model:
+def _shape(settings: BenchSettings) -> Model:
     if settings.dtype not in ("auto", *DTYPES):
         raise UsageError(f"dtype={settings.dtype}: known are auto, {', '.join(DTYPES)}")
     words = [f"target={settings.model}"]
@@ -157,11 +157,11 @@ def _shape(settings: BenchSettings, drafter: DrafterSettings) -> Model:
         )
     with torch.inference_mode():
         target = ShapeTarget(shape, torch.device(device), dtype)
-        return Model(settings.model, target, _drafter(target, drafter), blank(target), True)
+        return Model(settings.model, target, _drafter(target), blank(target), True)
 
 
-def _drafter(target: Any, settings: DrafterSettings) -> Drafter:
-    drafter = Drafter.beside(settings, target).to(device=target.device, dtype=target.dtype)
+def _drafter(target: Any) -> Drafter:
+    drafter = Drafter.beside(DrafterSettings(), target).to(device=target.device, dtype=target.dtype)
     drafter.eval().requires_grad_(False)
     pack(drafter)
     return drafter

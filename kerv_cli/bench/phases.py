@@ -72,21 +72,23 @@ class Stage:
         """Observation -> prompt."""
         self.prompt = self.target.encode(self.model.observation)
 
-    def prefill(self, drafted: int = 0) -> list[int]:
-        """The prompt and `drafted` tokens behind it -> argmax of the rows from the prompt's last on."""
+    def prefill(self, drafted: int = 0, seen: np.ndarray | None = None) -> list[int]:
+        """The prompt and `drafted` tokens behind it -> argmax of the rows from the prompt's last on. seen: of a tree."""
         x = self.prompt
         if drafted:
             x = torch.cat([x, self.target.embed(self.tokens(drafted))], 1)
         self.cache.length = 0
-        self.hidden = self.target.forward(x, torch.arange(x.shape[1], device=self.device), self.cache, None)
+        self.hidden = self.target.forward(x, torch.arange(x.shape[1], device=self.device), self.cache, seen)
         found: list[int] = self.target.head(self.hidden[0, self.length - 1 :]).argmax(-1).tolist()
         return found
 
-    def verify(self, drafted: int = 0, done: int = 1) -> list[int]:
-        """One token and a chain of `drafted` behind it, after `done` committed tokens -> argmax of every row."""
+    def verify(self, drafted: int = 0, done: int = 1, seen: np.ndarray | None = None) -> list[int]:
+        """One token and `drafted` behind it, after `done` committed tokens -> argmax of every row. seen: of a tree;
+        default a chain."""
         start = self.cache.length = self.length + done - 1
         positions = torch.arange(start, start + 1 + drafted, device=self.device)
-        seen = visible_in_verification(TokenTree.chain(range(drafted))) if drafted else None
+        if drafted and seen is None:
+            seen = visible_in_verification(TokenTree.chain(range(drafted)))
         x = self.target.embed(self.tokens(1 + drafted))
         self.hidden = self.target.forward(x, positions, self.cache, seen)
         found: list[int] = self.target.head(self.hidden)[0].argmax(-1).tolist()

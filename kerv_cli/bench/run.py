@@ -113,9 +113,7 @@ def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, fl
 
 
 @torch.inference_mode()
-def run(
-    settings: BenchSettings, model: Model, machine: Machine, card: dict[str, float], opened: float
-) -> Bench:
+def run(settings: BenchSettings, model: Model, machine: Machine, card: dict[str, float], opened: float) -> Bench:
     """Measures the opened model."""
     began = time.perf_counter()
     stage = Stage(model, max(settings.tokens) + 2)
@@ -133,5 +131,3 @@ def place_of(results: str, model: str, dtype: str, kind: str) -> Path:
     """results/bench/<model>-<dtype>.<kind>: of the document, the plot, the table of a replay."""
     name = model.rstrip("/").rsplit("/", 1)[-1]
     return results_dir(results) / "bench" / f"{name}-{dtype}{kind}"
-
-

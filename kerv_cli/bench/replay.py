@@ -1,0 +1,110 @@
+"""Executes recorded sequences of forwards on a model of another shape, and predicts them from a latency profile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from kerv_cli.bench.machine import synchronise
+from kerv_cli.bench.model import Model
+from kerv_cli.bench.phases import Stage
+from kerv_cli.bench.profile import Profile
+from kerv_cli.bench.sequences import DRAFTER, DecodeSequence, Forward, Recorded
+from kerv_cli.drafting.eagle import grow_tree
+from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
+
+_SPARE = 8
+
+
+class Player:
+    """Plays decodes of recorded settings; `stage` holds the model's caches."""
+
+    def __init__(self, model: Model, recorded: Sequence[Recorded]) -> None:
+        """Room is made for the largest draft of the settings."""
+        forwards = [f for own in recorded for s in own.sequences for f in s.forwards]
+        most = max((f.start + f.drafted for f in forwards), default=1)
+        wide = max((_tree(own.proposer)[0] * _tree(own.proposer)[1] for own in recorded), default=0)
+        self.model, self.stage = model, Stage(model, most + wide + _SPARE)
+
+    @torch.inference_mode()
+    def play(self, decode: DecodeSequence, proposer: Mapping[str, Any]) -> float:
+        """Seconds of the decode's forwards and drafts on the model, the prompt's encoding included, and its recorded
+        host seconds."""
+        device = self.stage.device
+        synchronise(device)
+        began = time.perf_counter()
+        self.stage.encode()
+        for place, forward in enumerate(decode.forwards):
+            self._forward(forward, proposer)
+            if decode.drafts and place + 1 < len(decode.forwards):
+                self._feed(forward)
+        synchronise(device)
+        return time.perf_counter() - began + decode.host
+
+    def _forward(self, forward: Forward, proposer: Mapping[str, Any]) -> None:
+        tree = TokenTree.chain([0] * forward.drafted)
+        if forward.proposer == DRAFTER:
+            depth, top_k = _tree(proposer)
+            self.stage.draft_state.cache.length = self.stage.length + forward.start - 1
+            depth = min(depth, forward.drafted)
+            state, stage = self.stage.draft_state, self.stage
+            tree = grow_tree(self.model.drafter, stage.target, state, depth, top_k, forward.drafted)
+        if forward.kind == "prefill":
+            self.stage.prefill(len(tree), None if tree.is_chain else visible_in_prefill(tree, self.stage.length))
+        else:
+            self.stage.verify(len(tree), forward.start, visible_in_verification(tree) if len(tree) else None)
+        if len(tree):
+            first = self.stage.length + forward.start - (forward.kind == "verify")
+            kept = forward.accepted + (forward.kind == "verify")
+            self.stage.cache.compact(first, torch.arange(first, first + kept, device=self.stage.device))
+
+    def _feed(self, forward: Forward) -> None:
+        if forward.kind == "prefill":
+            self.stage.feed(self.stage.hidden[:, : self.stage.length], 0)
+        else:
+            kept = self.stage.hidden[:, : forward.accepted + 1]
+            self.stage.feed(kept, self.stage.length + forward.start - 1)
+
+
+def _tree(proposer: Mapping[str, Any]) -> tuple[int, int]:
+    """Depth and children per level of a setting's drafter; 0, 0 without one."""
+    return int(proposer.get("depth") or 0), int(proposer.get("top_k") or 0)
+
+
+def predicted(decode: DecodeSequence, profile: Profile) -> float:
+    """Seconds of the decode by the cost model: the profile's times of its forwards, the drafter's passes at the
+    profile's time per token, and the recorded host seconds."""
+    seconds = profile.seconds("encode", 1) + decode.host
+    step = profile.drafting(2)
+    for place, forward in enumerate(decode.forwards):
+        rows = forward.drafted + (profile.prompt if forward.kind == "prefill" else 1)
+        seconds += profile.seconds(forward.kind, rows)
+        if forward.proposer == DRAFTER:
+            seconds += profile.drafting(min(forward.drafted, profile_depth(forward)))
+        if decode.drafts and place + 1 < len(decode.forwards):
+            seconds += step
+    return seconds
+
+
+def profile_depth(forward: Forward) -> int:
+    """Levels of a draft: a chain's length; a tree has more nodes than a chunk has tokens, and few levels."""
+    return forward.drafted if forward.drafted < 32 else 5
+
+
+def play_all(player: Player, recorded: Sequence[Recorded]) -> np.ndarray:
+    """(settings, decodes) seconds; the settings take turns decode by decode, each turn begins with another one. Settings
+    with fewer decodes begin again."""
+    count = max(len(own.sequences) for own in recorded)
+    for own in recorded:
+        player.play(own.sequences[0], own.proposer)  # first calls choose kernels
+    seconds = np.empty((len(recorded), count))
+    for i in range(count):
+        for turn in range(len(recorded)):
+            place = (turn + i) % len(recorded)
+            own = recorded[place]
+            seconds[place, i] = player.play(own.sequences[i % len(own.sequences)], own.proposer)
+    return seconds
