@@ -1,7 +1,8 @@
-"""The highest speedup that a method can reach at measured latencies: every draft accepted whole (docs/methods.md §5)."""
+"""The highest speedup of a method at measured latencies: every draft accepted whole (docs/methods.md §5)."""
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -28,11 +29,15 @@ def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
     for name in groups()["method"]:
         if name in (EXPERT, "ar"):
             continue
-        settings = compose("rollout", [f"method={name}"], RolloutSettings)
-        ceiling = _ceiling(name, settings, profile, tokens)
+        ceiling = _ceiling(name, _settings(name), profile, tokens)
         if ceiling is not None:
             found.append(ceiling)
     return found
+
+
+@functools.cache
+def _settings(method: str) -> RolloutSettings:
+    return compose("rollout", [f"method={method}"], RolloutSettings)
 
 
 def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int) -> MethodCeiling | None:

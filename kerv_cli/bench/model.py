@@ -59,7 +59,7 @@ class Model:
 
 
 class ShapeTarget(CompactTarget):
-    """A compact target with random weights, made layer by layer in its final form: 7 B parameters are never there twice.
+    """A compact target with random weights, made layer by layer in its final form: 7 B of them are never there twice.
 
     On a CPU the prompt's encoder stays float32, where its packed weights are fastest. Layers after the first are the
     first one's numbers shifted by a few rows: in other memory, which is what a measurement needs.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 
-from kerv_cli.bench.machine import Machine, timed
+from kerv_cli.bench.machine import Machine, measure_machine, timed
 from kerv_cli.bench.model import Model
 from kerv_cli.drafting.eagle import DraftState, draft_chain, observe
 from kerv_cli.drafting.tree import TokenTree, visible_in_verification
@@ -73,7 +73,8 @@ class Stage:
         self.prompt = self.target.encode(self.model.observation)
 
     def prefill(self, drafted: int = 0, seen: np.ndarray | None = None) -> list[int]:
-        """The prompt and `drafted` tokens behind it -> argmax of the rows from the prompt's last on. seen: of a tree."""
+        """The prompt and `drafted` tokens behind it -> argmax of the prompt's last row and of theirs. seen: of a
+        tree."""
         x = self.prompt
         if drafted:
             x = torch.cat([x, self.target.embed(self.tokens(drafted))], 1)
@@ -124,8 +125,11 @@ def _phase(kind: str, rows: int, seconds: np.ndarray, needs: tuple[float, float]
 
 
 @torch.inference_mode()
-def measure(model: Model, machine: Machine, tokens: Sequence[int], depth: int, repeats: int) -> list[Phase]:
-    """Every phase that a chunk of N tokens can have, for each N: one token, verify(1 + n), prefill(P + n), drafts."""
+def measure(
+    model: Model, machine: Machine, tokens: Sequence[int], depth: int, repeats: int
+) -> tuple[Machine, list[Phase]]:
+    """Every phase that a chunk of N tokens can have, for each N: one token, verify(1 + n), prefill(P + n), drafts. The
+    machine is measured again behind them -> its best rates, from which all floors are taken."""
     stage = Stage(model, max(tokens) + 2)
     most = max(tokens)
     device, length = stage.device, stage.length
@@ -149,7 +153,8 @@ def measure(model: Model, machine: Machine, tokens: Sequence[int], depth: int, r
     for count in sorted({2, max(2, depth)}):  # the first token comes from the state that is there: no forward
         needs = per_token * (count - 1), 2.0 * (count - 1) * per_token / model.dtype.itemsize
         add("draft", count, needs, lambda n=count: stage.draft(n))  # type: ignore[misc]
-    return done
+    machine = machine.best_of(measure_machine(device, model.dtype))
+    return machine, [replace(phase, floor=machine.floor(phase.read, phase.flops)) for phase in done]
 
 
 def layer_numbers(model: Model) -> int:
@@ -170,7 +175,7 @@ def flipped(model: Model, chunks: int, tokens: int) -> tuple[int, int]:
     differ = 0
     for _ in range(chunks):
         drawn = torch.randint(model.target.actions.tokens, (1, tokens), generator=generator).to(stage.device)
-        stage.tokens = lambda count, drawn=drawn: drawn[:, :count]  # type: ignore[misc,assignment]
+        stage.tokens = lambda count, drawn=drawn: drawn[:, :count]  # type: ignore[misc,method-assign]
         stage.prefill()
         together = stage.verify(tokens - 1)
         stage.cache.length = stage.length

@@ -96,8 +96,8 @@ def profile_depth(forward: Forward) -> int:
 
 
 def play_all(player: Player, recorded: Sequence[Recorded]) -> np.ndarray:
-    """(settings, decodes) seconds; the settings take turns decode by decode, each turn begins with another one. Settings
-    with fewer decodes begin again."""
+    """(settings, decodes) seconds; the settings take turns decode by decode, each turn begins with another one.
+    Settings with fewer decodes begin again."""
     count = max(len(own.sequences) for own in recorded)
     for own in recorded:
         player.play(own.sequences[0], own.proposer)  # first calls choose kernels

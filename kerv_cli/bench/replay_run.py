@@ -135,7 +135,7 @@ def replay(settings: BenchReplaySettings) -> Replay:
     store = StudyStore(settings.results, settings.recorded)
     by_tokens = {n: read_study(store, n, settings.decodes) for n in settings.tokens}
     model, machine, _, _ = open_and_card(settings)
-    phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
+    machine, phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
     rows = []
     for tokens, recorded in by_tokens.items():
         seconds = play_all(Player(model, recorded), recorded)

@@ -27,7 +27,7 @@ def card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
 
 def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
     """One row per phase: times in milliseconds, rates, share of the roofline."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for phase in phases:
         limited = phase.floor > 0
         rates = (f"{phase.read / phase.seconds / 1e9:.1f}", f"{phase.flops / phase.seconds / 1e9:.0f}")
@@ -53,7 +53,7 @@ def ceiling_rows(found: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str
 def comparison_rows(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Phases that both documents have: medians in milliseconds and a over b."""
     other = {phase["name"]: phase for phase in b["phases"]}
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for phase in a["phases"]:
         if phase["name"] in other:
             mine, theirs = phase["seconds"], other[phase["name"]]["seconds"]

@@ -113,7 +113,7 @@ def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, fl
 
 
 @torch.inference_mode()
-def run(settings: BenchSettings, model: Model, machine: Machine, card: dict[str, float], opened: float) -> Bench:
+def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) -> Bench:
     """Measures the opened model."""
     began = time.perf_counter()
     stage = Stage(model, max(settings.tokens) + 2)
@@ -121,9 +121,10 @@ def run(settings: BenchSettings, model: Model, machine: Machine, card: dict[str,
     stage.verify()
     synchronise(model.target.device)
     cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
-    phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
+    machine, phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
     profile = Profile.of(stage.length, phases)
     found = {n: ceilings(profile, n) for n in settings.tokens}
+    card = card_of(model, machine, max(settings.tokens))
     return Bench(model, machine, card, cold, phases, found, flipped(model, FLIP_CHUNKS, max(settings.tokens)))
 
 

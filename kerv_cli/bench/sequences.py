@@ -1,4 +1,4 @@
-"""Recorded decodes as sequences of forwards: what a study's cells say about which forwards ran, over how many tokens."""
+"""Recorded decodes as sequences of forwards: which ran, and over how many tokens, as a study's cells say."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def sequence_of(row: Mapping[str, Any], size: int, tokens: int) -> DecodeSequenc
         if played["mode"] == "skip" or start >= tokens:
             continue
         left, most = tokens - start - 1, size - start - 1  # tokens that a draft may have here, and had in the record
-        if nodes and left > 0:
-            nodes = min(nodes, math.ceil(nodes * left / most)) if nodes >= most else nodes
-        else:
+        if left < 1:
             nodes = 0
+        elif nodes >= most:
+            nodes = math.ceil(nodes * left / most)
         kind = "prefill" if start == 0 else "verify"
         accepted = min(int(played["accepted"]), left) if nodes else 0
         forwards.append(Forward(kind, start, nodes, accepted, str(played["proposer"]) if nodes else ""))
@@ -108,5 +108,5 @@ def _setting(label: str, cells: Sequence[Cell], found: Mapping[str, Any], tokens
     picked = rows.iloc[chosen].to_dict("records")
     episodes = sum(len(cell.episodes) for cell in stored)
     successes = sum(int(cell.episodes["success"].sum()) for cell in stored)
-    sequences = tuple(sequence_of(row, size, tokens) for row in picked)  # type: ignore[arg-type]
+    sequences = tuple(sequence_of(row, size, tokens) for row in picked)
     return Recorded(label, sequences, cells[0].settings["proposer"], successes, episodes)

@@ -1,4 +1,4 @@
-"""`kerv bench`: a target's speed against the device's limits; `kerv bench replay`: recorded decodes on another target."""
+"""`kerv bench`: a target's speed against the device's limits; `kerv bench replay`: recorded decodes on another one."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ Compare = Annotated[
 def bench(
     overrides: Overrides = None, cfg: ShowConfig = False, as_json: AsJson = False, compare: Compare = None
 ) -> None:
-    """Measure a target's forwards against the device's limits. With the word replay in front: execute a study's recorded
-    decodes on another target. target= is a policy, or a shape: vla-150m, smolvla, openvla-7b."""
+    """Measure a target's forwards against the device's limits; target= is a policy or a shape: vla-150m, smolvla,
+    openvla-7b. 'kerv bench replay study=NAME target=…' executes a study's recorded decodes on that target."""
     words = list(overrides or [])
     if words[:1] == [REPLAY]:
         _replay(words[1:], cfg, as_json)
@@ -53,7 +53,7 @@ def _measure(settings: BenchSettings, as_json: bool) -> None:
 
     model, machine, card, opened = open_and_card(settings)
     print_table(("card", ""), report.card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
-    done = run(settings, model, machine, card, opened)
+    done = run(settings, model, machine, opened)
     typer.echo(
         f"cold start: opened in {opened:.1f} s, first prefill and token {done.cold['first_decode_seconds']:.2f} s"
     )
@@ -64,7 +64,7 @@ def _measure(settings: BenchSettings, as_json: bool) -> None:
     typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
     document, path = done.document(), place_of(settings.results, model.name, done.dtype, ".json")
     write_json(path, document)
-    report.plot_roofline(path.with_suffix(".png"), done.title, machine, done.phases)
+    report.plot_roofline(path.with_suffix(".png"), done.title, done.machine, done.phases)
     typer.echo(f"{path}\n{path.with_suffix('.png')}")
     if as_json:
         typer.echo(json.dumps(document, allow_nan=False))

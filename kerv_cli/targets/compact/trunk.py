@@ -171,7 +171,7 @@ class LayerStack(Packable):
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
         """An empty cache. fixed: of fixed shapes; default: on CUDA."""
         channels = self.width // self.heads
-        like = self.norm.weight
+        like: Tensor = self.norm.weight
         if isinstance(self.packed, BlockedLayers):
             like = like.to(self.packed.cache_dtype)
         return Cache(self.depth, batch, self.heads, capacity, channels, like, fixed)

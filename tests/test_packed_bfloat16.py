@@ -1,0 +1,91 @@
+"""The packed weights of a bfloat16 trunk compute the trunk, up to bfloat16's rounding; and decode what it decodes."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.trunk import Trunk
+
+pytestmark = pytest.mark.skipif(not multiplies_bfloat16(), reason="this CPU does not multiply bfloat16")
+
+
+@pytest.fixture(scope="module")
+def trunks() -> tuple[Trunk, Trunk]:
+    """The exact trunk of bfloat16 weights, in float32, and the packed one."""
+    torch.manual_seed(3)
+    trunk = Trunk(128, 3, 4, 320).eval().requires_grad_(False)
+    for parameter in trunk.parameters():
+        parameter.data = 0.1 * torch.randn_like(parameter) if parameter.dim() == 2 else 1 + 0.3 * torch.rand(128)
+    packed = trunk.bfloat16()
+    exact = copy.deepcopy(packed).float()
+    pack(packed)
+    assert isinstance(packed.packed, BlockedLayers)
+    return exact, packed
+
+
+def run(trunk: Trunk, x: torch.Tensor, tree: TokenTree) -> list[torch.Tensor]:
+    """A prefill, a tree, its commit, two single tokens, a batch of two; then the tree in the prefill."""
+    prompt, x = 20, x.to(trunk.norm.weight.dtype)
+    cache = trunk.new_cache(1, 64)
+    found = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
+    positions = torch.tensor([prompt, *(prompt + 1 + d for d in tree.depths)])
+    drafted = x[:, prompt : prompt + 1 + len(tree)]
+    found.append(trunk(drafted, positions, cache, visible_in_verification(tree)))
+    cache.compact(prompt, torch.tensor([prompt, prompt + 2, prompt + 4]))
+    for i in (3, 4):
+        found.append(trunk(x[:, -i][:, None], torch.tensor([prompt + i]), cache))
+    cache.length = 0
+    whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
+    found.append(trunk(x[:, : prompt + len(tree)], whole, cache, visible_in_prefill(tree, prompt)))
+    found.append(trunk(x[:, :10].view(2, 5, -1), torch.arange(5)))
+    return found
+
+
+def test_the_packed_trunk_is_the_trunk(trunks: tuple[Trunk, Trunk]) -> None:
+    tree = TokenTree.build(range(6), [-1, -1, 0, 1, 3, 2])
+    x = torch.randn(1, 32, 128)
+    with torch.inference_mode():
+        for exact, packed in zip(*(run(trunk, x.bfloat16(), tree) for trunk in trunks), strict=True):
+            assert packed.dtype == torch.bfloat16
+            assert (packed.float() - exact).abs().mean() < 0.02 * exact.abs().mean()
+
+
+def test_without_a_cache_one_token_sees_itself_alone(trunks: tuple[Trunk, Trunk]) -> None:
+    exact, packed = trunks
+    x = torch.randn(1, 1, 128).bfloat16()
+    with torch.inference_mode():
+        told = packed(x, torch.tensor([7])).float()
+        assert (told - exact(x.float(), torch.tensor([7]))).abs().mean() < 0.02 * told.abs().mean()
+
+
+def test_one_verification_and_single_tokens_agree_but_for_ties(trunks: tuple[Trunk, Trunk]) -> None:
+    """Where their argmax differs, the two best logits lie within bfloat16's rounding: no other cause is allowed."""
+    packed, head = trunks[1], torch.randn(50, 128)
+    x, differ = torch.randn(1, 36, 128).bfloat16(), 0
+    with torch.inference_mode():
+        caches = [packed.new_cache(1, 40) for _ in range(2)]
+        for cache in caches:
+            packed(x[:, :20], torch.arange(20), cache)
+        together = packed(x[:, 20:], torch.arange(20, 36), caches[0]).float()[0] @ head.T
+        for i in range(16):
+            alone = packed(x[:, 20 + i][:, None], torch.tensor([20 + i]), caches[1]).float()[0, 0] @ head.T
+            best = np.sort(alone.numpy())[-2:]
+            if alone.argmax() != together[i].argmax():
+                differ += 1
+                assert best[1] - best[0] < 0.05 * alone.abs().max()
+            assert (alone - together[i]).abs().max() < 0.05 * alone.abs().max()
+    assert differ <= 2
+
+
+def test_training_and_unfreezing_drop_the_packed_weights(trunks: tuple[Trunk, Trunk]) -> None:
+    packed = copy.deepcopy(trunks[1])
+    assert packed.packed is None  # copies have none: oneDNN's layouts cannot be copied
+    pack(packed)
+    assert packed.train().packed is None
