@@ -27,9 +27,11 @@ from kerv_cli.places import shipped_dir
 from kerv_cli.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.spaces import Observation, ObservationSpace, Place
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
+from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.trunk import Trunk, attention_mask
 from kerv_cli.training import runs
 from kerv_cli.training.imitation import Imitation, imitation_job, load_samples, new_target
 from kerv_cli.training.loop import Loop
@@ -223,3 +225,26 @@ def test_a_drafter_of_other_actions_is_refused(seven: Path) -> None:
     wider = dataclasses.replace(description.actions, high=tuple(2 * x for x in description.actions.high))
     with pytest.raises(CheckpointError, match="action space with high"):
         read_drafter(folder, description.sha256, wider)
+
+
+@pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33])
+def test_a_padded_bucket_computes_its_tokens(tokens: int) -> None:
+    """What a captured graph would run, call by call: the rows behind the tokens change nothing."""
+    torch.manual_seed(0)
+    trunk = Trunk(32, 2, 2, 48).eval()
+    x, positions = torch.randn(1, 20 + tokens, 32), torch.arange(20 + tokens)
+    with torch.inference_mode():
+        wanted = trunk.run_layers(x, positions, None, None)[:, 20:]
+        cache = trunk.new_cache(1, 60, fixed=True)
+        captured = CapturedLayers(trunk, cache)
+        for first, last in ((0, 20), (20, 20 + tokens)):
+            mask = attention_mask(None, last - first, cache, x)
+            assert mask is not None
+            found = captured(x[:, first:last], positions[first:last], mask)
+            cache.length = last
+    assert captured.steps.keys() == {32, bucket(tokens)}
+    assert torch.allclose(found, wanted, atol=1e-5)
+
+
+def test_buckets_hold_their_tokens() -> None:
+    assert [bucket(n) for n in (1, 2, 3, 5, 16, 17, 281)] == [1, 2, 4, 8, 16, 32, 288]

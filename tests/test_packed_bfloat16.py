@@ -39,8 +39,7 @@ def run(trunk: Trunk, x: torch.Tensor, tree: TokenTree) -> list[torch.Tensor]:
     drafted = x[:, prompt : prompt + 1 + len(tree)]
     found.append(trunk(drafted, positions, cache, visible_in_verification(tree)))
     cache.compact(prompt, torch.tensor([prompt, prompt + 2, prompt + 4]))
-    for i in (3, 4):
-        found.append(trunk(x[:, -i][:, None], torch.tensor([prompt + i]), cache))
+    found += [trunk(x[:, -i][:, None], torch.tensor([prompt + i]), cache) for i in (3, 4)]
     cache.length = 0
     whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
     found.append(trunk(x[:, : prompt + len(tree)], whole, cache, visible_in_prefill(tree, prompt)))

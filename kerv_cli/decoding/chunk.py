@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,28 +22,46 @@ from kerv_cli.targets.protocol import Cache
 
 
 class Clock:
-    """Stopwatch of one decode: seconds per phase; on CUDA it synchronises before reading the time."""
+    """Stopwatch of one decode: seconds per phase.
+
+    On CUDA it synchronises when it is made and when it stops, and nowhere between: laps are events in the stream, read
+    at the end, so that measuring phases does not keep the host from running ahead.
+    """
 
     def __init__(self, device: torch.device) -> None:
-        self.cuda = device.type == "cuda"
         self.phases = dict.fromkeys(PHASES, 0.0)
-        self.began = self.last = self._now()
-
-    def _now(self) -> float:
-        if self.cuda:
+        self.events: list[tuple[str, torch.cuda.Event]] | None = None
+        if device.type == "cuda":
             torch.cuda.synchronize()
-        return time.perf_counter()
+            self.events = [("", _event())]
+        self.began = self.last = time.perf_counter()
 
     def lap(self, phase: str) -> None:
-        """Adds the time since the last lap to `phase`."""
-        now = self._now()
+        """Adds the time since the last lap to `phase`; on CUDA the device's time, added when the clock stops."""
+        if self.events is not None:
+            self.events.append((phase, _event()))
+            return
+        now = time.perf_counter()
         self.phases[phase] += now - self.last
         self.last = now
 
     def stop(self) -> float:
         """Seconds since the clock was made; the time since the last lap is added to `other`."""
         self.lap("other")
+        if self.events is not None:
+            torch.cuda.synchronize()
+            self.last = time.perf_counter()
+            for (_, begin), (phase, end) in itertools.pairwise(self.events):
+                self.phases[phase] += begin.elapsed_time(end) / 1000.0
+            self.phases["other"] += max(0.0, self.last - self.began - sum(self.phases.values()))
         return self.last - self.began
+
+
+def _event() -> torch.cuda.Event:
+    """An event with a time, recorded in the current stream."""
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
 
 
 def steps_of(asked: int, trained: int) -> int:

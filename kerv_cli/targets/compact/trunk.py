@@ -16,26 +16,29 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.targets.compact.captured import CapturedLayers
 from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradient
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 
 
 class Cache:
-    """Keys and values of every layer in fixed buffers (layers, 2, B, A, capacity, C); the first `length` slots are
-    valid.
+    """Keys and values of every layer in fixed buffers (layers, 2, B, A, slots, C) with slots ≥ capacity; the first
+    `length` slots are valid.
 
-    fixed: every forward has the same shapes. Modules and packed weights order key channels differently, so they must
-    not share a cache.
+    fixed: every forward has the same shapes. captured: the graphs that write to it. Modules and packed weights order key
+    channels differently, so they must not share a cache.
     """
 
     def __init__(
         self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor, fixed: bool | None = None
     ) -> None:
-        self.buffer = like.new_zeros((layers, 2, batch, heads, capacity, channels))
-        self.layers = list(self.buffer)  # (2, B, A, capacity, C): keys, values
+        self.fixed = like.is_cuda if fixed is None else fixed
+        slots = capacity + self.fixed  # a spare one, for the rows that fill up a graph's bucket
+        self.buffer = like.new_zeros((layers, 2, batch, heads, slots, channels))
+        self.layers = list(self.buffer)  # (2, B, A, slots, C): keys, values
         self.capacity = capacity
         self.length = 0
-        self.fixed = like.is_cuda if fixed is None else fixed
+        self.captured: CapturedLayers | None = None
 
     def compact(self, start: int, slots: Tensor) -> None:
         """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
@@ -55,6 +58,14 @@ class Slots:
         if cache.fixed:
             self.index = torch.arange(self.start, self.stop, device=cache.buffer.device)
 
+    @classmethod
+    def at(cls, index: Tensor) -> Slots:
+        """The slots `index` (T,) of a cache of fixed shapes."""
+        slots = cls.__new__(cls)
+        slots.start = slots.stop = 0
+        slots.index = index
+        return slots
+
     def write(self, layer: Tensor, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """k, v (B, A, T, C) into a layer (2, B, A, capacity, C) -> the keys and values to attend to."""
         if self.index is not None:
@@ -67,7 +78,7 @@ class Slots:
 
 
 def attention_mask(seen: np.ndarray | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
-    """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, capacity) for a cache of fixed shapes.
+    """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, slots) for a cache of fixed shapes.
 
     seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to
     all cached ones before those. None: the new tokens are causal. The mask is None where attention without one does the
@@ -80,7 +91,7 @@ def attention_mask(seen: np.ndarray | None, tokens: int, cache: Cache | None, li
         return None
     if seen is None:
         seen = np.tri(tokens, dtype=bool)
-    mask = np.zeros((tokens, cache.capacity if cache is not None and fixed else stop), dtype=np.float32)
+    mask = np.zeros((tokens, cache.buffer.shape[-2] if cache is not None and fixed else stop), dtype=np.float32)
     mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
     mask[:, stop:] = -np.inf
     return torch.from_numpy(mask).to(device=like.device, dtype=like.dtype)
@@ -180,6 +191,10 @@ class LayerStack(Packable):
         """The packed weights where they can compute x: without gradients, and with no cache of fixed shapes."""
         return None if wants_gradient(x) or (cache is not None and cache.fixed) else self.packed
 
+    def captures(self, x: Tensor, cache: Cache | None) -> bool:
+        """Whether a captured graph computes x: one sequence on CUDA, without gradients, in a cache of fixed shapes."""
+        return x.is_cuda and x.shape[0] == 1 and cache is not None and cache.fixed and not wants_gradient(x)
+
     def run_layers(self, x: Tensor, positions: Tensor, cache: Cache | None, seen: np.ndarray | None) -> Tensor:
         """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
         `attention_mask`."""
@@ -187,6 +202,11 @@ class LayerStack(Packable):
         packed = self.packed_for(x, cache)
         if packed is not None:
             x = packed(x, positions, cache, mask)
+        elif self.captures(x, cache):
+            assert cache is not None
+            assert mask is not None
+            cache.captured = cache.captured or CapturedLayers(self, cache)
+            x = cache.captured(x, positions, mask)
         else:
             rotary, slots = self.rotary(positions), Slots(cache, x.shape[1]) if cache is not None else None
             for i, layer in enumerate(self.layers):

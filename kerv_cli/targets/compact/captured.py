@@ -1,0 +1,90 @@
+"""One CUDA graph per number of tokens: a forward over a cache of fixed shapes as a single launch.
+
+A forward of T tokens runs in the graph of the next larger bucket. The rows behind T read zeros and write to the cache's
+spare slot, which no other row attends to. On a device without graphs the same computation runs call by call: that is
+how it is tested on a CPU.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from kerv_cli.targets.compact.trunk import Cache, LayerStack
+
+_WARM_UP = 3  # runs before a capture: libraries choose kernels and allocate workspaces
+
+
+def bucket(tokens: int) -> int:
+    """Tokens of the graph that runs a forward of `tokens`: powers of two up to 16, then multiples of 16."""
+    if tokens <= 16:
+        return 1 << (tokens - 1).bit_length()
+    return -(-tokens // 16) * 16
+
+
+class CapturedLayers:
+    """The layers of one stack over one cache of fixed shapes and batch 1."""
+
+    def __init__(self, stack: LayerStack, cache: Cache) -> None:
+        self.stack, self.cache = stack, cache
+        self.steps: dict[int, _Step] = {}
+
+    def __call__(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        """x (1, T, E) at `positions` (T,), mask (T, slots) as `attention_mask` -> output of the last layer (1, T, E),
+        valid until the next forward of the same bucket; the new tokens lie behind the cached ones."""
+        size = bucket(x.shape[1])
+        if size not in self.steps:
+            self.steps[size] = _Step(self.stack, self.cache, size)
+        return self.steps[size].run(x, positions, mask)
+
+
+class _Step:
+    """The buffers of one bucket, and its graph."""
+
+    def __init__(self, stack: LayerStack, cache: Cache, size: int) -> None:
+        self.stack, self.cache = stack, cache
+        like, slots = cache.buffer, cache.buffer.shape[-2]
+        self.x = like.new_zeros((1, size, stack.width))
+        self.positions = torch.zeros(size, dtype=torch.long, device=like.device)
+        self.index = torch.full((size,), slots - 1, dtype=torch.long, device=like.device)
+        self.mask = like.new_full((size, slots), -torch.inf)
+        self.mask[:, -1] = 0.0  # a row that attends to nothing would be NaN, and so would its value for all others
+        self.graph = self._captured() if like.is_cuda else None
+
+    def _captured(self) -> torch.cuda.CUDAGraph:
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(_WARM_UP):
+                self._compute()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.out = self._compute()
+        return graph
+
+    def _compute(self) -> Tensor:
+        from kerv_cli.targets.compact.trunk import Slots
+
+        x, rotary, slots = self.x, self.stack.rotary(self.positions), Slots.at(self.index)
+        for layer, kept in zip(self.stack.layers, self.cache.layers, strict=True):
+            x = layer(x, rotary, kept, slots, self.mask)
+        return x
+
+    def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        """As `CapturedLayers.__call__`."""
+        tokens, start = x.shape[1], self.cache.length
+        self.x.zero_()[:, :tokens].copy_(x)
+        self.positions[:tokens].copy_(positions)
+        self.index.fill_(self.mask.shape[1] - 1)
+        torch.arange(start, start + tokens, out=self.index[:tokens])
+        self.mask[:, :-1] = -torch.inf
+        self.mask[:tokens].copy_(mask)
+        self.mask[tokens:, -1] = 0.0
+        if self.graph is None:
+            return self._compute()[:, :tokens]
+        self.graph.replay()
+        return self.out[:, :tokens]

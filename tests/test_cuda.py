@@ -1,0 +1,44 @@
+"""On a CUDA device: captured graphs compute what eager forwards do, and strict methods decode AR's tokens."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kerv_cli.bench.model import open_model
+from kerv_cli.bench.phases import flipped
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
+from kerv_cli.settings import BenchSettings, RuntimeSettings
+from kerv_cli.targets.compact.trunk import Trunk
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+
+
+def test_a_captured_graph_computes_what_eager_forwards_do() -> None:
+    torch.manual_seed(0)
+    trunk = Trunk(64, 3, 4, 160).cuda().eval()
+    x, outputs = torch.randn(1, 40, 64, device="cuda"), []
+    with torch.inference_mode():
+        for fixed in (True, False):
+            cache = trunk.new_cache(1, 48, fixed)
+            found = []
+            for first, last in ((0, 20), (20, 21), (21, 22), (22, 40)):
+                found.append(trunk(x[:, first:last], torch.arange(first, last, device="cuda"), cache))
+            assert (cache.captured is not None) == fixed
+            outputs.append(torch.cat(found, 1))
+    assert torch.allclose(*outputs, atol=1e-4)
+
+
+def test_strict_methods_decode_the_baselines_tokens() -> None:
+    model = open_model(BenchSettings(model="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
+    wanted = Decoder(model.target).decode(model.observation)
+    assert sum(wanted.phases.values()) == pytest.approx(wanted.seconds, rel=0.2)
+    for proposer in (JacobiProposer(), DrafterProposer(model.drafter, model.target, 5, 3, 12)):
+        assert Decoder(model.target, Parts(proposer=proposer)).decode(model.observation).tokens == wanted.tokens
+
+
+def test_ties_in_bfloat16_are_few() -> None:
+    model = open_model(BenchSettings(model="nano", dtype="bfloat16", runtime=RuntimeSettings(device="cuda")))
+    differ, compared = flipped(model, 4, 16)
+    assert differ <= compared // 4
