@@ -2,7 +2,7 @@
 # Everything that needs a GPU, in under 25 minutes, on a Linux with CUDA and torch and no network.
 #
 #   scripts/gpu.sh                       writes results/gpu/: one log and the result of every step, as each ends
-#   DEVICE=cpu SHAPES="nano nano nano" SCALE=nano LIMIT=300 scripts/gpu.sh     a trial without a GPU
+#   DEVICE=cpu SHAPES="nano tiny" SCALE=nano DECODES=3 EPISODES=1 scripts/gpu.sh     a trial without a GPU
 #
 # PYTHON   the interpreter that has torch                (.venv/bin/python where it exists, else python3)
 # WHEELS   folder of wheels for packages that are missing (wheels)
@@ -11,6 +11,8 @@
 # DEMOS    folder of the demonstrations to train on       (results/artifacts/demos/mt50)
 # SHAPES   shapes that are measured                       (vla-150m smolvla openvla-7b)
 # SCALE    shape of the replay                            (openvla-7b)
+# DECODES  decodes of every setting in the replay         (40)
+# EPISODES per task and setting in the shipped policy's study (2)
 # LIMIT    seconds for all of it                          (1500)
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -22,6 +24,8 @@ STUDY=${STUDY:-results/studies/main}
 DEMOS=${DEMOS:-results/artifacts/demos/mt50}
 SHAPES=${SHAPES:-vla-150m smolvla openvla-7b}
 SCALE=${SCALE:-openvla-7b}
+DECODES=${DECODES:-40}
+EPISODES=${EPISODES:-2}
 LIMIT=${LIMIT:-1500}
 DEVICE=${DEVICE:-cuda}
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
@@ -81,12 +85,12 @@ done
 if [ -d "$STUDY" ]; then
     study=$(basename "$STUDY")
     ln -sfn "$(cd "$STUDY" && pwd)" "$OUT/studies/$study"
-    kerv replay 420 bench replay "study=$study" "target=$SCALE" "tokens=[7,16]" --json
+    kerv replay 420 bench replay "study=$study" "target=$SCALE" "tokens=[7,16]" "decodes=$DECODES" --json
     rm -f "$OUT/studies/$study"
 else
     skip replay "no study in $STUDY: run 'kerv sweep study=main', or set STUDY"
 fi
-kerv sweep 300 sweep study=main task=reach-v3,drawer-open-v3 episodes=2
+kerv sweep 300 sweep study=main task=drawer-open-v3,drawer-close-v3 "episodes=$EPISODES"
 if [ -d "$DEMOS" ]; then
     mkdir -p "$OUT/artifacts/demos"
     ln -sfn "$(cd "$DEMOS" && pwd)" "$OUT/artifacts/demos/mt50"

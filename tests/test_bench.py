@@ -7,8 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 import torch
+from studies_synthetic import prepare, threshold_settings, threshold_study
 from typer.testing import CliRunner
 
 from kerv_cli.app import app
@@ -21,6 +23,8 @@ from kerv_cli.bench.replay import Player, predicted
 from kerv_cli.bench.sequences import DecodeSequence, Forward, Recorded, sequence_of
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import BenchSettings
+from kerv_cli.studies.execute import execute
+from kerv_cli.studies.store import StudyStore
 
 NANO = BenchSettings(model="nano", dtype="float32")
 
@@ -157,6 +161,27 @@ def test_a_stage_reports_the_targets_own_tokens() -> None:
     with torch.inference_mode():
         hidden = model.target.forward(stage.prompt, torch.arange(stage.length))
         assert stage.prefill() == [int(model.target.head(hidden[0, -1]).argmax())]
+
+
+def test_a_study_is_replayed_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """End to end on a synthetic study: AR's forwards are N, every method's are those of its record."""
+    monkeypatch.setattr("kerv_cli.bench.machine._BUFFER", 2**20)
+    monkeypatch.setattr("kerv_cli.bench.machine._WIDTH", 256)
+    cells = threshold_study(["reach-v3"], radii=(9,))
+    store = StudyStore(tmp_path, "threshold")
+    store.write_plan(threshold_settings(), cells)
+    execute(cells, prepare, store)
+    words = ("study=threshold", "target=nano", "dtype=float32", "decodes=4", "repeats=3", "tokens=[7,16]")
+    told = kerv("replay", *words, f"results={tmp_path}", "--json")
+    rows = json.loads(told.splitlines()[-1])["rows"]
+    assert [(r["tokens"], r["label"]) for r in rows][:2] == [(7, "ar"), (7, "naive_sd")]
+    baseline = {r["tokens"]: r for r in rows if r["label"] == "ar"}
+    assert {n: r["forwards"] for n, r in baseline.items()} == {7: 7.0, 16: 16.0}
+    assert all(r["speedup"] == r["model"] == 1.0 for r in baseline.values())
+    assert all(2 <= r["forwards"] < r["tokens"] and set(r["projections"]) for r in rows if r["label"] != "ar")
+    table = pd.read_csv(tmp_path / "bench/nano-float32-replay-threshold.csv")
+    assert len(table) == 6
+    assert {"speedup", "low", "high", "projection.A100 80GB", "device_name", "git_commit"} <= set(table.columns)
 
 
 def kerv(*words: str) -> str:

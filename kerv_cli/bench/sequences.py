@@ -17,7 +17,8 @@ from kerv_cli.studies.store import StudyStore
 
 DRAFTER = "drafter"
 _HOST = ("seconds.accept", "seconds.rectify", "seconds.other")
-_COLUMNS = ["task", "seed", "index", "rounds", "seconds.propose", *_HOST]
+_TIMES = ("seconds.propose", *_HOST)
+_COLUMNS = ["task", "seed", "index", "rounds", *_TIMES]
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def sequence_of(row: Mapping[str, Any], size: int, tokens: int) -> DecodeSequenc
         accepted = min(int(played["accepted"]), left) if nodes else 0
         forwards.append(Forward(kind, start, nodes, accepted, str(played["proposer"]) if nodes else ""))
     drafted = any(f.proposer == DRAFTER for f in forwards)
-    host = sum(float(row[name] or 0.0) for name in _HOST) + (0.0 if drafted else float(row["seconds.propose"] or 0.0))
+    host = sum(float(row[name]) for name in (_HOST if drafted else _TIMES))
     return DecodeSequence(tuple(forwards), host)
 
 
@@ -101,6 +102,7 @@ def _setting(label: str, cells: Sequence[Cell], found: Mapping[str, Any], tokens
     stored = [found[cell.id] for cell in cells]
     frames = [pq.read_table(cell.folder / "decodes.parquet", columns=_COLUMNS).to_pandas() for cell in stored]
     rows = pd.concat(frames).sort_values(["task", "seed", "index"])
+    rows[list(_TIMES)] = rows[list(_TIMES)].fillna(0.0)  # phases that a decode has not
     size = max(sum(int(r["committed"]) for r in rounds) for rounds in rows["rounds"])
     if size < tokens:
         raise UsageError(f"setting '{label}' decodes chunks of {size} tokens: tokens={tokens} cannot be cut from them")

@@ -25,8 +25,8 @@ class Cache:
     """Keys and values of every layer in fixed buffers (layers, 2, B, A, slots, C) with slots ≥ capacity; the first
     `length` slots are valid.
 
-    fixed: every forward has the same shapes. captured: the graphs that write to it. Modules and packed weights order key
-    channels differently, so they must not share a cache.
+    fixed: every forward has the same shapes. captured: the graphs that write to it. Modules and packed weights order
+    key channels differently, so they must not share a cache.
     """
 
     def __init__(
