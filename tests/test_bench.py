@@ -67,6 +67,11 @@ def test_a_cut_decode_ends_at_its_last_token() -> None:
     assert [(f.start, f.drafted, f.proposer) for f in last.forwards] == [(0, 0, ""), (6, 0, "")]
 
 
+def test_a_parallel_decode_is_one_forward_over_prompt_and_chunk() -> None:
+    found = sequence_of(row(played("parallel", 0, committed=16)), 16, 7)
+    assert found.forwards == (Forward("prefill", 0, 7, 0),)
+
+
 def test_a_skipped_decode_has_no_forward() -> None:
     assert sequence_of(row(played("skip", 0, 0, 16, 16, "early")), 16, 16).forwards == ()
 
@@ -145,6 +150,7 @@ def test_ceilings_are_those_of_the_definition() -> None:
     assert found["spec_vla"].drafted == pytest.approx(20 / (5 + 1.14 + 1.3))
     assert found["naive_sd"].how == "3 × 5 drafted"
     assert found["naive_sd"].drafted < found["naive_sd"].free
+    assert found["parallel"].free == pytest.approx(20 / 5.16)
     assert not {"ar", "expert", "early_unverified"} & set(found)
 
 

@@ -44,6 +44,9 @@ def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int
     autoregressive, encode = profile.decode(tokens), profile.seconds("encode", 1)
     if settings.skip.kind == "always":
         return None  # executed unverified: nothing of the target's trunk runs
+    if settings.skip.kind == "parallel":
+        reached = autoregressive / (encode + profile.seconds("prefill", profile.prompt + tokens))
+        return MethodCeiling(name, "one forward", reached, reached)
     if settings.prefill_draft.kind != "none":
         least = encode + profile.seconds("prefill", profile.prompt + tokens - 1)
         return MethodCeiling(name, "in the prefill", autoregressive / least, autoregressive / least)

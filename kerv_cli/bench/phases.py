@@ -147,6 +147,11 @@ def measure(
     for rows in counts:
         add("verify", rows, costs(model, rows, length), lambda n=rows: stage.verify(n - 1))  # type: ignore[misc]
     stage.prefill()
+    if device.type == "cuda":
+        eager = Stage(model, most + 2)
+        eager.cache = eager.target.new_cache(1, eager.cache.capacity, fixed=False)
+        eager.prefill()
+        add("eager", 1, costs(model, 1, length), eager.verify)  # what the captured graph saves
     stage.feed(stage.hidden, 0)
     s = model.target.settings
     per_token = (layer_numbers(model) + 2 * s.width**2 + s.width * model.target.actions.tokens) * model.dtype.itemsize

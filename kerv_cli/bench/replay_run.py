@@ -30,7 +30,7 @@ _PER_LAYER = 15e-6  # seconds per layer and forward below which projections do n
 
 @dataclass(frozen=True)
 class Row:
-    """One setting at one N. seconds: mean per decode, executed. low, high: 95 % bootstrap interval of the speedup.
+    """One setting at one N. seconds: mean per decode, executed; host: recorded ones among them. low, high: 95 % bootstrap interval of the speedup.
     model: the speedup that the cost model predicts. projections: device -> predicted speedup there."""
 
     tokens: int
@@ -38,6 +38,7 @@ class Row:
     success: float
     forwards: float
     seconds: float
+    host: float
     speedup: float
     low: float
     high: float
@@ -84,7 +85,7 @@ class Replay:
             names = list(own[0].projections)
             title = f"decodes of study={self.study}, executed on {self.model.name} ({self.dtype}): N = {tokens}"
             told = "success and acceptance: the study's; times: executed here; model, projections: predicted"
-            columns = ("setting", "success %", "forwards", "ms / decode", "speedup", "model", *names)
+            columns = ("setting", "success %", "forwards", "ms / decode", "host ms", "speedup", "model", *names)
             table = Table(*columns, title=title, caption=told)
             for row in own:
                 speedup = f"{row.speedup:.2f} ({row.low:.2f}–{row.high:.2f})"
@@ -93,6 +94,7 @@ class Replay:
                     f"{100 * row.success:.1f}",
                     f"{row.forwards:.2f}",
                     f"{1e3 * row.seconds:.1f}",
+                    f"{1e3 * row.host:.2f}",
                     speedup,
                 )
                 table.add_row(*cells, f"{row.model:.2f}", *(f"{row.projections[name]:.2f}" for name in names))
@@ -168,6 +170,7 @@ def _rows(
                 success=own.successes / own.episodes,
                 forwards=float(np.mean([len(s.forwards) for s in own.sequences])),
                 seconds=float(seconds[place].mean()),
+                host=float(np.mean([s.host for s in own.sequences])),
                 speedup=float(seconds[0].sum() / seconds[place].sum()),
                 low=low,
                 high=high,

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
+from kerv_cli.decoding.record import PARALLEL
 from kerv_cli.errors import UsageError
 from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.store import StudyStore
@@ -65,6 +66,9 @@ def sequence_of(row: Mapping[str, Any], size: int, tokens: int) -> DecodeSequenc
     for played in row["rounds"]:
         start, nodes = int(played["start"]), int(played["tree_size"])
         if played["mode"] == "skip" or start >= tokens:
+            continue
+        if played["mode"] == PARALLEL:
+            forwards.append(Forward("prefill", 0, tokens, 0))
             continue
         left, most = tokens - start - 1, size - start - 1  # tokens that a draft may have here, and had in the record
         if left < 1:
