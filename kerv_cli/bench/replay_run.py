@@ -30,8 +30,9 @@ _PER_LAYER = 15e-6  # seconds per layer and forward below which projections do n
 
 @dataclass(frozen=True)
 class Row:
-    """One setting at one N. seconds: mean per decode, executed; host: recorded ones among them. low, high: 95 % bootstrap interval of the speedup.
-    model: the speedup that the cost model predicts. projections: device -> predicted speedup there."""
+    """One setting at one N. seconds: mean per decode, executed; host: recorded ones among them. low, high: 95 %
+    bootstrap interval of the speedup. model: the speedup that the cost model predicts. projections: device -> predicted
+    speedup there."""
 
     tokens: int
     label: str
