@@ -259,6 +259,9 @@ class BenchReplaySettings(BenchSettings):
     recorded: str = "main"  # study=: whose decodes
     decodes: int = 40  # of every setting, evenly over tasks and seeds
     model: str = "vla-150m"
+    profiles: dict[str, str] = field(
+        default_factory=dict
+    )  # name -> a bench's document, of this target on another device
     projections: dict[str, list[float]] = field(  # device -> published GB/s and dense bfloat16 TFLOP/s
         default_factory=lambda: {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4090": [1008.0, 165.0]}
     )

@@ -178,7 +178,9 @@ def test_a_study_is_replayed_and_written(tmp_path: Path, monkeypatch: pytest.Mon
     store.write_plan(threshold_settings(), cells)
     execute(cells, prepare, store)
     words = ("study=threshold", "target=nano", "dtype=float32", "decodes=4", "repeats=3", "tokens=[7,16]")
-    told = kerv("replay", *words, f"results={tmp_path}", "--json")
+    path = tmp_path / "there.json"
+    path.write_text(json.dumps({"profile": profile().as_dict()}))
+    told = kerv("replay", *words, f"results={tmp_path}", f"profiles.there={path}", "--json")
     rows = json.loads(told.splitlines()[-1])["rows"]
     assert [(r["tokens"], r["label"]) for r in rows][:2] == [(7, "ar"), (7, "naive_sd")]
     baseline = {r["tokens"]: r for r in rows if r["label"] == "ar"}
@@ -187,7 +189,9 @@ def test_a_study_is_replayed_and_written(tmp_path: Path, monkeypatch: pytest.Mon
     assert all(2 <= r["forwards"] < r["tokens"] and set(r["projections"]) for r in rows if r["label"] != "ar")
     table = pd.read_csv(tmp_path / "bench/nano-float32-replay-threshold.csv")
     assert len(table) == 6
-    assert {"speedup", "low", "high", "projection.A100 80GB", "device_name", "git_commit"} <= set(table.columns)
+    assert {"speedup", "low", "high", "projection.A100 80GB", "projection.there", "device_name", "git_commit"} <= set(
+        table.columns
+    )
 
 
 def kerv(*words: str) -> str:
@@ -224,6 +228,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path, monkeypatch: pytest.
         (["target=openvla-7b", "dtype=float32"], "GB are free on cpu"),
         (["replay", "study=nothing"], "no study 'nothing'"),
         (["replay", "decodes=1"], "at least 2"),
+        (["replay", "profiles=1"], "profiles"),
         (["replay", "projections.mine=[1]"], "GB/s and TFLOP/s"),
     ],
 )

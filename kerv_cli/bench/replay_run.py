@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import torch
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Phase, measure
-from kerv_cli.bench.profile import Profile, projected
+from kerv_cli.bench.profile import Profile, projected, read_profile
 from kerv_cli.bench.replay import Player, play_all, predicted
 from kerv_cli.bench.run import open_and_card, place_of
 from kerv_cli.bench.sequences import Recorded, read_study
@@ -32,7 +32,7 @@ _PER_LAYER = 15e-6  # seconds per layer and forward below which projections do n
 class Row:
     """One setting at one N. seconds: mean per decode, executed; host: recorded ones among them. low, high: 95 %
     bootstrap interval of the speedup. model: the speedup that the cost model predicts. projections: device -> predicted
-    speedup there."""
+    speedup there, from its published figures or from its own profile."""
 
     tokens: int
     label: str
@@ -135,6 +135,7 @@ def replay(settings: BenchReplaySettings) -> Replay:
     for name, figures in settings.projections.items():
         if len(figures) != 2 or min(figures) <= 0:
             raise UsageError(f"projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")
+    measured = {name: read_profile(Path(path)) for name, path in settings.profiles.items()}
     store = StudyStore(settings.results, settings.recorded)
     by_tokens = {n: read_study(store, n, settings.decodes) for n in settings.tokens}
     model, machine, _, _ = open_and_card(settings)
@@ -142,7 +143,7 @@ def replay(settings: BenchReplaySettings) -> Replay:
     rows = []
     for tokens, recorded in by_tokens.items():
         seconds = play_all(Player(model, recorded), recorded)
-        rows += _rows(tokens, recorded, seconds, model, machine, phases, settings)
+        rows += _rows(tokens, recorded, seconds, model, machine, phases, settings, measured)
     return Replay(settings.recorded, model, machine, rows)
 
 
@@ -154,6 +155,7 @@ def _rows(
     machine: Machine,
     phases: Sequence[Phase],
     settings: BenchReplaySettings,
+    measured: Mapping[str, Profile],
 ) -> list[Row]:
     prompt, layers = model.target.max_prompt, model.target.settings.layers
     here = Profile.of(prompt, phases)
@@ -161,6 +163,7 @@ def _rows(
         name: Profile.of(prompt, projected(phases, machine, Machine(gb * 1e9, tf * 1e12), layers * _PER_LAYER))
         for name, (gb, tf) in settings.projections.items()
     }
+    there |= measured
     found = []
     for place, own in enumerate(recorded):
         low, high = _interval(seconds[0], seconds[place])
