@@ -15,6 +15,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from kerv_cli.targets.compact.trunk import Cache, LayerStack
 
+_AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets of verifications; those of prefills follow with the first ones
 _WARM_UP = 3  # runs before a capture: libraries choose kernels and allocate workspaces
 
 
@@ -31,6 +32,8 @@ class CapturedLayers:
     def __init__(self, stack: LayerStack, cache: Cache) -> None:
         self.stack, self.cache = stack, cache
         self.steps: dict[int, _Step] = {}
+        if cache.buffer.is_cuda:  # in the warm-up's first forward: a capture in the middle of an episode would be timed
+            self.steps = {size: _Step(stack, cache, size) for size in _AT_ONCE if size <= cache.capacity}
 
     def __call__(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """x (1, T, E) at `positions` (T,), mask (T, slots) as `attention_mask` -> output of the last layer (1, T, E),
