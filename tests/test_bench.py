@@ -131,6 +131,7 @@ def profile() -> Profile:
 
     found = [phase("encode", 1, 1.0), *(phase("verify", n, 1 + 0.01 * (n - 1)) for n in (1, 2, 16))]
     found += [phase("prefill", 31, 4.0), phase("prefill", 46, 4.15), phase("draft", 2, 0.1), phase("draft", 6, 0.5)]
+    found += [phase("feed", 1, 0.1), phase("feed", 31, 0.3)]
     return Profile.of(31, found)
 
 
@@ -140,7 +141,7 @@ def test_the_cost_model_adds_the_forwards_up() -> None:
     assert known.seconds("verify", 9) == pytest.approx(1.08)
     assert known.seconds("verify", 32) == pytest.approx(1.31)
     forwards = (Forward("prefill", 0, 0, 0), Forward("verify", 1, 5, 5, "drafter"))
-    assert predicted(DecodeSequence(forwards, 0.25), known) == pytest.approx(1 + 4 + 0.1 + 1.05 + 0.4 + 0.25)
+    assert predicted(DecodeSequence(forwards, 0.25), known) == pytest.approx(1 + 4 + 0.3 + 1.05 + 0.4 + 0.25)
 
 
 def test_ceilings_are_those_of_the_definition() -> None:

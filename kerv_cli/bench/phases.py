@@ -16,9 +16,10 @@ from kerv_cli.drafting.tree import TokenTree, visible_in_verification
 
 @dataclass(frozen=True)
 class Phase:
-    """One measured phase. kind: encode, prefill, verify (1 row: a single token), draft (rows: tokens of the drafter's
-    chain). rows: forwarded tokens. seconds: median; read, flops: bytes and operations that it cannot do without;
-    floor: the seconds that the device needs for them; share: floor over median."""
+    """One measured phase. kind: encode, prefill, verify (1 row: a single token), feed (the target's states into the
+    drafter), draft (rows: tokens of the drafter's chain), eager (one token without a captured graph). rows: forwarded
+    tokens. seconds: median; read, flops: bytes and operations that it cannot do without; floor: the seconds that the
+    device needs for them; share: floor over median."""
 
     kind: str
     rows: int
@@ -152,14 +153,27 @@ def measure(
         eager.cache = eager.target.new_cache(1, eager.cache.capacity, fixed=False)
         eager.prefill()
         add("eager", 1, costs(model, 1, length), eager.verify)  # what the captured graph saves
+    _measure_drafter(model, stage, depth, add)
+    machine = machine.best_of(measure_machine(device, model.dtype))
+    return machine, [replace(phase, floor=machine.floor(phase.read, phase.flops)) for phase in done]
+
+
+Add = Callable[[str, int, tuple[float, float], Callable[[], object]], None]
+"""Measures a phase: kind, rows, bytes and operations, what to run."""
+
+
+def _measure_drafter(model: Model, stage: Stage, depth: int, add: Add) -> None:
+    """Feeding the drafter one state and the prompt's, and its chains. The stage's prefill has run."""
     stage.feed(stage.hidden, 0)
     s = model.target.settings
     per_token = (layer_numbers(model) + 2 * s.width**2 + s.width * model.target.actions.tokens) * model.dtype.itemsize
+    hidden, length = stage.hidden[:, : stage.length], stage.length
+    for rows in (1, length):
+        needs = per_token * 1.0, 2.0 * rows * per_token / model.dtype.itemsize
+        add("feed", rows, needs, lambda n=rows: stage.feed(hidden[:, :n], 0))  # type: ignore[misc]
     for count in sorted({2, max(2, depth)}):  # the first token comes from the state that is there: no forward
         needs = per_token * (count - 1), 2.0 * (count - 1) * per_token / model.dtype.itemsize
         add("draft", count, needs, lambda n=count: stage.draft(n))  # type: ignore[misc]
-    machine = machine.best_of(measure_machine(device, model.dtype))
-    return machine, [replace(phase, floor=machine.floor(phase.read, phase.flops)) for phase in done]
 
 
 def layer_numbers(model: Model) -> int:

@@ -14,7 +14,7 @@ from kerv_cli.bench.phases import Phase
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json
 
-KINDS = ("encode", "prefill", "verify", "draft")
+KINDS = ("encode", "prefill", "verify", "draft", "feed")
 
 
 @dataclass(frozen=True)

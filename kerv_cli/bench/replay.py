@@ -76,17 +76,17 @@ def _tree(proposer: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def predicted(decode: DecodeSequence, profile: Profile) -> float:
-    """Seconds of the decode by the cost model: the profile's times of its forwards, the drafter's passes at the
-    profile's time per token, and the recorded host seconds."""
+    """Seconds of the decode by the cost model: the profile's times of its forwards, the drafter's passes
+    and the states it is fed, and the recorded host seconds."""
     seconds = profile.seconds("encode", 1) + decode.host
-    step = profile.drafting(2)
     for place, forward in enumerate(decode.forwards):
         rows = forward.drafted + (profile.prompt if forward.kind == "prefill" else 1)
         seconds += profile.seconds(forward.kind, rows)
         if forward.proposer == DRAFTER:
             seconds += profile.drafting(min(forward.drafted, profile_depth(forward)))
         if decode.drafts and place + 1 < len(decode.forwards):
-            seconds += step
+            first = forward.kind == "prefill"
+            seconds += profile.seconds("feed", profile.prompt if first else forward.accepted + 1)
     return seconds
 
 
