@@ -319,6 +319,11 @@ def _add(
 for _name in ("metaworld", "insertion"):
     _add("environment", _name, f"environments.{_name}.spec:SPEC", names=f"kerv_cli.environments.{_name}.tasks:NAMES")
 _add("target", "compact", "targets.compact.target:build")
+_add(
+    *("target", "openvla", "targets.openvla.target:build"),
+    weights="kerv_cli.targets.openvla.target:check_weights",
+    importer="kerv_cli.targets.openvla.importing:import_checkpoint",
+)
 _add("artifact", "drafter", "drafting.eagle:ARTIFACT")
 _add("artifact", "early", "drafting.early:ARTIFACT")
 _add("artifact", "datastore", "drafting.datastore:ARTIFACT")

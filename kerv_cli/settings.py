@@ -281,6 +281,23 @@ class ViewSettings(CommandSettings):
 
 
 @dataclass
+class BuildTargetSettings(RunSettings):
+    """`kerv build target`: a published checkpoint as a target of ours. Nothing is copied: it stays where it lies."""
+
+    checkpoint: str = ""  # folder of a Hugging Face checkpoint
+    family: str = "openvla"  # target=openvla says the same
+    name: str = "openvla"
+    statistics: str | None = None  # data set whose actions it emits; None: the only one
+    environment: str | None = None  # whose DoFs, control rate and camera it has; None: OpenVLA's own
+    control_hz: float = 5.0  # control steps per second, without an environment
+    camera: str = ""  # name of the image it is shown; empty: the environment's first camera, else primary
+    prompt: str = "openvla"  # openvla | openvla_v01
+    crop: bool = False  # show the central 90 %: for checkpoints fine-tuned with augmented images (LIBERO's)
+    int8: bool = False  # the language model's layers with one byte per weight
+    prompt_tokens: int = 64  # longest prompt, without the vision tokens
+
+
+@dataclass
 class BuildDatastoreSettings(TaskSettings):
     """`kerv build datastore` (docs/methods.md §4.1)."""
 

@@ -35,7 +35,9 @@ class ActionSpace:
     DoFs whose draft tokens must equal the target's and which are held, never extrapolated (a gripper opens or closes).
     control_hz: control steps per second. low, high: (D,) in environment units, what -1 and 1 of the normalised range
     mean; an environment gives its limits, a policy the 1st and 99th percentile of its demonstrations. bins: edges on
-    [-1, 1]; a token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges, 255 centres).
+    [-1, 1]; a token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges, 255 centres). end_token: there
+    is one token more, for the upper end itself, which decodes like the last interval (published OpenVLA checkpoints
+    were trained with it: a value of exactly 1 has an id of its own).
 
     Raises:
         ValueError: numbers that do not fit together.
@@ -48,6 +50,7 @@ class ActionSpace:
     low: tuple[float, ...]
     high: tuple[float, ...]
     bins: int = 256
+    end_token: bool = False
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) != len(self.names):
@@ -64,8 +67,11 @@ class ActionSpace:
             raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return asdict(self)
+        """Plain values for JSON; `end_token` only where it is set, so that other spaces are written as ever."""
+        plain = asdict(self)
+        if not self.end_token:
+            del plain["end_token"]
+        return plain
 
     @property
     def dofs(self) -> int:
@@ -74,8 +80,8 @@ class ActionSpace:
 
     @property
     def tokens(self) -> int:
-        """Size of the vocabulary: one token per bin."""
-        return self.bins - 1
+        """Size of the vocabulary: one token per bin, and the end token where there is one."""
+        return self.bins - 1 + self.end_token
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -85,7 +91,8 @@ class ActionSpace:
     @cached_property
     def centres(self) -> np.ndarray:
         """(tokens,) normalised value of every token."""
-        return (self.edges[:-1] + self.edges[1:]) / 2
+        inner = (self.edges[:-1] + self.edges[1:]) / 2
+        return np.append(inner, inner[-1]) if self.end_token else inner
 
     @cached_property
     def is_strict(self) -> np.ndarray:
@@ -126,7 +133,8 @@ class ActionSpace:
         return (values + 1.0) / 2.0 * (high - low) + low
 
     def bins_of(self, values: np.ndarray) -> np.ndarray:
-        """Normalised values -> int64 tokens of the same shape. Both ends belong to the outermost bins."""
+        """Normalised values -> int64 tokens of the same shape. Both ends belong to the outermost bins; with an end
+        token the upper end is that."""
         return np.clip(np.digitize(values, self.edges) - 1, 0, self.tokens - 1).astype(np.int64)
 
     def values_of(self, tokens: np.ndarray) -> np.ndarray:
@@ -157,7 +165,7 @@ class ActionSpace:
         Raises:
             CheckpointError: they differ; the message names the first difference.
         """
-        fields = ["names", "groups", "strict", "bins", "control_hz", *(("low", "high") if statistics else ())]
+        fields = ["names", "groups", "strict", "bins", "control_hz", *(("low", "high", "end_token") if statistics else ())]
         for name in fields:
             mine, theirs = getattr(self, name), getattr(other, name)
             if mine != theirs:

@@ -1,4 +1,4 @@
-"""`kerv build datastore`."""
+"""`kerv build target`, `kerv build drafter` and `kerv build datastore`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import typer
 
 from kerv_cli.commands import common
 from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, edge, progress_bar
+from kerv_cli.errors import UsageError
 
 HELP = "Build artifacts that need no training."
 
@@ -15,6 +16,24 @@ app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None, pretty
 @app.callback(help=HELP)
 def build() -> None:
     """The group: with a callback, its single command keeps its name."""
+
+
+@app.command("target")
+@edge
+def target(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+    """Check a published checkpoint and make it a target; its files stay where they are."""
+    from kerv_cli.settings import BuildTargetSettings
+
+    # here target=NAME is a registered family; to Hydra it would be a choice among the files of conf/target
+    words = [f"family={o[7:]}" if o.startswith("target=") else o for o in overrides or []]
+    settings = common.composed("build_target", words, BuildTargetSettings, cfg)
+    from kerv_cli.registry import find, load, parts
+
+    importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
+    if find("target", settings.family, "target family").name not in importers:
+        raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")
+    folder, figures = load(importers[settings.family].traits["importer"])(settings)
+    common.print_figures("target", figures, folder)
 
 
 @app.command("datastore")

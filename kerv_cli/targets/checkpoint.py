@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
 from kerv_cli.manifests import read
-from kerv_cli.registry import find
+from kerv_cli.registry import find, load, parts
 from kerv_cli.spaces import ActionSpace, ObservationSpace
 
 if TYPE_CHECKING:
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 FORMAT = 2
 WEIGHTS = "model.safetensors"
+WEIGHTS_ELSEWHERE = "weights"
+"""Trait of a target's part: `module:function`, called with (folder, description), for weights that do not lie in the
+target's own folder."""
 
 
 @dataclass(frozen=True)
@@ -117,18 +120,33 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
     Raises:
         CheckpointError: it is missing, of another version, damaged, or of other weights.
     """
-    path, weights = folder / f"{kind}.json", folder / WEIGHTS
+    description = described(folder, kind, schema)
+    check_weights(folder, kind, description.sha256)
+    return description
+
+
+def described(folder: Path, kind: str, schema: type[T]) -> T:
+    """The JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
+    path = folder / f"{kind}.json"
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
     value = read_json(path)
     if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
-    description = read(schema, value, str(path))
+    return read(schema, value, str(path))
+
+
+def check_weights(folder: Path, kind: str, sha256: str) -> None:
+    """Checks that the weights in `folder` are there and have this hash.
+
+    Raises:
+        CheckpointError: they are not.
+    """
+    weights = folder / WEIGHTS
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing: the {kind} is incomplete, train or copy it again")
-    if sha256_of(weights) != description.sha256:
+    if sha256_of(weights) != sha256:
         raise CheckpointError(f"{weights} does not match its description: damaged or mixed up, copy the folder again")
-    return description
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
@@ -162,8 +180,15 @@ def save_target(
 
 
 def read_target(folder: Path) -> TargetDescription:
-    """A target's description; errors as `read_description`."""
-    return read_description(folder, "target", TargetDescription)
+    """A target's description; errors as `read_description`. A family whose weights lie elsewhere (trait `weights`)
+    checks them itself."""
+    description = described(folder, "target", TargetDescription)
+    family = parts("target").get(description.family)
+    if family is not None and WEIGHTS_ELSEWHERE in family.traits:
+        load(family.traits[WEIGHTS_ELSEWHERE])(folder, description)
+    else:
+        check_weights(folder, "target", description.sha256)
+    return description
 
 
 def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> tuple[Any, TargetDescription]:

@@ -1,0 +1,120 @@
+"""Frames -> the pixels that OpenVLA's two vision towers take, as its own preprocessing makes them.
+
+The whole frame is resized to the towers' size without keeping its proportions (`resize-naive`, bicubic), scaled to
+[0, 1] and normalised for each tower. A checkpoint that was fine-tuned with augmented images is shown the central 90 %
+of the area (`crop`), resized bilinearly: the sides are cut by the square root of that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.files import read_json
+from kerv_cli.manifests import read
+from kerv_cli.targets.openvla.config import Shape
+
+PREPROCESSOR = "preprocessor_config.json"
+CROPPED_AREA = 0.9
+RESIZE = "resize-naive"
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """Mean and standard deviation of the three channels, in [0, 1]."""
+
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+
+
+DEFAULTS = (
+    Normalisation((0.484375, 0.455078125, 0.40625), (0.228515625, 0.2236328125, 0.224609375)),
+    Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+)
+"""ImageNet's for DINOv2, as published (rounded to bfloat16), and SigLIP's."""
+
+
+def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
+    """Those of `preprocessor_config.json`, the published ones where the folder has none.
+
+    Raises:
+        CheckpointError: the file is damaged, or asks for another way of resizing.
+    """
+    path = folder / PREPROCESSOR
+    if not path.is_file():
+        return DEFAULTS
+    value = read_json(path)
+    strategy = value.get("image_resize_strategy", RESIZE) if isinstance(value, dict) else None
+    if strategy != RESIZE:
+        raise CheckpointError(f"{path} asks for image_resize_strategy={strategy}; OpenVLA's is {RESIZE}")
+    given = value.get("tvf_normalize_params")
+    if given is None:
+        means, stds = value.get("means"), value.get("stds")
+        if means is None or stds is None:
+            return DEFAULTS
+        given = [{"mean": mean, "std": std} for mean, std in zip(means, stds, strict=False)]
+    plain = [{k: v for k, v in one.items() if k in ("mean", "std")} for one in given]
+    if len(plain) != 2:
+        raise CheckpointError(f"{path} normalises for {len(plain)} vision towers, OpenVLA has two")
+    first, second = (read(Normalisation, one, f"{path}, tvf_normalize_params") for one in plain)
+    return first, second
+
+
+def check_image(image: np.ndarray, camera: str) -> np.ndarray:
+    """The image, if it is (h, w, 3) uint8.
+
+    Raises:
+        UsageError: it is not.
+    """
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < 2:
+        raise UsageError(
+            f"the image of camera '{camera}' has shape {image.shape} and type {image.dtype}: "
+            "height x width x 3 of uint8 are wanted"
+        )
+    return image
+
+
+def cropped(image: np.ndarray, size: int, area: float = CROPPED_AREA) -> np.ndarray:
+    """image (h, w, 3) uint8 -> its central `area`, sampled bilinearly at size × size points, the outermost on the
+    crop's edges (TensorFlow's crop_and_resize), uint8."""
+    side = math.sqrt(area)
+    rows, columns = ((n - 1) * ((1 - side) / 2 + side * np.linspace(0, 1, size)) for n in image.shape[:2])
+    pixels = image.astype(np.float32) / 255
+    pixels = _interpolated(_interpolated(pixels, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
+    return np.clip(np.floor(np.clip(pixels, 0, 1) * 255.5), 0, 255).astype(np.uint8)
+
+
+def _interpolated(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """rows (n, …) at the fractional indices `at` (m,) -> (m, …)."""
+    below = np.clip(np.floor(at).astype(int), 0, len(rows) - 2)
+    share = (at - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
+    mixed: np.ndarray = rows[below] * (1 - share) + rows[below + 1] * share
+    return mixed
+
+
+def resized(image: np.ndarray, size: int) -> np.ndarray:
+    """image (h, w, 3) uint8 -> (size, size, 3) uint8, bicubic with antialiasing."""
+    from PIL import Image
+
+    if image.shape[:2] == (size, size):
+        return image
+    return np.asarray(Image.fromarray(image).resize((size, size), Image.Resampling.BICUBIC))
+
+
+def pixels_of(image: np.ndarray, shape: Shape, normalisations: Sequence[Normalisation], crop: bool) -> Tensor:
+    """image (h, w, 3) uint8 -> (1, 6, s, s) float32: normalised for the first tower, then for the second."""
+    parts = []
+    for tower, normal in zip(shape.towers, normalisations, strict=True):
+        shown = cropped(image, tower.image) if crop else image
+        pixels = torch.from_numpy(np.array(resized(shown, tower.image), dtype=np.float32)) / 255
+        mean, std = torch.tensor(normal.mean), torch.tensor(normal.std)
+        parts.append(((pixels - mean) / std).permute(2, 0, 1))
+    return torch.cat(parts)[None]

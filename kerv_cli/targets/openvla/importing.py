@@ -1,0 +1,90 @@
+"""`kerv build target`: checks a published OpenVLA folder and describes it as a target."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from kerv_cli.environments import specs
+from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.files import write_json
+from kerv_cli.places import artifact
+from kerv_cli.provenance import provenance
+from kerv_cli.settings import BuildTargetSettings
+from kerv_cli.spaces import ObservationSpace
+from kerv_cli.targets.checkpoint import FORMAT
+from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
+from kerv_cli.targets.openvla.image import read_normalisations
+from kerv_cli.targets.openvla.layout import layout
+from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, open_shards
+from kerv_cli.targets.openvla.prompt import PROMPTS, Prompter
+from kerv_cli.targets.openvla.target import OpenVLASettings
+
+SEES_NOTHING_ELSE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
+
+
+def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
+    """Writes target.json for the checkpoint -> its folder, and figures for the user. Every number is read once.
+
+    Raises:
+        UsageError: no checkpoint, an unknown prompt, several statistics and none chosen. UnknownName: no such
+            statistics or environment. CheckpointError: the folder is incomplete, damaged, pickled or another model's.
+    """
+    if not settings.checkpoint:
+        raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
+    if settings.prompt not in PROMPTS:
+        raise UnknownName("prompt", settings.prompt, PROMPTS)
+    source = Path(settings.checkpoint).expanduser().resolve()
+    shape = read_shape(source)
+    spec = _environment(settings.environment)
+    statistics = read_statistics(source, settings.statistics)
+    actions = action_space(shape, statistics, spec.actions if spec else None, settings.control_hz)
+    prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
+    prompter.ids("move")
+    read_normalisations(source)
+    shards = open_shards(source)
+    check_layout(shards.shapes, layout(shape), source)
+    parameters, hashes = check_finite(shards), shards.hashes()
+    chosen = OpenVLASettings(
+        checkpoint=str(source),
+        statistics=statistics.name,
+        files=shards.sizes(),
+        prompt=settings.prompt,
+        crop=settings.crop,
+        int8=settings.int8,
+        prompt_tokens=settings.prompt_tokens,
+        image_size=shape.towers[0].image,
+    )
+    computed = {"prompt": chosen.prompt, "crop": chosen.crop, "int8": chosen.int8}
+    folder = artifact(settings.results, "target", settings.name)
+    observation = spec.observation if spec else SEES_NOTHING_ELSE
+    made = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
+    description = {
+        "format": FORMAT,
+        "kind": "target",
+        "sha256": digest_of(hashes, computed),
+        "family": "openvla",
+        "environment": spec.name if spec else "none",
+        "settings": asdict(chosen),
+        "actions": actions.as_dict(),
+        "observation": observation.as_dict(),
+        "cameras": [spec.camera_name(settings.camera) if spec else settings.camera or "primary"],
+        "words": [],
+        "provenance": {**made, **provenance(settings.runtime.device)},
+    }
+    write_json(folder / "target.json", description)
+    return folder, {
+        "parameters": parameters,
+        "prompt tokens": shape.patches + len(prompter.ids("move")),
+        "action tokens": actions.tokens,
+        "DoFs": actions.dofs,
+    }
+
+
+def _environment(name: str | None) -> EnvironmentSpec | None:
+    known = specs()
+    if name is not None and name not in known:
+        raise UnknownName("environment", name, known)
+    return known[name] if name is not None else None

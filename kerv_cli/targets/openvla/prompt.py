@@ -1,0 +1,78 @@
+"""Instructions -> token ids: OpenVLA's prompt through the tokenizer.json of its folder.
+
+The prompt ends with the token of a lone word boundary (id 29871 of Llama-2), which the training data has in front of
+the action tokens and a tokenizer leaves out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.targets.openvla.config import Shape
+
+TOKENIZER = "tokenizer.json"
+BEGIN, BOUNDARY = "<s>", "\u2581"
+PROMPTS = {
+    "openvla": "In: What action should the robot take to {}?\nOut:",
+    "openvla_v01": (
+        "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, "
+        "detailed, and polite answers to the user's questions. USER: What action should the robot take to {}? "
+        "ASSISTANT:"
+    ),
+}
+"""Text around the instruction by version; v0.1 checkpoints were trained with the second."""
+
+
+class Prompter:
+    """The prompt of one checkpoint. limit: most ids of a prompt."""
+
+    def __init__(self, folder: Path, shape: Shape, form: str, limit: int) -> None:
+        """
+        Raises:
+            CheckpointError: no tokenizer, or that of another model. KervError: the package tokenizers is missing.
+        """
+        self.text, self.limit = PROMPTS[form], limit
+        self.tokenizer = _read(folder / TOKENIZER)
+        size = self.tokenizer.get_vocab_size(with_added_tokens=False)
+        known = {name: self.tokenizer.token_to_id(name) for name in (BEGIN, BOUNDARY)}
+        if size != shape.vocabulary:
+            raise CheckpointError(
+                f"{folder / TOKENIZER} has {size} ids, the weights are for {shape.vocabulary}: another model's tokenizer"
+            )
+        absent = [repr(name) for name, token in known.items() if token is None]
+        if absent:
+            raise CheckpointError(f"{folder / TOKENIZER} has no token {absent[0]}: it is not a Llama tokenizer")
+        self.begin, self.boundary = known[BEGIN], known[BOUNDARY]
+
+    def ids(self, instruction: str) -> list[int]:
+        """The prompt's ids: begin of sequence, the text, the word boundary.
+
+        Raises:
+            UsageError: longer than `limit`; cutting it could drop the decisive word.
+        """
+        ids: list[int] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
+        if ids[:1] != [self.begin]:
+            ids = [self.begin, *ids]
+        if ids[-1] != self.boundary:
+            ids = [*ids, self.boundary]
+        if len(ids) > self.limit:
+            raise UsageError(
+                f"instruction '{instruction[:60]}' makes a prompt of {len(ids)} tokens, at most {self.limit} are "
+                "taken: shorten it, or import the checkpoint with more prompt_tokens"
+            )
+        return ids
+
+
+def _read(path: Path) -> Any:
+    if not path.is_file():
+        raise CheckpointError(f"no {TOKENIZER} in {path.parent}: copy the one that was published with the checkpoint")
+    try:
+        from tokenizers import Tokenizer
+    except ImportError as error:
+        raise KervError("OpenVLA checkpoints need the package tokenizers: pip install 'kerv[openvla]'") from error
+    try:
+        return Tokenizer.from_file(str(path))
+    except Exception as error:  # noqa: BLE001 - the library raises bare Exceptions
+        raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error

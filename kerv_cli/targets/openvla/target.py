@@ -1,0 +1,188 @@
+"""The target of an OpenVLA checkpoint: `ReadableTarget` on published weights (arXiv 2406.09246).
+
+Prompt order: [begin] [vision patches] [text], as its own code inserts the patches behind the first token. Action token
+t is id vocabulary − 1 − t; the head's logits are those of these ids alone, so greedy decoding is that of the published
+code wherever its token is an action (it takes the argmax over all ids and executes any other as the last bin).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from kerv_cli.errors import CheckpointError
+from kerv_cli.manifests import read
+from kerv_cli.spaces import ActionSpace, Observation
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.openvla.config import Shape, read_shape
+from kerv_cli.targets.openvla.image import Normalisation, check_image, pixels_of, read_normalisations
+from kerv_cli.targets.openvla.loading import OpenVLAModel, load_model, open_shards
+from kerv_cli.targets.openvla.prompt import Prompter
+from kerv_cli.targets.openvla.trunk import KeyValueCache
+
+
+@dataclass(frozen=True)
+class OpenVLASettings:
+    """`settings` of a target.json of family openvla. checkpoint: folder of the published files. statistics: name of the
+    data set whose actions it emits. prompt: openvla or openvla_v01. crop: whether the central 90 % of an image are
+    shown (for checkpoints fine-tuned with augmented images). int8: the language model's layers with one byte a weight.
+    prompt_tokens: longest prompt without the patches. image_size: pixels of a tower. chunk: H. files: name -> bytes."""
+
+    checkpoint: str
+    statistics: str
+    files: dict[str, int]
+    prompt: str = "openvla"
+    crop: bool = False
+    int8: bool = False
+    prompt_tokens: int = 64
+    image_size: int = 224
+    chunk: int = 1
+
+
+class OpenVLATarget:
+    """The policy in a folder of published files. cameras: the one whose image it is shown."""
+
+    def __init__(
+        self,
+        model: OpenVLAModel,
+        shape: Shape,
+        actions: ActionSpace,
+        prompter: Prompter,
+        settings: OpenVLASettings,
+        camera: str,
+        normalisations: tuple[Normalisation, Normalisation],
+    ) -> None:
+        self.model, self.shape, self.actions, self.prompter = model, shape, actions, prompter
+        self.settings, self.cameras, self.normalisations = settings, (camera,), normalisations
+        self.chunk, self.width = settings.chunk, shape.language.hidden_size
+        self.heads, self.feed_forward = shape.language.num_attention_heads, shape.language.intermediate_size
+        self.max_prompt = shape.patches + settings.prompt_tokens
+        last = shape.vocabulary
+        self.action_rows = model.language_model.lm_head.weight[last - shape.bins : last].flip(0).contiguous()
+        self.words = functools.lru_cache(maxsize=64)(self._words)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the weights."""
+        return self.action_rows.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Number format of the weights."""
+        return self.action_rows.dtype
+
+    @property
+    def segments(self) -> Mapping[str, slice]:
+        """Slice of the prompt by the name of its part; the text ends where the prompt does."""
+        patches = self.shape.patches
+        return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
+
+    @property
+    def pooled_width(self) -> int:
+        """F of `pooled`."""
+        return 2 * self.width
+
+    def pooled(self, prompt: Tensor) -> Tensor:
+        """prompt (B, P, E) -> (B, F): mean patch, mean word."""
+        return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
+
+    def encode(self, observation: Observation) -> Tensor:
+        """The prompt's embeddings (1, P, E).
+
+        Raises:
+            CheckpointError: the camera's image is missing. UsageError: it is no (h, w, 3) uint8, or the instruction is
+                too long.
+        """
+        camera = self.cameras[0]
+        if camera not in observation.images:
+            raise CheckpointError(f"the target is shown camera '{camera}', whose image was not drawn")
+        image = check_image(observation.images[camera], camera)
+        patches = self.see(pixels_of(image, self.shape, self.normalisations, self.settings.crop))
+        words = self.words(observation.instruction)
+        return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
+
+    def see(self, pixels: Tensor) -> Tensor:
+        """pixels (B, 6, s, s) -> vision tokens (B, n, E)."""
+        patches: Tensor = self.model.projector(
+            self.model.vision_backbone(pixels.to(device=self.device, dtype=self.dtype))
+        )
+        return patches
+
+    def _words(self, instruction: str) -> Tensor:
+        ids = torch.tensor([self.prompter.ids(instruction)], device=self.device)
+        embedded: Tensor = self.model.language_model.model.embed_tokens(ids)
+        return embedded
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        """Action tokens (B, T) int64 -> (B, T, E)."""
+        embedded: Tensor = self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
+        return embedded
+
+    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> KeyValueCache:
+        """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
+        fixed = self.action_rows.is_cuda if fixed is None else fixed
+        return KeyValueCache(self.shape.language, batch, capacity, self.action_rows, fixed)
+
+    def forward(
+        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | None = None
+    ) -> Tensor:
+        """As `Target.forward`."""
+        hidden: Tensor = self.model.language_model.model(x, positions, cache, seen)
+        return hidden
+
+    def head(self, hidden: Tensor) -> Tensor:
+        """hidden (..., E) -> logits over the action tokens (..., V)."""
+        return F.linear(hidden, self.action_rows)
+
+
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> OpenVLATarget:
+    """The target that the target.json in `folder` describes, frozen.
+
+    Raises:
+        CheckpointError: the description is not OpenVLA's, its checkpoint is missing, changed or does not fit its config.
+    """
+    settings = read_settings(folder, description)
+    source = Path(settings.checkpoint)
+    shape = read_shape(source)
+    prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
+    model = load_model(source, shape, device, dtype, settings.int8)
+    normalisations = read_normalisations(source)
+    return OpenVLATarget(
+        model, shape, description.actions, prompter, settings, description.cameras[0], normalisations
+    )
+
+
+def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:
+    """The description's settings; errors as `build`."""
+    path = str(folder / "target.json")
+    settings = read(OpenVLASettings, description.settings, path)
+    if len(description.cameras) != 1:
+        raise CheckpointError(f"{path} names {len(description.cameras)} cameras: OpenVLA is shown one")
+    return settings
+
+
+def check_weights(folder: Path, description: TargetDescription) -> None:
+    """Compares the checkpoint's files with what was imported, by name and size: hashing 15 GB at every start would
+    take longer than loading them.
+
+    Raises:
+        CheckpointError: the folder is gone, or a file is missing, new or of another size.
+    """
+    settings = read_settings(folder, description)
+    source = Path(settings.checkpoint)
+    if not source.is_dir():
+        raise CheckpointError(
+            f"the checkpoint of {folder} lay in {source}, which is gone: import it again with 'kerv build target'"
+        )
+    if open_shards(source).sizes() != settings.files:
+        raise CheckpointError(
+            f"the weights in {source} are not the ones that {folder} was made from: import them again with "
+            "'kerv build target'"
+        )

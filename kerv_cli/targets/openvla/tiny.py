@@ -1,0 +1,134 @@
+"""A tiny random checkpoint in exactly the published layout: names, files, tokenizer, statistics. For tests and for a
+first look without 15 GB:
+
+    python -m kerv_cli.targets.openvla.tiny DIR
+    kerv build target target=openvla checkpoint=DIR
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kerv_cli.errors import KervError
+from kerv_cli.files import write_json
+from kerv_cli.targets.checkpoint import save_tensors
+from kerv_cli.targets.openvla.config import CONFIG, SHAPES, STATISTICS, Language, Shape, Tower
+from kerv_cli.targets.openvla.image import DEFAULTS, PREPROCESSOR
+from kerv_cli.targets.openvla.layout import Sizes, layout
+from kerv_cli.targets.openvla.loading import INDEX
+from kerv_cli.targets.openvla.prompt import BEGIN, BOUNDARY, TOKENIZER
+
+TINY = Shape(
+    towers=(
+        Tower(32, 4, 2, 64, registers=4, scaled=True, image=56),
+        Tower(48, 3, 3, 80, pooled=True, image=56),
+    ),
+    language=Language(704, 64, 96, 3, 4),
+)
+"""16 patches; a trunk of 3 layers and 64 channels."""
+
+WORDS = tuple(f"{BOUNDARY}{word}" for word in "What action should robot take".split())
+"""Words with a token of their own, so that a prompt is not one token per letter."""
+
+ROBOT: dict[str, Any] = {
+    "q01": [-0.03, -0.04, -0.04, -0.08, -0.09, -0.2, 0.0],
+    "q99": [0.03, 0.04, 0.04, 0.08, 0.09, 0.2, 1.0],
+    "mask": [True] * 6 + [False],
+}
+
+
+def write_checkpoint(
+    folder: Path, shape: Shape = TINY, seed: int = 0, statistics: Mapping[str, Any] | None = None, shards: int = 2
+) -> Path:
+    """Writes the checkpoint -> `folder`. statistics: data set -> {"q01", "q99", "mask"} of its actions.
+
+    Raises:
+        KervError: the package tokenizers is missing. StorageError: writing failed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / CONFIG, config_of(shape))
+    known = statistics or {"tiny": ROBOT}
+    write_json(folder / STATISTICS, {name: {"action": dict(action)} for name, action in known.items()})
+    normalise = [{"inplace": False, "mean": list(n.mean), "std": list(n.std)} for n in DEFAULTS]
+    write_json(folder / PREPROCESSOR, {"image_resize_strategy": "resize-naive", "tvf_normalize_params": normalise})
+    (folder / TOKENIZER).write_text(tokenizer_json(shape.vocabulary), encoding="utf-8")
+    tensors = random_tensors(shape, seed)
+    named, names = {}, list(tensors)
+    for number in range(shards):
+        file = f"model-{number + 1:05d}-of-{shards:05d}.safetensors"
+        own = {name: tensors[name] for name in names[number::shards]}
+        save_tensors(folder / file, own, {"format": "pt"})
+        named |= dict.fromkeys(own, file)
+    total = sum(t.numel() * t.element_size() for t in tensors.values())
+    write_json(folder / INDEX, {"metadata": {"total_size": total}, "weight_map": dict(sorted(named.items()))})
+    return folder
+
+
+def config_of(shape: Shape) -> dict[str, Any]:
+    """The contents of config.json."""
+    return {
+        "model_type": "openvla",
+        "architectures": ["OpenVLAForActionPrediction"],
+        "use_fused_vision_backbone": True,
+        "image_resize_strategy": "resize-naive",
+        "image_sizes": [tower.image for tower in shape.towers],
+        "n_action_bins": shape.bins,
+        "pad_to_multiple_of": shape.padding,
+        "text_config": {"model_type": "llama", **asdict(shape.language)},
+        SHAPES: [asdict(tower) for tower in shape.towers],
+    }
+
+
+def random_tensors(shape: Shape, seed: int) -> dict[str, Tensor]:
+    """Seeded weights that keep activations of order one, so that tokens depend on image and instruction. The head's
+    rows of the action tokens are the longest: the greedy token over all ids is an action."""
+    random = torch.Generator().manual_seed(seed)
+    tensors = {name: _random(name, sizes, random) for name, sizes in layout(shape).items()}
+    head = tensors["language_model.lm_head.weight"]
+    head[: shape.vocabulary - shape.bins] *= 0.1
+    head[shape.vocabulary :] *= 0.1
+    return tensors
+
+
+def _random(name: str, sizes: Sizes, random: torch.Generator) -> Tensor:
+    drawn = torch.randn(sizes, generator=random)
+    if "norm" in name and name.endswith("weight"):
+        return 1 + 0.1 * drawn
+    if name.endswith(("bias", "scale_factor")):
+        return 0.1 * drawn + (0.5 if name.endswith("scale_factor") else 0.0)
+    if len(sizes) == 2 and "embed" not in name:
+        return 2.0 * drawn / sizes[1] ** 0.5
+    return drawn / (drawn[0].numel() ** 0.5) if len(sizes) == 4 else drawn
+
+
+def tokenizer_json(size: int) -> str:
+    """A tokenizer.json of `size` ids built like Llama's: bytes, characters, word boundaries as tokens of their own."""
+    try:
+        from tokenizers import Tokenizer, decoders, models, normalizers, processors
+    except ImportError as error:
+        raise KervError("the tokenizer is written by the package tokenizers: pip install 'kerv[openvla]'") from error
+    pieces = ["<unk>", BEGIN, "</s>", *(f"<0x{byte:02X}>" for byte in range(256)), BOUNDARY]
+    pieces += [chr(code) for code in range(33, 127)]
+    merges = [(word[:end], word[end]) for word in WORDS for end in range(1, len(word))]
+    pieces += [first + second for first, second in merges]
+    pieces += [f"{BOUNDARY}unused{number}" for number in range(size - len(pieces))]
+    vocabulary = {piece: number for number, piece in enumerate(pieces)}
+    tokenizer = Tokenizer(models.BPE(vocab=vocabulary, merges=merges, unk_token="<unk>", byte_fallback=True))
+    tokenizer.normalizer = normalizers.Sequence([normalizers.Prepend(BOUNDARY), normalizers.Replace(" ", BOUNDARY)])
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single=f"{BEGIN} $A", special_tokens=[(BEGIN, vocabulary[BEGIN])]
+    )
+    tokenizer.decoder = decoders.ByteFallback()
+    text: str = tokenizer.to_str()
+    return text
+
+
+if __name__ == "__main__":
+    print(write_checkpoint(Path(sys.argv[1])))

@@ -1,0 +1,232 @@
+"""The language model of OpenVLA: Llama-2 with a cache in fixed buffers and tree attention.
+
+Modules are named as in the published checkpoints, so that weights can stay where the file's memory map has them.
+
+Shapes: B batch, T new tokens, S cached tokens, E width, A heads, K heads of keys and values, C channels of a head.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kerv_cli.targets.openvla.config import Language
+
+
+class KeyValueCache:
+    """Keys and values of every layer (layers, 2, B, K, capacity, C); slots 0 … length − 1 are valid.
+
+    fixed: every forward writes at a tensor of slots and attends to the whole capacity under a mask, so that its shapes
+    do not depend on the length; otherwise slices are used, which is faster on a CPU.
+    """
+
+    def __init__(self, language: Language, batch: int, capacity: int, like: Tensor, fixed: bool) -> None:
+        shape = (language.num_hidden_layers, 2, batch, language.key_value_heads, capacity, language.channels)
+        self.buffer = like.new_zeros(shape)
+        self.capacity, self.fixed = capacity, fixed
+        self.length = 0
+
+    def compact(self, start: int, slots: Tensor) -> None:
+        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
+        sets the length behind them."""
+        n = slots.shape[0]
+        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
+        self.length = start + n
+
+    def write(self, layer: int, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """k, v (B, K, T, C) behind the valid slots -> the keys and values to attend to."""
+        keys, values = self.buffer[layer]
+        stop = self.length + k.shape[2]
+        if self.fixed:
+            slots = torch.arange(self.length, stop, device=k.device)
+            return keys.index_copy_(2, slots, k), values.index_copy_(2, slots, v)
+        keys[:, :, self.length : stop], values[:, :, self.length : stop] = k, v
+        return keys[:, :, :stop], values[:, :, :stop]
+
+
+def additive_mask(seen: np.ndarray | None, tokens: int, cache: KeyValueCache | None, like: Tensor) -> Tensor | None:
+    """Additive mask of T = `tokens` new tokens behind a cache (T, S + T), over its whole capacity where it is fixed;
+    None where plain or causal attention does the same.
+
+    seen (T, M) bool: which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to all
+    before those. None: the new tokens are causal.
+    """
+    before, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
+    plain = (tokens == 1 or not before) if seen is None else (tokens == 1 and bool(seen.all()))
+    if plain and not fixed:
+        return None
+    seen = np.tri(tokens, dtype=bool) if seen is None else seen
+    stop = before + tokens
+    mask = np.zeros((tokens, cache.capacity if cache is not None and fixed else stop), dtype=np.float32)
+    mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
+    mask[:, stop:] = -np.inf
+    return torch.from_numpy(mask).to(device=like.device, dtype=like.dtype)
+
+
+def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """positions (T,) -> cos and sin (T, C) of the rotary embedding, half-split layout, computed in float32. The sign
+    of the swapped half is part of the sine."""
+    frequencies = theta ** (-torch.arange(0, channels, 2, device=positions.device, dtype=torch.float32) / channels)
+    angles = positions[:, None].float() * frequencies
+    cos, sin = angles.cos(), angles.sin()
+    return torch.cat([cos, cos], -1).to(dtype), torch.cat([-sin, sin], -1).to(dtype)
+
+
+def turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """x (B, heads, T, C) rotated by its positions' cos and sin (T, C)."""
+    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
+
+
+class LlamaAttention(nn.Module):
+    """Rotary self-attention; several query heads may share a head of keys and values."""
+
+    def __init__(self, language: Language) -> None:
+        super().__init__()
+        width, inner = language.hidden_size, language.key_value_heads * language.channels
+        self.heads, self.shared = language.num_attention_heads, language.key_value_heads
+        self.q_proj = nn.Linear(width, width, bias=False)
+        self.k_proj = nn.Linear(width, inner, bias=False)
+        self.v_proj = nn.Linear(width, inner, bias=False)
+        self.o_proj = nn.Linear(width, width, bias=False)
+
+    def forward(
+        self,
+        x: Tensor,
+        rotary: tuple[Tensor, Tensor],
+        mask: Tensor | None,
+        cache: KeyValueCache | None = None,
+        layer: int = 0,
+    ) -> Tensor:
+        """x (B, T, E) -> (B, T, E); without a cache and a mask attention is causal."""
+        batch, tokens, width = x.shape
+        q = turned(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
+        k = turned(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
+        v = self.v_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2)
+        if cache is not None:
+            k, v = cache.write(layer, k, v)
+        causal = mask is None and tokens > 1
+        shared = self.shared != self.heads
+        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
+        out: Tensor = self.o_proj(attended.transpose(1, 2).reshape(batch, tokens, width))
+        return out
+
+
+class LlamaPerceptron(nn.Module):
+    """SwiGLU."""
+
+    def __init__(self, language: Language) -> None:
+        super().__init__()
+        width, hidden = language.hidden_size, language.intermediate_size
+        self.gate_proj = nn.Linear(width, hidden, bias=False)
+        self.up_proj = nn.Linear(width, hidden, bias=False)
+        self.down_proj = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x (B, T, E) -> (B, T, E)."""
+        out: Tensor = self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
+        return out
+
+
+class LlamaLayer(nn.Module):
+    """One pre-norm decoder layer. normed: whether a norm stands before the attention (in the first layer of a public
+    EAGLE drafter none does)."""
+
+    def __init__(self, language: Language, normed: bool = True) -> None:
+        super().__init__()
+        width, epsilon = language.hidden_size, language.rms_norm_eps
+        self.input_layernorm = nn.RMSNorm(width, eps=epsilon) if normed else nn.Identity()
+        self.self_attn = LlamaAttention(language)
+        self.post_attention_layernorm = nn.RMSNorm(width, eps=epsilon)
+        self.mlp = LlamaPerceptron(language)
+
+    def forward(
+        self,
+        x: Tensor,
+        rotary: tuple[Tensor, Tensor],
+        mask: Tensor | None,
+        cache: KeyValueCache | None = None,
+        layer: int = 0,
+    ) -> Tensor:
+        """x (B, T, E) -> (B, T, E)."""
+        x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, layer)
+        out: Tensor = x + self.mlp(self.post_attention_layernorm(x))
+        return out
+
+
+def run_layers(
+    layers: nn.ModuleList,
+    language: Language,
+    x: Tensor,
+    positions: Tensor,
+    cache: KeyValueCache | None,
+    seen: np.ndarray | None,
+) -> Tensor:
+    """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
+    `additive_mask`."""
+    rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
+    mask = additive_mask(seen, x.shape[1], cache, x)
+    for number, layer in enumerate(layers):
+        x = layer(x, rotary, mask, cache, number)
+    if cache is not None:
+        cache.length += x.shape[1]
+    return x
+
+
+class LlamaModel(nn.Module):
+    """Token embeddings, layers and the final norm."""
+
+    def __init__(self, language: Language) -> None:
+        super().__init__()
+        self.language = language
+        self.embed_tokens = nn.Embedding(language.vocab_size, language.hidden_size)
+        self.layers = nn.ModuleList(LlamaLayer(language) for _ in range(language.num_hidden_layers))
+        self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
+
+    def forward(
+        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | None = None
+    ) -> Tensor:
+        """x (B, T, E) at `positions` (T,) -> hidden states behind the final norm (B, T, E)."""
+        normed: Tensor = self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
+        return normed
+
+
+class LanguageModel(nn.Module):
+    """The model and its head, which has a row per id."""
+
+    def __init__(self, language: Language) -> None:
+        super().__init__()
+        self.model = LlamaModel(language)
+        self.lm_head = nn.Linear(language.hidden_size, language.vocab_size, bias=False)
+
+
+class Int8Linear(nn.Module):
+    """A linear layer with one byte per weight and one factor per output: half of bfloat16's memory. The product is
+    computed in the format of its input.
+
+    weight (O, I) int8, scale (O,).
+    """
+
+    weight: Tensor
+    scale: Tensor
+
+    def __init__(self, weight: Tensor, dtype: torch.dtype) -> None:
+        """weight: (O, I) floats, rounded to 255 levels of each row's largest absolute value."""
+        super().__init__()
+        scale = weight.float().abs().amax(1).clamp_min(1e-12) / 127
+        self.register_buffer("weight", (weight.float() / scale[:, None]).round().to(torch.int8))
+        self.register_buffer("scale", scale.to(dtype))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x (…, I) -> (…, O)."""
+        return F.linear(x, self.weight.to(x.dtype)) * self.scale
+
+
+def quantise(module: nn.Module) -> None:
+    """Replaces every linear layer below `module` by an `Int8Linear`."""
+    for name, child in module.named_children():
+        if isinstance(child, nn.Linear):
+            setattr(module, name, Int8Linear(child.weight.data, child.weight.dtype))
+        else:
+            quantise(child)

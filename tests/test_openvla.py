@@ -1,0 +1,513 @@
+"""The OpenVLA target on tiny random checkpoints: equal to transformers' own models, lossless, and strict about files."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from safetensors.torch import load_file, save_file
+from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
+from kerv_cli.drafting.eagle import Drafter
+from kerv_cli.settings import BuildTargetSettings, DrafterSettings
+from kerv_cli.spaces import Observation
+from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.targets.openvla.config import TOWERS, Language, Shape, Statistics, action_space, read_shape
+from kerv_cli.targets.openvla.image import cropped, pixels_of
+from kerv_cli.targets.openvla.importing import import_checkpoint
+from kerv_cli.targets.openvla.layout import layout, published, unread
+from kerv_cli.targets.openvla.loading import OpenVLAModel
+from kerv_cli.targets.openvla.target import OpenVLATarget
+from kerv_cli.targets.openvla.tiny import ROBOT, TINY, write_checkpoint
+
+FOUR = {"q01": [-1.0] * 4, "q99": [1.0] * 4}
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("openvla") / "tiny")
+
+
+def imported(checkpoint: Path, results: Path, **chosen: Any) -> Path:
+    wanted = {"prompt_tokens": 120, **chosen}
+    return import_checkpoint(BuildTargetSettings(checkpoint=str(checkpoint), results=str(results), **wanted))[0]
+
+
+def loaded(folder: Path, dtype: torch.dtype = torch.float32) -> OpenVLATarget:
+    target = load_target(folder, dtype=dtype)[0]
+    assert isinstance(target, OpenVLATarget)
+    return target
+
+
+@pytest.fixture(scope="module")
+def target(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> OpenVLATarget:
+    return loaded(imported(checkpoint, tmp_path_factory.mktemp("results")))
+
+
+def shown(seed: int, instruction: str = "pick up the cup", size: tuple[int, int] = (40, 64)) -> Observation:
+    image = np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+    return Observation(np.zeros(0), np.zeros(0), instruction, {"primary": image})
+
+
+# --- the published layout
+
+
+def test_the_layout_is_that_of_the_published_checkpoint() -> None:
+    card = published()
+    first, second = TOWERS.values()
+    shape = Shape((first, second))
+    assert layout(shape) == card["tensors"]
+    assert 2 * sum(math.prod(sizes) for sizes in card["tensors"].values()) == card["total_size"]
+    sizes, language = card["sizes"], shape.language
+    assert sizes["width"] == language.hidden_size
+    assert sizes["layers"] == language.num_hidden_layers
+    assert sizes["vocabulary"] == language.vocab_size
+
+
+def test_every_published_name_is_a_parameter_or_known_to_be_unread() -> None:
+    first, second = (replace(tower, depth=3) for tower in TOWERS.values())  # blocks differ by their number alone
+    shape = Shape((first, second), Language(num_hidden_layers=2))
+    with torch.device("meta"):
+        model = OpenVLAModel(shape)
+    wanted = {name: tuple(x.shape) for name, x in model.state_dict().items()}
+    assert wanted == {name: sizes for name, sizes in layout(shape).items() if not unread(name, shape)}
+
+
+def test_the_published_config_gives_the_published_shape(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps(published()["config"]))
+    first, second = TOWERS.values()
+    assert read_shape(tmp_path) == Shape((first, second))
+
+
+# --- equal to transformers' own models, composed as OpenVLA composes them
+
+
+def split_qkv(state: dict[str, torch.Tensor], name: str) -> dict[str, torch.Tensor]:
+    return {
+        f"{part}_proj.{kind}": chunk
+        for kind in ("weight", "bias")
+        for part, chunk in zip("qkv", state[f"{name}.{kind}"].chunk(3), strict=True)
+    }
+
+
+def block_weights(state: dict[str, torch.Tensor], block: str, names: dict[str, str]) -> dict[str, torch.Tensor]:
+    return {
+        f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"] for ours, theirs in names.items() for kind in ("weight", "bias")
+    }
+
+
+class Composed:
+    """OpenVLA put together from transformers' Llama, Dinov2WithRegisters and Siglip."""
+
+    def __init__(self, folder: Path) -> None:
+        self.shape = read_shape(folder)
+        self.state = {k: v for path in sorted(folder.glob("*.safetensors")) for k, v in load_file(path).items()}
+        self.dino, self.siglip, self.llama = self._dino(), self._siglip(), self._llama()
+
+    def _dino(self) -> Any:
+        from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
+
+        tower = self.shape.towers[0]
+        model = Dinov2WithRegistersModel(
+            Dinov2WithRegistersConfig(
+                hidden_size=tower.width,
+                num_hidden_layers=tower.depth,
+                num_attention_heads=tower.heads,
+                mlp_ratio=tower.feed_forward // tower.width,
+                num_register_tokens=tower.registers,
+                image_size=tower.image,
+                patch_size=tower.patch,
+            )
+        )
+        own = {k.removeprefix("vision_backbone.featurizer."): v for k, v in self.state.items() if ".featurizer." in k}
+        # timm adds positions to the patches alone: transformers' class token gets a position of zero
+        position = torch.cat([torch.zeros(1, 1, tower.width), own["pos_embed"]], 1)
+        weights = {
+            "embeddings.cls_token": own["cls_token"],
+            "embeddings.mask_token": torch.zeros(1, tower.width),
+            "embeddings.register_tokens": own["reg_token"],
+            "embeddings.position_embeddings": position,
+            "embeddings.patch_embeddings.projection.weight": own["patch_embed.proj.weight"],
+            "embeddings.patch_embeddings.projection.bias": own["patch_embed.proj.bias"],
+            "layernorm.weight": own["norm.weight"],
+            "layernorm.bias": own["norm.bias"],
+        }
+        names = {"norm1": "norm1", "norm2": "norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
+        for i in range(tower.depth):
+            layer = block_weights(own, f"blocks.{i}", {**names, "attn.proj": "attention.o_proj"})
+            layer |= {f"attention.{k}": v for k, v in split_qkv(own, f"blocks.{i}.attn.qkv").items()}
+            layer |= {f"layer_scale{n}.lambda1": own[f"blocks.{i}.ls{n}.scale_factor"] for n in (1, 2)}
+            weights |= {f"encoder.layer.{i}.{k}": v for k, v in layer.items()}
+        model.load_state_dict(weights)
+        return model.eval()
+
+    def _siglip(self) -> Any:
+        from transformers import SiglipVisionConfig, SiglipVisionModel
+
+        tower = self.shape.towers[1]
+        model = SiglipVisionModel(
+            SiglipVisionConfig(
+                hidden_size=tower.width,
+                intermediate_size=tower.feed_forward,
+                num_hidden_layers=tower.depth,
+                num_attention_heads=tower.heads,
+                image_size=tower.image,
+                patch_size=tower.patch,
+                hidden_act="gelu",  # timm's; transformers' own default is its tanh approximation
+            )
+        )
+        prefix = "vision_backbone.fused_featurizer."
+        own = {k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)}
+        weights = {
+            "embeddings.patch_embedding.weight": own["patch_embed.proj.weight"],
+            "embeddings.patch_embedding.bias": own["patch_embed.proj.bias"],
+            "embeddings.position_embedding.weight": own["pos_embed"][0],
+            "post_layernorm.weight": own["norm.weight"],
+            "post_layernorm.bias": own["norm.bias"],
+        }
+        names = {"norm1": "layer_norm1", "norm2": "layer_norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
+        for i in range(tower.depth):
+            layer = block_weights(own, f"blocks.{i}", {**names, "attn.proj": "self_attn.out_proj"})
+            layer |= {f"self_attn.{k}": v for k, v in split_qkv(own, f"blocks.{i}.attn.qkv").items()}
+            weights |= {f"encoder.layers.{i}.{k}": v for k, v in layer.items()}
+        rest = model.load_state_dict(weights, strict=False)
+        assert all(name.startswith("head.") for name in rest.missing_keys)
+        assert not rest.unexpected_keys
+        return model.eval()
+
+    def _llama(self) -> Any:
+        from dataclasses import asdict
+
+        from transformers import LlamaConfig, LlamaForCausalLM
+
+        numbers = asdict(self.shape.language)
+        theta = numbers.pop("rope_theta")
+        model = LlamaForCausalLM(LlamaConfig(**numbers, rope_parameters={"rope_type": "default", "rope_theta": theta}))
+        prefix = "language_model."
+        model.load_state_dict({k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)})
+        return model.eval()
+
+    def patches(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Output of the last but one block of each tower, patches only, through the projector."""
+        depths = [tower.depth for tower in self.shape.towers]
+        first = self.dino(pixels[:, :3], output_hidden_states=True).hidden_states[depths[0] - 1]
+        second = self.siglip(pixels[:, 3:], output_hidden_states=True).hidden_states[depths[1] - 1]
+        x = torch.cat([first[:, 1 + self.shape.towers[0].registers :], second], -1)
+        for number in (1, 2, 3):
+            x = torch.nn.functional.linear(
+                x, self.state[f"projector.fc{number}.weight"], self.state[f"projector.fc{number}.bias"]
+            )
+            x = torch.nn.functional.gelu(x) if number < 3 else x
+        return x
+
+    @torch.inference_mode()
+    def generate(self, pixels: torch.Tensor, ids: list[int], count: int) -> tuple[list[int], torch.Tensor]:
+        """Greedy over *all* ids -> `count` ids and the logits before each (count, ids)."""
+        words = self.llama.model.embed_tokens(torch.tensor([ids]))
+        x, found, logits = torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1), [], []
+        for _ in range(count):
+            logits.append(self.llama(inputs_embeds=x).logits[0, -1])
+            found.append(int(logits[-1].argmax()))
+            x = torch.cat([x, self.llama.model.embed_tokens(torch.tensor([found[-1:]]))], 1)
+        return found, torch.stack(logits)
+
+
+def reference_pixels(image: np.ndarray, size: int) -> torch.Tensor:
+    """The published preprocessing, spelt out: PIL's bicubic, [0, 1], two normalisations."""
+    resized = np.asarray(Image.fromarray(image).resize((size, size), Image.Resampling.BICUBIC)) / 255.0
+    normalised = [
+        (resized - [0.484375, 0.455078125, 0.40625]) / [0.228515625, 0.2236328125, 0.224609375],
+        (resized - 0.5) / 0.5,
+    ]
+    return torch.from_numpy(np.concatenate([x.transpose(2, 0, 1) for x in normalised]))[None].float()
+
+
+def published_action(ids: list[int], vocabulary: int) -> np.ndarray:
+    """Published code's way from generated ids to actions."""
+    edges = np.linspace(-1, 1, 256)
+    centres = (edges[:-1] + edges[1:]) / 2.0
+    normalised = centres[np.clip(vocabulary - np.array(ids) - 1, 0, len(centres) - 1)]
+    low, high, mask = (np.array(ROBOT[key]) for key in ("q01", "q99", "mask"))
+    return np.where(mask, 0.5 * (normalised + 1) * (high - low) + low, normalised)
+
+
+@pytest.mark.parametrize("key_value_heads", [None, 2])
+def test_logits_and_actions_equal_transformers(
+    checkpoint: Path, target: OpenVLATarget, tmp_path: Path, key_value_heads: int | None
+) -> None:
+    if key_value_heads:
+        language = Language(704, 64, 96, 3, 4, key_value_heads, rms_norm_eps=1e-5, rope_theta=5000.0)
+        checkpoint = write_checkpoint(tmp_path / "grouped", Shape(TINY.towers, language), seed=5)
+        target = loaded(imported(checkpoint, tmp_path))
+    composed, worst = Composed(checkpoint), 0.0
+    for seed, words in enumerate(("pick up the cup", "Put the spoon on the towel", "open")):
+        observation = shown(seed, words)
+        record = Decoder(target).decode(observation)
+        text = f"In: What action should the robot take to {words.lower()}?\nOut:"
+        ids = [*target.prompter.tokenizer.encode(text).ids, target.prompter.boundary]
+        assert target.prompter.ids(words) == ids
+        generated, logits = composed.generate(reference_pixels(observation.images["primary"], 56), ids, 7)
+        with torch.inference_mode():
+            prompt = target.encode(observation)
+            x = torch.cat([prompt, target.embed(torch.tensor([record.tokens[:-1]]))], 1)
+            hidden = target.forward(x, torch.arange(x.shape[1]))
+            own = target.head(hidden[0, prompt.shape[1] - 1 :])
+        theirs = logits[:, TINY.vocabulary - 256 : TINY.vocabulary].flip(-1)
+        worst = max(worst, float((own - theirs).abs().max()))
+        assert [TINY.vocabulary - 1 - token for token in record.tokens] == generated
+        np.testing.assert_allclose(record.actions[0], published_action(generated, TINY.vocabulary), atol=1e-6)
+    assert worst < 1e-4
+
+
+def test_the_tokens_depend_on_image_and_instruction(target: OpenVLATarget) -> None:
+    decoder = Decoder(target)
+    tokens = {decoder.decode(shown(seed, words)).tokens for seed in range(3) for words in ("open", "close it")}
+    assert len(tokens) == 6
+
+
+@given(value=st.floats(-1.2, 1.2) | st.sampled_from([-1.0, 1.0]))
+def test_tokens_are_those_of_the_published_tokenizer(value: float) -> None:
+    space = action_space(TINY, Statistics("one", (-1.0,) * 7, (1.0,) * 7), None, 5.0)
+    number = int(np.digitize(np.clip(value, -1.0, 1.0), np.linspace(-1, 1, 256)))  # published: id = vocabulary − number
+    token = int(space.bins_of(np.array(np.clip(value, -1.0, 1.0))))
+    assert TINY.vocabulary - 1 - token == TINY.vocabulary - number
+    assert space.tokens == 256
+    assert abs(space.values_of(np.array(token)) - np.clip(value, -1, 1)) <= 1 / 255 + 1e-9
+
+
+def test_a_dof_without_a_mask_keeps_its_value(target: OpenVLATarget) -> None:
+    assert (target.actions.low[-1], target.actions.high[-1]) == (-1.0, 1.0)
+    assert target.actions.decode(np.full((1, 7), 255))[0, -1] == pytest.approx(254 / 255, abs=1e-6)
+
+
+def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
+    image = np.random.default_rng(3).integers(0, 256, (90, 61, 3), dtype=np.uint8)
+    side = math.sqrt(0.9)
+    axis = torch.linspace(-side, side, 56)  # of grid_sample: −1 and 1 are the centres of the outermost pixels
+    grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)[None]
+    floats = torch.from_numpy(image).permute(2, 0, 1)[None] / 255
+    wanted = torch.nn.functional.grid_sample(floats, grid, align_corners=True)[0].permute(1, 2, 0)
+    wanted = (wanted.clamp(0, 1) * 255.5).floor().clamp(0, 255).numpy()
+    assert np.abs(cropped(image, 56).astype(float) - wanted).max() <= 1  # a sum at the edge of a grey level
+    assert (cropped(image, 56) == wanted).mean() > 0.999
+    whole, part = (pixels_of(image, TINY, target.normalisations, crop) for crop in (False, True))
+    assert whole.shape == part.shape == (1, 6, 56, 56)
+    assert not torch.allclose(whole, part)
+
+
+# --- the engine: lossless at D = 7, N = 7
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 10_000), nodes=st.integers(0, 24), inside=st.booleans(), fixed=st.booleans())
+def test_strict_decoding_equals_ar(
+    target: OpenVLATarget, monkeypatch: pytest.MonkeyPatch, seed: int, nodes: int, inside: bool, fixed: bool
+) -> None:
+    monkeypatch.setattr(target, "new_cache", lambda batch, size: OpenVLATarget.new_cache(target, batch, size, fixed))
+    with torch.inference_mode():
+        prompt = target.encode(shown(seed, "move " * (1 + seed % 9)))
+        truth = plain_greedy(target, prompt)
+    trees = RandomTrees(truth, seed, nodes, target.actions.tokens)
+    first = RandomTrees(truth, seed + 1, nodes, target.actions.tokens) if inside else None
+    from kerv_cli.decoding.decoder import Parts
+
+    result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
+    assert result.tokens == truth
+    assert result.size == 7
+    assert_adds_up(result)
+
+
+@pytest.mark.parametrize("kind", ["chain", "tree", "jacobi"])
+def test_the_methods_run_on_it(target: OpenVLATarget, kind: str) -> None:
+    torch.manual_seed(0)
+    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    proposers = {
+        "chain": DrafterProposer(drafter, target, 6, 1, 6),
+        "tree": DrafterProposer(drafter, target, 5, 4, 20),
+        "jacobi": JacobiProposer(),
+    }
+    for seed in range(3):
+        with torch.inference_mode():
+            prompt = target.encode(shown(seed))
+            truth = plain_greedy(target, prompt)
+        assert decode(target, proposers[kind], prompt).tokens == truth
+
+
+# --- formats of the weights
+
+
+def test_weights_stay_in_the_files_memory_map(checkpoint: Path, target: OpenVLATarget) -> None:
+    address = target.model.language_model.model.layers[0].mlp.up_proj.weight.data_ptr()
+    mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(checkpoint) in line]
+    spans = [tuple(int(x, 16) for x in line[0].split("-")) for line in mapped]
+    assert any(low <= address < high for low, high in spans)
+
+
+def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint: Path, tmp_path: Path, target: OpenVLATarget) -> None:
+    half = loaded(imported(checkpoint, tmp_path), torch.bfloat16)
+    small = loaded(imported(checkpoint, tmp_path, int8=True, name="int8"))
+    layer = small.model.language_model.model.layers[0].mlp.up_proj
+    assert layer.weight.dtype == torch.int8
+    prompt = target.encode(shown(1))
+    with torch.inference_mode():
+        positions = torch.arange(prompt.shape[1])
+        right = target.head(target.forward(prompt, positions)[0, -1])
+        for other, least in ((half, 0.99), (small, 0.99)):
+            got = other.head(other.forward(other.encode(shown(1)), positions)[0, -1]).float()
+            assert float(torch.corrcoef(torch.stack([right, got]))[0, 1]) > least
+    assert load_target(tmp_path / "artifacts/target/int8")[1].sha256 != load_target(tmp_path / "artifacts/target/openvla")[1].sha256
+
+
+# --- bad input: one line
+
+
+def kerv(*words: str) -> tuple[int, str]:
+    run = CliRunner().invoke(app, [*words])
+    assert "Traceback" not in run.output
+    lines = [line for line in run.output.splitlines() if line.startswith("kerv:")]
+    assert len(lines) == (run.exit_code != 0), run.output
+    return run.exit_code, "".join(lines)
+
+
+def edited(checkpoint: Path, tmp_path: Path, file: str, **changes: Any) -> Path:
+    import shutil
+
+    copy = Path(shutil.copytree(checkpoint, tmp_path / "copy"))
+    value = json.loads((copy / file).read_text())
+    (copy / file).write_text(json.dumps({**value, **changes}))
+    return copy
+
+
+def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"checkpoint={checkpoint}", f"results={tmp_path}", "name=vla", "environment=insertion", "prompt_tokens=120"]
+    assert kerv("build", "target", "target=openvla", *words)[0] == 0
+    run = ["rollout", "method=ar", "task=insert-peg", "policy.target=vla", "episodes=1", "world.horizon=2", "record=0"]
+    assert kerv(*run, "world.camera.size=56", f"results={tmp_path}")[0] == 0
+    code, line = kerv(*run[:-3], "task=reach", "world.camera.size=56", f"results={tmp_path}")
+    assert code == 1
+    assert "action space with names dx, dy, dz, droll, dpitch, dyaw, gripper, environment metaworld one with" in line
+
+
+@pytest.mark.parametrize(
+    ("changes", "words", "said"),
+    [
+        ({}, ["checkpoint=/nowhere"], "no config.json in /nowhere"),
+        ({}, [], "checkpoint=DIR"),
+        ({"config.json": {"model_type": "llava"}}, ["COPY"], "is of a model of type llava, not openvla"),
+        ({"config.json": {"n_action_bins": 700}}, ["COPY"], "fewer token ids than action bins"),
+        ({"config.json": {"pad_to_multiple_of": 0}}, ["COPY"], "has 640 ids, the weights are for 704"),
+        ({"dataset_statistics.json": {"b": {"action": ROBOT}}}, ["COPY"], "statistics of b, tiny: choose with statistics"),
+        ({}, ["COPY", "statistics=bridge"], "unknown statistics 'bridge': known: tiny"),
+        ({"dataset_statistics.json": {"b": {"action": FOUR}}}, ["COPY", "statistics=b"], "are of 4 DoFs, the action space"),
+        ({"dataset_statistics.json": {"b": {"action": {}}}}, ["COPY", "statistics=b"], "statistics b in"),
+        ({}, ["COPY", "environment=metaworld"], "are of 7 DoFs, the action space has 4 (dx, dy, dz, gripper)"),
+        ({}, ["COPY", "environment=kitchen"], "unknown environment 'kitchen'"),
+        ({}, ["COPY", "prompt=chat"], "unknown prompt 'chat'"),
+        ({}, ["COPY", "family=compact"], "only openvla is imported"),
+        ({}, ["COPY", "prompt_tokens=3"], "at most 3 are taken"),
+        ({"preprocessor_config.json": {"image_resize_strategy": "letterbox"}}, ["COPY"], "image_resize_strategy=letterbox"),
+    ],
+)
+def test_an_import_refuses_in_one_line(
+    checkpoint: Path, tmp_path: Path, changes: dict[str, Any], words: list[str], said: str
+) -> None:
+    for file, values in changes.items():
+        checkpoint = edited(checkpoint, tmp_path, file, **values)
+    words = [word.replace("COPY", f"checkpoint={checkpoint}") for word in words]
+    code, line = kerv("build", "target", *words, f"results={tmp_path}")
+    assert code in (1, 2)
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        ("truncate", "missing, cut short or damaged"),
+        ("remove", "missing, cut short or damaged"),
+        ("rename", "1 missing: language_model.model.norm.weight; 1 unknown: language_model.model.norm.scale"),
+        ("reshape", "1 of another shape: language_model.model.norm.weight 3, not 64"),
+        ("nan", "numbers in language_model.model.norm.weight that are not finite"),
+        ("pickle", "holds pickled weights (pytorch_model.bin), which can run code"),
+        ("tokenizer", "cannot be read"),
+        ("no tokenizer", "no tokenizer.json in"),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(checkpoint: Path, tmp_path: Path, harm: str, said: str) -> None:
+    copy = edited(checkpoint, tmp_path, "config.json")
+    index = json.loads((copy / "model.safetensors.index.json").read_text())["weight_map"]
+    norm = "language_model.model.norm.weight"
+    shard = copy / index[norm]
+    tensors = {k: v.clone() for k, v in load_file(shard).items()}
+    if harm == "truncate":
+        shard.write_bytes(shard.read_bytes()[:-100])
+    elif harm == "remove":
+        shard.unlink()
+    elif harm in ("rename", "reshape", "nan"):
+        value = tensors.pop(norm)
+        name = norm.replace("weight", "scale") if harm == "rename" else norm
+        tensors[name] = value[:3].clone() if harm == "reshape" else value
+        tensors[name][0] = math.nan if harm == "nan" else 1.0
+        save_file(tensors, shard)
+        (copy / "model.safetensors.index.json").write_text(
+            json.dumps({"weight_map": {**{k: v for k, v in index.items() if k != norm}, name: shard.name}})
+        )
+    elif harm == "pickle":
+        for path in copy.glob("model*"):
+            path.unlink()
+        torch.save({"x": torch.zeros(1)}, copy / "pytorch_model.bin")
+    elif harm == "tokenizer":
+        (copy / "tokenizer.json").write_text("{")
+    else:
+        (copy / "tokenizer.json").unlink()
+    code, line = kerv("build", "target", f"checkpoint={copy}", f"results={tmp_path}")
+    assert code == 1
+    assert said in line
+
+
+def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+    import shutil
+
+    copy = edited(checkpoint, tmp_path, "config.json")
+    imported(copy, tmp_path)
+    run = ["rollout", "method=ar", "task=insert-peg", "policy.target=openvla", f"results={tmp_path}"]
+    save_file({"x": torch.zeros(1)}, copy / "model-00001-of-00002.safetensors")
+    assert "model.safetensors.index.json and its shards disagree" in kerv(*run)[1]
+    shutil.rmtree(copy)
+    assert "which is gone: import it again" in kerv(*run)[1]
+
+
+@pytest.mark.parametrize(
+    ("image", "said"),
+    [
+        (np.zeros((56, 56), np.uint8), r"shape \(56, 56\) and type uint8"),
+        (np.zeros((56, 56, 3), np.float32), "type float32"),
+        (np.zeros((3, 56, 56), np.uint8), r"shape \(3, 56, 56\)"),
+        (None, "whose image was not drawn"),
+    ],
+)
+def test_a_wrong_image_is_refused(target: OpenVLATarget, image: np.ndarray | None, said: str) -> None:
+    from kerv_cli.errors import KervError
+
+    images = {} if image is None else {"primary": image}
+    with pytest.raises(KervError, match=said):
+        target.encode(Observation(np.zeros(0), np.zeros(0), "open", images))
+
+
+def test_too_long_an_instruction_is_refused(target: OpenVLATarget) -> None:
+    from kerv_cli.errors import UsageError
+
+    with pytest.raises(UsageError, match="at most 120 are taken"):
+        target.encode(shown(0, "turn " * 90))
