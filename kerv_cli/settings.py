@@ -298,6 +298,16 @@ class BuildTargetSettings(RunSettings):
 
 
 @dataclass
+class BuildDrafterSettings(RunSettings):
+    """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout, for one of our targets."""
+
+    policy: PolicySettings = field(default_factory=PolicySettings)  # policy.target, and policy.drafter: its new name
+    checkpoint: str = ""  # folder with config.json and model.safetensors
+    positions: str = "sequence"  # sequence | text (docs/methods.md §2.2)
+    mask: str = "causal"  # causal | prompt
+
+
+@dataclass
 class BuildDatastoreSettings(TaskSettings):
     """`kerv build datastore` (docs/methods.md §4.1)."""
 

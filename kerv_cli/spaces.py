@@ -165,7 +165,14 @@ class ActionSpace:
         Raises:
             CheckpointError: they differ; the message names the first difference.
         """
-        fields = ["names", "groups", "strict", "bins", "control_hz", *(("low", "high", "end_token") if statistics else ())]
+        fields = [
+            "names",
+            "groups",
+            "strict",
+            "bins",
+            "control_hz",
+            *(("low", "high", "end_token") if statistics else ()),
+        ]
         for name in fields:
             mine, theirs = getattr(self, name), getattr(other, name)
             if mine != theirs:

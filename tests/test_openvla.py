@@ -1,4 +1,4 @@
-"""The OpenVLA target on tiny random checkpoints: equal to transformers' own models, lossless, and strict about files."""
+"""The OpenVLA target on tiny random checkpoints: equal to transformers' own models, lossless, strict about files."""
 
 from __future__ import annotations
 
@@ -105,7 +105,9 @@ def split_qkv(state: dict[str, torch.Tensor], name: str) -> dict[str, torch.Tens
 
 def block_weights(state: dict[str, torch.Tensor], block: str, names: dict[str, str]) -> dict[str, torch.Tensor]:
     return {
-        f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"] for ours, theirs in names.items() for kind in ("weight", "bias")
+        f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"]
+        for ours, theirs in names.items()
+        for kind in ("weight", "bias")
     }
 
 
@@ -368,7 +370,10 @@ def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint: Path, tmp_path: Pa
         for other, least in ((half, 0.99), (small, 0.99)):
             got = other.head(other.forward(other.encode(shown(1)), positions)[0, -1]).float()
             assert float(torch.corrcoef(torch.stack([right, got]))[0, 1]) > least
-    assert load_target(tmp_path / "artifacts/target/int8")[1].sha256 != load_target(tmp_path / "artifacts/target/openvla")[1].sha256
+    assert (
+        load_target(tmp_path / "artifacts/target/int8")[1].sha256
+        != load_target(tmp_path / "artifacts/target/openvla")[1].sha256
+    )
 
 
 # --- bad input: one line
@@ -392,7 +397,13 @@ def edited(checkpoint: Path, tmp_path: Path, file: str, **changes: Any) -> Path:
 
 
 def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) -> None:
-    words = [f"checkpoint={checkpoint}", f"results={tmp_path}", "name=vla", "environment=insertion", "prompt_tokens=120"]
+    words = [
+        f"checkpoint={checkpoint}",
+        f"results={tmp_path}",
+        "name=vla",
+        "environment=insertion",
+        "prompt_tokens=120",
+    ]
     assert kerv("build", "target", "target=openvla", *words)[0] == 0
     run = ["rollout", "method=ar", "task=insert-peg", "policy.target=vla", "episodes=1", "world.horizon=2", "record=0"]
     assert kerv(*run, "world.camera.size=56", f"results={tmp_path}")[0] == 0
@@ -409,16 +420,28 @@ def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) 
         ({"config.json": {"model_type": "llava"}}, ["COPY"], "is of a model of type llava, not openvla"),
         ({"config.json": {"n_action_bins": 700}}, ["COPY"], "fewer token ids than action bins"),
         ({"config.json": {"pad_to_multiple_of": 0}}, ["COPY"], "has 640 ids, the weights are for 704"),
-        ({"dataset_statistics.json": {"b": {"action": ROBOT}}}, ["COPY"], "statistics of b, tiny: choose with statistics"),
+        (
+            {"dataset_statistics.json": {"b": {"action": ROBOT}}},
+            ["COPY"],
+            "statistics of b, tiny: choose with statistics",
+        ),
         ({}, ["COPY", "statistics=bridge"], "unknown statistics 'bridge': known: tiny"),
-        ({"dataset_statistics.json": {"b": {"action": FOUR}}}, ["COPY", "statistics=b"], "are of 4 DoFs, the action space"),
+        (
+            {"dataset_statistics.json": {"b": {"action": FOUR}}},
+            ["COPY", "statistics=b"],
+            "are of 4 DoFs, the action space",
+        ),
         ({"dataset_statistics.json": {"b": {"action": {}}}}, ["COPY", "statistics=b"], "statistics b in"),
         ({}, ["COPY", "environment=metaworld"], "are of 7 DoFs, the action space has 4 (dx, dy, dz, gripper)"),
         ({}, ["COPY", "environment=kitchen"], "unknown environment 'kitchen'"),
         ({}, ["COPY", "prompt=chat"], "unknown prompt 'chat'"),
         ({}, ["COPY", "family=compact"], "only openvla is imported"),
         ({}, ["COPY", "prompt_tokens=3"], "at most 3 are taken"),
-        ({"preprocessor_config.json": {"image_resize_strategy": "letterbox"}}, ["COPY"], "image_resize_strategy=letterbox"),
+        (
+            {"preprocessor_config.json": {"image_resize_strategy": "letterbox"}},
+            ["COPY"],
+            "image_resize_strategy=letterbox",
+        ),
     ],
 )
 def test_an_import_refuses_in_one_line(

@@ -36,6 +36,19 @@ def target(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     common.print_figures("target", figures, folder)
 
 
+@app.command("drafter")
+@edge
+def drafter(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+    """Check a drafter in the public EAGLE or Spec-VLA layout and copy it beside its target."""
+    from kerv_cli.settings import BuildDrafterSettings
+
+    settings = common.composed("build_drafter", overrides, BuildDrafterSettings, cfg)
+    from kerv_cli.training.public_drafter import import_drafter
+
+    folder, figures = import_drafter(settings)
+    common.print_figures("drafter", figures, folder)
+
+
 @app.command("datastore")
 @edge
 def datastore(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
-from kerv_cli.drafting.eagle import Drafter, DraftState, grow_tree, observe
+from kerv_cli.drafting.eagle import DraftsStates, DraftState, grow_tree, observe
 from kerv_cli.drafting.early import EarlyDrafter
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
@@ -218,7 +218,7 @@ class DrafterProposer:
     name = "drafter"
     needs_states = True
 
-    def __init__(self, drafter: Drafter, target: Target, depth: int, top_k: int, nodes: int) -> None:
+    def __init__(self, drafter: DraftsStates, target: Target, depth: int, top_k: int, nodes: int) -> None:
         """depth: tokens; top_k: children expanded per level; nodes: kept after reranking."""
         self.drafter, self.target = drafter, target
         self.depth, self.top_k, self.nodes = depth, top_k, nodes

@@ -10,20 +10,37 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.drafting.public import PublicShape, load_public
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import Description, read_description, save_module
 from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.compact.trunk import Cache, LayerStack
+from kerv_cli.targets.protocol import Cache as AnyCache
 from kerv_cli.targets.protocol import ReadableTarget, Target
+
+
+class DraftsStates(Protocol):
+    """What a drafter is to a decode: our own, or one of the public layout (`public.py`)."""
+
+    def new_cache(self, batch: int, capacity: int) -> AnyCache:
+        """An empty cache for `capacity` positions."""
+
+    def draft_position(self, place: int) -> int:
+        """Rotary position of a drafted token at this place of the sequence; the same, but for public conventions."""
+
+    def __call__(
+        self, following: Tensor, hidden: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | None = None
+    ) -> Tensor:
+        """As `Drafter.forward`."""
 
 
 class Drafter(LayerStack):
@@ -38,6 +55,10 @@ class Drafter(LayerStack):
     def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> Drafter:
         """A fresh drafter of the target's width, heads and feed-forward width."""
         return cls(settings, target.width, target.heads, target.feed_forward)
+
+    def draft_position(self, place: int) -> int:
+        """As `DraftsStates.draft_position`."""
+        return place
 
     def forward(
         self,
@@ -59,11 +80,11 @@ class DraftState:
     """The drafter's state between rounds. cache: every committed position but the last. hidden: (E,) predicted state
     from which the first draft token follows."""
 
-    cache: Cache
+    cache: AnyCache
     hidden: Tensor
 
 
-def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
+def observe(drafter: DraftsStates, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
     """Feeds the target's own states: hidden (1, T, E) at positions first, first + 1, … and the embedding of the token
     after each of them (1, T, E). Cache entries from `first` on (the last draft's) are overwritten."""
     state.cache.length = first
@@ -72,7 +93,9 @@ def observe(drafter: Drafter, state: DraftState, following: Tensor, hidden: Tens
     state.hidden = drafter(following, hidden, positions, state.cache)[0, -1]
 
 
-def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> TokenTree:
+def grow_tree(
+    drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
+) -> TokenTree:
     """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
     `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree.
     """
@@ -83,11 +106,12 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
     level = list(range(len(tokens)))
     all_tokens, parents, cumulative = tokens.tolist(), [ROOT] * len(tokens), values.tolist()
     base = state.cache.length
+    first = drafter.draft_position(base)
     hidden = state.hidden.expand(1, len(tokens), -1)
     seen = np.eye(len(tokens), dtype=bool)  # of the nodes that were forwarded, level by level
     for reached in range(1, depth):
         following = target.embed(tokens[None])
-        position = torch.full((len(level),), base + reached - 1, device=tokens.device)
+        position = torch.full((len(level),), first + reached - 1, device=tokens.device)
         hidden = drafter(following, hidden, position, state.cache, seen)
         logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
         child_values, child_tokens = logp.topk(top_k, -1)
@@ -106,10 +130,11 @@ def grow_tree(drafter: Drafter, target: Target, state: DraftState, depth: int, t
     return _keep_best(all_tokens, parents, cumulative, nodes)
 
 
-def draft_chain(drafter: Drafter, target: Target, state: DraftState, depth: int) -> list[int]:
+def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> list[int]:
     """The `depth` greedy draft tokens, without the bookkeeping of a tree."""
     base = state.cache.length
-    positions = torch.arange(base, base + depth, device=state.hidden.device).split(1)
+    first = drafter.draft_position(base)
+    positions = torch.arange(first, first + depth, device=state.hidden.device).split(1)
     hidden = state.hidden[None, None]
     drafted = [target.head(hidden[0]).argmax(-1)]
     for reached in range(depth - 1):
@@ -129,12 +154,14 @@ def _keep_best(tokens: list[int], parents: list[int], scores: list[float], nodes
 
 @dataclass(frozen=True)
 class DrafterDescription(Description):
-    """A drafter's JSON. target: hash of the weights it imitates; actions: the action space whose tokens it drafts."""
+    """A drafter's JSON. target: hash of the weights it imitates; actions: the action space whose tokens it drafts.
+    public: shape and convention of one in the public layout."""
 
     settings: DrafterSettings
     target: str
     actions: ActionSpace
     provenance: dict[str, Any]
+    public: PublicShape | None = None
 
 
 def save_drafter(
@@ -163,9 +190,11 @@ def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> Draf
     return description
 
 
-def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tuple[Drafter, DrafterDescription]:
+def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tuple[Any, DrafterDescription]:
     """The drafter, ready for inference, and its description; errors as `read_drafter`."""
     description = read_drafter(folder, target_sha256, target.actions)
+    if description.public is not None:
+        return load_public(folder, description.public, target), description
     drafter = Drafter.beside(description.settings, target)
     return load_packed(drafter, folder, "drafter", target.device, target.dtype), description
 
@@ -174,7 +203,7 @@ def _check(folder: Path, request: Request) -> str:
     return read_drafter(folder, request.description.sha256, request.description.actions).sha256
 
 
-def _load(folder: Path, request: Request) -> Drafter:
+def _load(folder: Path, request: Request) -> DraftsStates:
     target: Any = request.target
     return load_drafter(folder, target, request.description.sha256)[0]
 

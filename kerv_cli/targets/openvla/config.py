@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -237,9 +237,8 @@ def action_space(shape: Shape, statistics: Statistics, like: ActionSpace | None,
     Raises:
         CheckpointError: the statistics are of another number of DoFs, or of DoFs that do not move.
     """
-    names, groups, strict, rate = DOFS, GROUPS, DOFS[-1:], control_hz
-    if like is not None:
-        names, groups, strict, rate = like.names, like.groups, like.strict, like.control_hz
+    own = like or ActionSpace(DOFS, GROUPS, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
+    names = own.names
     if len(statistics.low) != len(names):
         raise CheckpointError(
             f"statistics {statistics.name} are of {len(statistics.low)} DoFs, the action space has {len(names)} "
@@ -248,6 +247,4 @@ def action_space(shape: Shape, statistics: Statistics, like: ActionSpace | None,
     still = [n for n, a, b in zip(names, statistics.low, statistics.high, strict=True) if not a < b]
     if still:
         raise CheckpointError(f"statistics {statistics.name} have q01 = q99 of {still[0]}: they are damaged")
-    return ActionSpace(
-        names, groups, strict, rate, statistics.low, statistics.high, bins=shape.bins, end_token=True
-    )
+    return replace(own, low=statistics.low, high=statistics.high, bins=shape.bins, end_token=True)

@@ -1,7 +1,7 @@
 """The tensors of a Hugging Face OpenVLA checkpoint: every name and shape, from the numbers of its config.
 
-`openvla-7b.json` holds the published names and shapes of openvla/openvla-7b as they are, for comparison; the tests check
-that both agree, and that their bytes add up to the `total_size` of the published index (15 082 474 368).
+`openvla-7b.json` holds the published names and shapes of openvla/openvla-7b as they are, for comparison; the tests
+check that both agree, and that their bytes add up to the `total_size` of the published index (15 082 474 368).
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def published() -> dict[str, Any]:
 def _expanded(patterns: Mapping[str, list[int]]) -> Iterator[tuple[str, Sizes]]:
     for pattern, sizes in patterns.items():
         spans = [range(int(a), int(b) + 1) for a, b in _RANGE.findall(pattern)]
+        form = _RANGE.sub("{}", pattern)
         for numbers in itertools.product(*spans):
-            number = iter(numbers)
-            yield _RANGE.sub(lambda _, number=number: str(next(number)), pattern), tuple(sizes)
+            yield form.format(*numbers), tuple(sizes)
 
 
 def _linear(name: str, inputs: int, outputs: int) -> dict[str, Sizes]:

@@ -39,7 +39,7 @@ class Prompter:
         known = {name: self.tokenizer.token_to_id(name) for name in (BEGIN, BOUNDARY)}
         if size != shape.vocabulary:
             raise CheckpointError(
-                f"{folder / TOKENIZER} has {size} ids, the weights are for {shape.vocabulary}: another model's tokenizer"
+                f"{folder / TOKENIZER} has {size} ids, the weights are for {shape.vocabulary}: it is another model's"
             )
         absent = [repr(name) for name, token in known.items() if token is None]
         if absent:
@@ -74,5 +74,5 @@ def _read(path: Path) -> Any:
         raise KervError("OpenVLA checkpoints need the package tokenizers: pip install 'kerv[openvla]'") from error
     try:
         return Tokenizer.from_file(str(path))
-    except Exception as error:  # noqa: BLE001 - the library raises bare Exceptions
+    except Exception as error:
         raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error

@@ -146,7 +146,7 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     """The target that the target.json in `folder` describes, frozen.
 
     Raises:
-        CheckpointError: the description is not OpenVLA's, its checkpoint is missing, changed or does not fit its config.
+        CheckpointError: the description is not OpenVLA's, its checkpoint is missing or does not fit its config.
     """
     settings = read_settings(folder, description)
     source = Path(settings.checkpoint)
@@ -154,9 +154,7 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
     model = load_model(source, shape, device, dtype, settings.int8)
     normalisations = read_normalisations(source)
-    return OpenVLATarget(
-        model, shape, description.actions, prompter, settings, description.cameras[0], normalisations
-    )
+    return OpenVLATarget(model, shape, description.actions, prompter, settings, description.cameras[0], normalisations)
 
 
 def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:

@@ -34,7 +34,7 @@ TINY = Shape(
 )
 """16 patches; a trunk of 3 layers and 64 channels."""
 
-WORDS = tuple(f"{BOUNDARY}{word}" for word in "What action should robot take".split())
+WORDS = tuple(f"{BOUNDARY}{word}" for word in ["What", "action", "should", "robot", "take"])
 """Words with a token of their own, so that a prompt is not one token per letter."""
 
 ROBOT: dict[str, Any] = {
@@ -60,7 +60,8 @@ def write_checkpoint(
     write_json(folder / PREPROCESSOR, {"image_resize_strategy": "resize-naive", "tvf_normalize_params": normalise})
     (folder / TOKENIZER).write_text(tokenizer_json(shape.vocabulary), encoding="utf-8")
     tensors = random_tensors(shape, seed)
-    named, names = {}, list(tensors)
+    named: dict[str, str] = {}
+    names = list(tensors)
     for number in range(shards):
         file = f"model-{number + 1:05d}-of-{shards:05d}.safetensors"
         own = {name: tensors[name] for name in names[number::shards]}

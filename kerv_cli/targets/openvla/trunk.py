@@ -162,11 +162,12 @@ def run_layers(
     positions: Tensor,
     cache: KeyValueCache | None,
     seen: np.ndarray | None,
+    mask: Tensor | None = None,
 ) -> Tensor:
     """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
-    `additive_mask`."""
+    `additive_mask`; mask: one that is given instead."""
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
-    mask = additive_mask(seen, x.shape[1], cache, x)
+    mask = additive_mask(seen, x.shape[1], cache, x) if mask is None else mask
     for number, layer in enumerate(layers):
         x = layer(x, rotary, mask, cache, number)
     if cache is not None:

@@ -1,4 +1,4 @@
-"""The fused vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector behind both.
+"""The vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector behind both.
 
 Modules are named as in the published checkpoints. What those hold and nothing reads is not here: the last block of each
 tower (OpenVLA takes the output of the last but one), the norm behind it and SigLIP's pooling head.

@@ -1,0 +1,158 @@
+"""Drafters of the public EAGLE and Spec-VLA layout: what they compute, and their conventions.
+
+`tests/public_conventions.py` measures what a convention costs that the drafter was not trained with.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from test_decoding_lossless import decode, plain_greedy
+from test_openvla import imported, kerv, loaded, shown
+from torch import Tensor
+
+from kerv_cli.decoding.proposers import DrafterProposer
+from kerv_cli.drafting.eagle import load_drafter
+from kerv_cli.drafting.public import Convention, PublicDrafter, PublicShape
+from kerv_cli.targets.openvla.config import Language
+from kerv_cli.targets.openvla.target import OpenVLATarget
+from kerv_cli.targets.openvla.tiny import write_checkpoint
+
+LANGUAGE = Language(704, 64, 96, 1, 4)
+KERV, TEXT, PROMPT = Convention(), Convention("text"), Convention(mask="prompt")
+PATCHES = 16
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("public")
+    imported(write_checkpoint(folder / "tiny"), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def target(results: Path) -> OpenVLATarget:
+    return loaded(results / "artifacts/target/openvla")
+
+
+@pytest.fixture(scope="module")
+def drafter() -> PublicDrafter:
+    """Untrained: what is drafted does not matter to what these tests say."""
+    torch.manual_seed(1)
+    return PublicDrafter(PublicShape(LANGUAGE, True, KERV, PATCHES)).eval().requires_grad_(False)
+
+
+def with_convention(drafter: PublicDrafter, convention: Convention) -> PublicDrafter:
+    other = PublicDrafter(replace(drafter.shape, convention=convention))
+    other.load_state_dict(drafter.state_dict())
+    return other.eval().requires_grad_(False)
+
+
+def written(folder: Path, drafter: PublicDrafter, embedding: Tensor) -> Path:
+    """As the public codes save it, with a copy of the embeddings."""
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({**asdict(LANGUAGE), "model_type": "llama", "pad_token_id": 0}))
+    save_file({**drafter.state_dict(), "embed_tokens.weight": embedding.clone()}, folder / "model.safetensors")
+    return folder
+
+
+def test_it_computes_what_the_public_layer_does(target: OpenVLATarget) -> None:
+    """EAGLE's forward, spelt out with transformers' layer: fc over (embedding, state), no norm in front or behind."""
+    from transformers import LlamaConfig
+    from transformers.models.llama.modeling_llama import LlamaDecoderLayer, LlamaRotaryEmbedding
+
+    torch.manual_seed(3)
+    drafter = PublicDrafter(PublicShape(LANGUAGE, True, KERV, PATCHES)).eval().requires_grad_(False)
+    numbers = {k: v for k, v in asdict(LANGUAGE).items() if k != "rope_theta"}
+    config = LlamaConfig(**numbers, attn_implementation="eager")
+    layer = LlamaDecoderLayer(config, 0).eval()
+    own = {k.removeprefix("layers.0."): v for k, v in drafter.state_dict().items() if k.startswith("layers.0.")}
+    layer.load_state_dict(own, strict=False)
+    layer.input_layernorm = torch.nn.Identity()
+    following, hidden = torch.randn(2, 1, 9, 64)
+    positions = torch.arange(9)
+    x = drafter.fc(torch.cat([following, hidden], -1))
+    mask = torch.full((9, 9), -torch.inf).triu(1)[None, None]
+    turned = LlamaRotaryEmbedding(config)(x, positions[None])
+    out = layer(x, attention_mask=mask, position_ids=positions[None], position_embeddings=turned)
+    wanted = out[0] if isinstance(out, tuple) else out
+    torch.testing.assert_close(drafter(following, hidden, positions), wanted.view(1, 9, 64), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("convention", [KERV, TEXT, PROMPT, Convention("text", "prompt")])
+@pytest.mark.parametrize("top_k", [1, 3])
+def test_decoding_with_it_is_lossless_under_every_convention(
+    target: OpenVLATarget, drafter: PublicDrafter, convention: Convention, top_k: int
+) -> None:
+    own = with_convention(drafter, convention)
+    for seed in (100, 101):
+        with torch.inference_mode():
+            prompt = target.encode(shown(seed))
+            truth = plain_greedy(target, prompt)
+        assert decode(target, DrafterProposer(own, target, 5, top_k, 16), prompt).tokens == truth
+
+
+def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter: PublicDrafter) -> None:
+    own = with_convention(drafter, PROMPT)
+    following, hidden = torch.randn(2, 1, 12, 64)
+    outputs = []
+    for _ in range(2):
+        cache = own.new_cache(1, 20)
+        own(following[:, :10], hidden[:, :10], torch.arange(10), cache)
+        outputs.append(own(following[:, 11:], hidden[:, 11:], torch.tensor([11]), cache))
+        hidden[:, 9] += 1  # the last prompt position: its key is the first that is hidden
+    torch.testing.assert_close(outputs[0], outputs[1])
+
+
+def test_it_is_imported_beside_its_target(
+    results: Path, target: OpenVLATarget, drafter: PublicDrafter, tmp_path: Path
+) -> None:
+    folder = written(tmp_path / "eagle", drafter, target.model.language_model.model.embed_tokens.weight)
+    words = [f"checkpoint={folder}", "policy.target=openvla", f"results={results}"]
+    assert kerv("build", "drafter", *words, "positions=text")[0] == 0
+    description = json.loads((results / "artifacts/drafter/openvla/drafter.json").read_text())
+    assert description["public"]["convention"] == {"positions": "text", "mask": "causal"}
+    own, _ = load_drafter(results / "artifacts/drafter/openvla", target, description["target"])
+    assert (own.draft_position(40), drafter.draft_position(40)) == (24, 40)
+    for name, tensor in own.state_dict().items():
+        torch.testing.assert_close(tensor, drafter.state_dict()[name])
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        ("rename", "1 missing: fc.weight; 1 unknown: fx.weight"),
+        ("width", "the drafter in"),
+        ("pickle", "is pickled and can run code when it is opened: convert it"),
+        ("convention", "unknown positions 'whole': known: sequence, text"),
+        ("nothing", "checkpoint=DIR"),
+    ],
+)
+def test_a_drafter_that_does_not_fit_is_refused_in_one_line(
+    results: Path, target: OpenVLATarget, drafter: PublicDrafter, tmp_path: Path, harm: str, said: str
+) -> None:
+    folder = written(tmp_path / "eagle", drafter, torch.zeros(704, 64))
+    words = [f"checkpoint={folder}"]
+    if harm == "rename":
+        tensors = load_file(folder / "model.safetensors")
+        save_file(
+            {("fx.weight" if k == "fc.weight" else k): v.clone() for k, v in tensors.items()},
+            folder / "model.safetensors",
+        )
+    elif harm == "width":
+        (folder / "config.json").write_text(json.dumps({**asdict(LANGUAGE), "hidden_size": 128}))
+    elif harm == "pickle":
+        (folder / "model.safetensors").unlink()
+        torch.save({}, folder / "pytorch_model.bin")
+    elif harm == "convention":
+        words.append("positions=whole")
+    else:
+        words = []
+    code, line = kerv("build", "drafter", *words, "policy.target=openvla", f"results={results}")
+    assert code in (1, 2)
+    assert said in line
