@@ -235,8 +235,10 @@ class TrainDrafterSettings(RunSettings):
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """`kerv doctor`."""
+    """`kerv doctor`. With a target or an environment it checks that alone."""
 
+    policy: PolicySettings = field(default_factory=lambda: PolicySettings(target=""))  # target=NAME says policy.target
+    environment: str | None = None
     seed: int = EVALUATION_SEED
     world: WorldSettings = field(default_factory=WorldSettings)
 

@@ -2,37 +2,73 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import typer
 
 from kerv_cli.commands.common import Overrides, ShowConfig, composed, edge, print_table
+from kerv_cli.findings import Finding
 
 if TYPE_CHECKING:
     from kerv_cli.environments.spec import EnvironmentSpec
     from kerv_cli.settings import DoctorSettings
 
 
-@dataclass(frozen=True)
-class Finding:
-    """The result of one check."""
-
-    what: str
-    ok: bool
-    says: str
-
-
 @edge
 def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
-    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing."""
+    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
+    target=NAME or environment=NAME: whether that keeps its protocol."""
     from kerv_cli.settings import DoctorSettings
 
-    settings = composed("doctor", overrides, DoctorSettings, cfg)
-    findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
+    # here target=NAME is a policy's folder; to Hydra it would be a choice among the files of conf/target
+    words = [f"policy.{o}" if o.startswith("target=") else o for o in overrides or []]
+    settings = composed("doctor", words, DoctorSettings, cfg)
+    if settings.policy.target or settings.environment:
+        findings = [*_target(settings), *_environment(settings)]
+    else:
+        findings = _machine(settings)
     print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
     if not all(finding.ok for finding in findings):
         raise typer.Exit(1)
+
+
+def _machine(settings: DoctorSettings) -> list[Finding]:
+    return [_versions(), *_rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
+
+
+def _target(settings: DoctorSettings) -> list[Finding]:
+    """Whether the target keeps the protocol, on an observation of noise."""
+    if not settings.policy.target:
+        return []
+    import numpy as np
+
+    from kerv_cli.artifacts import Artifacts
+    from kerv_cli.runtime import set_up
+    from kerv_cli.spaces import Observation
+    from kerv_cli.targets.conformance import check_target
+
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    described, random = artifacts.description, np.random.default_rng(settings.seed)
+    size, space = int(described.settings.get("image_size", settings.world.camera.size)), described.observation
+    images = {name: random.integers(0, 256, (size, size, 3), dtype=np.uint8) for name in described.cameras}
+    state = random.normal(size=space.state)
+    words = " ".join(described.words[:3]) or "move"
+    return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))
+
+
+def _environment(settings: DoctorSettings) -> list[Finding]:
+    """Whether the environment keeps the protocol, on its first task."""
+    if not settings.environment:
+        return []
+    from kerv_cli.environments import specs
+    from kerv_cli.environments.conformance import check_environment
+    from kerv_cli.errors import UnknownName
+
+    known = specs()
+    if settings.environment not in known:
+        raise UnknownName("environment", settings.environment, known)
+    return check_environment(known[settings.environment], settings.seed)
 
 
 def _versions() -> Finding:

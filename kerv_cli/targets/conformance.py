@@ -1,0 +1,275 @@
+"""Does a target keep the protocol? Checks that need nothing but the target and one observation of its kind.
+
+They are what speculative decoding relies on: a token's hidden state depends on what it sees alone, however the tokens
+are cut into forwards. `kerv doctor target=NAME` runs them on a folder, `check_target` on any object.
+
+Shapes: P prompt tokens, T tokens, E width, V action tokens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.findings import Failed, Finding, run
+from kerv_cli.spaces import ActionSpace, Observation
+from kerv_cli.targets.protocol import Target
+
+TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
+"""Largest difference of logits relative to their spread, by number format: products are summed in other orders."""
+MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
+METHODS = ("encode", "embed", "new_cache", "forward", "head")
+TREE = (-1, 0, 0, 1, 1, 2, 4)
+"""A draft tree: every node's parent, −1 for the token before them."""
+
+
+@torch.inference_mode()
+def check_target(target: Target, observation: Observation, seed: int = 0) -> list[Finding]:
+    """One finding per check. observation: one that the target can encode."""
+    found = run([("members", lambda: _members(target))])
+    if not found[0].ok:
+        return found
+    trial = Trial(target, observation, seed)
+    found += run([("encode", trial.encode), ("embed and head", trial.embed_and_head)])
+    if not all(finding.ok for finding in found):
+        return found
+    checks: list[tuple[str, Callable[[], str]]] = [
+        ("causality", trial.causality),
+        ("cache, token by token", trial.token_by_token),
+        ("cache, several tokens", trial.several_tokens),
+        ("tree attention", trial.tree),
+        ("commit of a path", trial.commit),
+        ("draft in the prefill", trial.prefill_draft),
+        ("cache used again", trial.again),
+        ("batch", trial.batch),
+        ("greedy chunk", trial.chunk),
+    ]
+    return found + run(checks)
+
+
+def _members(target: Any) -> str:
+    missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(target, name)]
+    if missing:
+        raise Failed(f"{type(target).__name__} lacks {', '.join(missing)} (kerv_cli/targets/protocol.py)")
+    if not isinstance(target.actions, ActionSpace):
+        raise Failed(f"actions is {type(target.actions).__name__}, an ActionSpace is wanted")
+    if target.chunk < 1 or target.width < 1 or target.max_prompt < 1:
+        raise Failed(f"chunk {target.chunk}, width {target.width}, max_prompt {target.max_prompt}: at least 1 each")
+    if isinstance(target.cameras, str):
+        raise Failed(f"cameras is the text '{target.cameras}', a tuple of names is wanted")
+    size = target.chunk * target.actions.dofs
+    return (
+        f"{type(target).__name__}: D={target.actions.dofs}, N={size}, {target.actions.tokens} tokens, E={target.width}"
+    )
+
+
+@dataclass
+class Trial:
+    """One observation's checks. Every check compares with `plain`: one causal forward without a cache."""
+
+    target: Target
+    observation: Observation
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.worst = 0.0
+        self.random = torch.Generator().manual_seed(self.seed)
+        size = max(len(TREE), self.target.chunk * self.target.actions.dofs) + 2
+        self.capacity = self.target.max_prompt + size + len(TREE)
+
+    def encode(self) -> str:
+        """The prompt: shape, length, finite, the same twice."""
+        prompt = self.target.encode(self.observation)
+        if prompt.ndim != 3 or len(prompt) != 1 or prompt.shape[2] != self.target.width:
+            raise Failed(f"encode gives {tuple(prompt.shape)}, (1, P, {self.target.width}) is wanted")
+        if not 1 <= prompt.shape[1] <= self.target.max_prompt:
+            raise Failed(f"a prompt of {prompt.shape[1]} tokens, max_prompt is {self.target.max_prompt}")
+        if not torch.isfinite(prompt).all():
+            raise Failed("the prompt holds numbers that are not finite")
+        if not torch.equal(prompt, self.target.encode(self.observation)):
+            raise Failed("the same observation gives another prompt the second time: a module is in training mode?")
+        self.prompt = prompt
+        self.tokens = torch.randint(self.target.actions.tokens, (1, 9), generator=self.random).to(prompt.device)
+        return f"P={prompt.shape[1]} of at most {self.target.max_prompt}, {str(prompt.dtype).removeprefix('torch.')}"
+
+    def embed_and_head(self) -> str:
+        """Shapes and formats of `embed`, `forward` and `head`, for the first and the last token."""
+        width, count = self.target.width, self.target.actions.tokens
+        tokens = torch.tensor([[0, count - 1]], device=self.prompt.device)
+        embedded = self.target.embed(tokens)
+        if embedded.shape != (1, 2, width) or embedded.dtype != self.prompt.dtype:
+            raise Failed(
+                f"embed gives {tuple(embedded.shape)} {embedded.dtype}, (1, 2, {width}) {self.prompt.dtype} wanted"
+            )
+        hidden = self.plain(self.tokens)
+        if hidden.shape != (1, self.prompt.shape[1] + 9, width):
+            raise Failed(f"forward of (1, {self.prompt.shape[1] + 9}, {width}) gives {tuple(hidden.shape)}")
+        logits = self.target.head(hidden)
+        if logits.shape != (*hidden.shape[:-1], count) or not torch.isfinite(logits).all():
+            raise Failed(f"head gives {tuple(logits.shape)}, finite (1, T, {count}) are wanted")
+        return f"{count} action tokens"
+
+    def plain(self, tokens: Tensor) -> Tensor:
+        """Hidden states (1, P + T, E) of prompt and tokens (1, T), forwarded at once without a cache."""
+        x = torch.cat([self.prompt, self.target.embed(tokens)], 1) if tokens.shape[1] else self.prompt
+        return self.target.forward(x, torch.arange(x.shape[1], device=x.device))
+
+    def same(self, got: Tensor, wanted: Tensor, what: str) -> None:
+        """Compares hidden states (…, E) by their logits.
+
+        Raises:
+            Failed: they differ by more than rounding.
+        """
+        a, b = self.target.head(got).double(), self.target.head(wanted).double()
+        gap = float((a - b).abs().max() / b.std().clamp_min(1e-9))
+        self.worst = max(self.worst, gap)
+        if not gap <= TOLERANCE.get(self.prompt.dtype, 2e-4):
+            raise Failed(f"{what}: logits differ by {gap:.2g} of their spread, rounding explains less")
+
+    def says(self) -> str:
+        """The largest difference so far."""
+        return f"logits within {self.worst:.1g} of their spread"
+
+    def causality(self) -> str:
+        """A token must not see what comes after it."""
+        length = self.prompt.shape[1]
+        whole = self.plain(self.tokens)
+        self.same(self.plain(self.tokens[:, :4])[:, : length + 4], whole[:, : length + 4], "a token sees later ones")
+        return self.says()
+
+    def cached(self, cuts: Sequence[int]) -> tuple[Any, list[Tensor]]:
+        """Prompt, then the tokens in pieces of these lengths -> the cache and the pieces' hidden states."""
+        cache, length = self.target.new_cache(1, self.capacity), self.prompt.shape[1]
+        if cache.capacity < self.capacity or cache.length:
+            raise Failed(f"new_cache(1, {self.capacity}) has capacity {cache.capacity} and length {cache.length}")
+        self.target.forward(self.prompt, torch.arange(length, device=self.prompt.device), cache)
+        if cache.length != length:
+            raise Failed(f"the cache has length {cache.length} after a prompt of {length} tokens")
+        hidden, first = [], 0
+        for cut in cuts:
+            positions = torch.arange(length + first, length + first + cut, device=self.prompt.device)
+            piece = self.target.embed(self.tokens[:, first : first + cut])
+            hidden.append(self.target.forward(piece, positions, cache))
+            first += cut
+        return cache, hidden
+
+    def token_by_token(self) -> str:
+        """Autoregressive decoding equals one forward."""
+        _, hidden = self.cached([1] * 6)
+        self.same(torch.cat(hidden, 1), self.plain(self.tokens[:, :6])[:, -6:], "token by token behind a cache")
+        return self.says()
+
+    def several_tokens(self) -> str:
+        """A chain behind a cache, as one forward verifies it."""
+        _, hidden = self.cached([1, 5, 3])
+        self.same(torch.cat(hidden, 1), self.plain(self.tokens)[:, -9:], "several tokens behind a cache")
+        return self.says()
+
+    def grown(self, cache: Any, start: int, before: int) -> tuple[Tensor, Tensor]:
+        """Forwards the token at `start` and a tree behind it -> the tree's tokens (1, n), hidden (1, 1 + n, E). before:
+        tokens that were forwarded."""
+        drafted = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random).to(
+            self.prompt.device
+        )
+        seen = np.eye(1 + len(TREE), dtype=bool)
+        depths = []
+        for node, parent in enumerate(TREE):
+            seen[node + 1] |= seen[parent + 1]
+            depths.append(0 if parent < 0 else depths[parent] + 1)
+        at = self.prompt.shape[1] + before
+        positions = torch.tensor([at, *(at + 1 + depth for depth in depths)], device=self.prompt.device)
+        x = self.target.embed(torch.cat([self.tokens[:, start : start + 1], drafted], 1))
+        return drafted, self.target.forward(x, positions, cache, seen)
+
+    def path(self, node: int) -> list[int]:
+        """Nodes from the root to `node`."""
+        return [*(self.path(TREE[node]) if TREE[node] >= 0 else []), node]
+
+    def tree(self) -> str:
+        """Every node of a tree equals the last token of its own path, forwarded alone."""
+        cache, _ = self.cached([1, 1])
+        drafted, hidden = self.grown(cache, 2, 2)
+        for node in range(len(TREE)):
+            own = torch.cat([self.tokens[:, :3], drafted[:, self.path(node)]], 1)
+            self.same(
+                hidden[:, node + 1], self.plain(own)[:, -1], f"node {node} of a tree sees others than its ancestors"
+            )
+        return self.says()
+
+    def commit(self) -> str:
+        """A path is kept and decoding goes on behind it."""
+        cache, _ = self.cached([1, 1])
+        drafted, _ = self.grown(cache, 2, 2)
+        kept = self.path(6)
+        start = self.prompt.shape[1] + 2
+        slots = torch.tensor([start, *(start + 1 + node for node in kept)], device=self.prompt.device)
+        cache.compact(start, slots)
+        if cache.length != start + 1 + len(kept):
+            raise Failed(f"compact({start}, {len(slots)} slots) leaves length {cache.length}, not {start + len(slots)}")
+        position = torch.tensor([cache.length], device=self.prompt.device)
+        hidden = self.target.forward(self.target.embed(self.tokens[:, 3:4]), position, cache)
+        own = torch.cat([self.tokens[:, :3], drafted[:, kept], self.tokens[:, 3:4]], 1)
+        self.same(hidden, self.plain(own)[:, -1:], "a token behind a committed path")
+        return self.says()
+
+    def prefill_draft(self) -> str:
+        """Prompt and a tree in one forward, as methods that draft before the prefill do."""
+        length, seen = self.prompt.shape[1], np.zeros((self.prompt.shape[1] + len(TREE),) * 2, dtype=bool)
+        seen[:length, :length] = np.tri(length, dtype=bool)
+        seen[length:, :length] = True
+        depths: list[int] = []
+        for node, parent in enumerate(TREE):
+            seen[length + node, [length + a for a in self.path(node)]] = True
+            depths.append(0 if parent < 0 else depths[parent] + 1)
+        drafted = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random).to(
+            self.prompt.device
+        )
+        positions = torch.tensor([*range(length), *(length + d for d in depths)], device=self.prompt.device)
+        x = torch.cat([self.prompt, self.target.embed(drafted)], 1)
+        hidden = self.target.forward(x, positions, self.target.new_cache(1, self.capacity), seen)
+        for node in (1, 3, 6):
+            wanted = self.plain(drafted[:, self.path(node)])[:, -1]
+            self.same(hidden[:, length + node], wanted, f"node {node} of a tree in the prefill")
+        return self.says()
+
+    def again(self) -> str:
+        """A cache that is set back to length 0 holds nothing of before."""
+        cache, _ = self.cached([5])
+        cache.length = 0
+        positions = torch.arange(self.prompt.shape[1], device=self.prompt.device)
+        self.same(self.target.forward(self.prompt, positions, cache), self.plain(self.tokens[:, :0]), "a reused cache")
+        return self.says()
+
+    def batch(self) -> str:
+        """Two prompts at once, as training a drafter does."""
+        prompts = torch.cat([self.prompt, self.prompt.flip(1)])
+        positions = torch.arange(prompts.shape[1], device=prompts.device)
+        hidden = self.target.forward(prompts, positions, self.target.new_cache(2, self.capacity))
+        for row in range(2):
+            self.same(hidden[row : row + 1], self.target.forward(prompts[row : row + 1], positions), "a batch of two")
+        return self.says()
+
+    def chunk(self) -> str:
+        """Greedy decoding with a cache gives the tokens of greedy decoding without."""
+        size, device = self.target.chunk * self.target.actions.dofs, self.prompt.device
+        tokens = torch.zeros(1, 0, dtype=torch.long, device=device)
+        for _ in range(size):
+            tokens = torch.cat([tokens, self.target.head(self.plain(tokens)[:, -1]).argmax(-1)[None]], 1)
+        cache, length = self.target.new_cache(1, self.capacity), self.prompt.shape[1]
+        hidden = self.target.forward(self.prompt, torch.arange(length, device=device), cache)
+        decoded = [int(self.target.head(hidden[0, -1]).argmax())]
+        while len(decoded) < size:
+            position = torch.tensor([length + len(decoded) - 1], device=device)
+            hidden = self.target.forward(
+                self.target.embed(torch.tensor([decoded[-1:]], device=device)), position, cache
+            )
+            decoded.append(int(self.target.head(hidden[0, -1]).argmax()))
+        if decoded != tokens[0].tolist() and self.prompt.dtype in (torch.float32, torch.float64):
+            raise Failed(f"greedy decoding gives {decoded} with a cache and {tokens[0].tolist()} without")
+        values = self.target.actions.decode(np.array(decoded).reshape(-1, self.target.actions.dofs))
+        return f"{size} tokens, the first action {np.array2string(values[0], precision=3)}"

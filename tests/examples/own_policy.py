@@ -1,0 +1,74 @@
+"""Example: plug in a policy that has no cache. It stands for any model that can be called with embeddings, positions
+and a mask; the cache stores what was forwarded and every forward computes all of it anew. Slow, but every method runs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from examples.own_target import SEVEN
+from torch import Tensor
+
+from kerv_cli.registry import Part, register
+from kerv_cli.spaces import ActionSpace, Observation
+
+
+class Remembered:
+    """What was forwarded: embeddings (B, capacity, E), positions and who sees whom."""
+
+    def __init__(self, batch: int, capacity: int, width: int) -> None:
+        self.x, self.positions = torch.zeros(batch, capacity, width), torch.zeros(capacity, dtype=torch.long)
+        self.seen, self.length, self.capacity = np.zeros((capacity, capacity), dtype=bool), 0, capacity
+
+    def compact(self, start: int, slots: Tensor) -> None:
+        self.length = start + len(slots)
+        self.x[:, start : self.length], self.positions[start : self.length] = self.x[:, slots], self.positions[slots]
+        self.seen[start : self.length] = np.tri(self.capacity, dtype=bool)[start : self.length]
+
+
+class OwnPolicy:
+    """The `Target` protocol around a model. Here: one layer of attention with random weights."""
+
+    cameras, max_prompt, device, chunk, width = (), 16, torch.device("cpu"), 1, 32
+
+    def __init__(self, actions: ActionSpace = SEVEN) -> None:
+        random = torch.Generator().manual_seed(0)
+        self.actions = actions
+        self.table, self.rows = (torch.randn(actions.tokens, self.width, generator=random) for _ in range(2))
+        self.turn = torch.randn(self.width, generator=random)
+
+    def model(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        """x (B, T, E), positions (T,), mask (T, T) bool -> (B, T, E). Yours instead."""
+        placed = x + torch.outer(positions.float(), self.turn).sin()
+        return torch.nn.functional.scaled_dot_product_attention(placed, placed, x, attn_mask=mask, scale=0.05) + x
+
+    def encode(self, observation: Observation) -> Tensor:
+        felt = torch.tensor([float(np.sum(observation.proprioception)), *map(len, observation.instruction.split())])
+        return torch.outer(felt[: self.max_prompt] + 1, self.turn).cos()[None]
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        return self.table[tokens]
+
+    def new_cache(self, batch: int, capacity: int) -> Remembered:
+        return Remembered(batch, capacity, self.width)
+
+    def forward(
+        self, x: Tensor, positions: Tensor, cache: Remembered | None = None, seen: np.ndarray | None = None
+    ) -> Tensor:
+        cache = cache or self.new_cache(len(x), x.shape[1])
+        start, stop = cache.length, cache.length + x.shape[1]
+        cache.x[:, start:stop], cache.positions[start:stop], cache.length = x, positions, stop
+        cache.seen[start:stop, :start] = True  # every new token sees all that was committed
+        cache.seen[start:stop, start:stop] = np.tri(stop - start, dtype=bool) if seen is None else seen
+        mask = torch.from_numpy(cache.seen[:stop, :stop])
+        return self.model(cache.x[:, :stop], cache.positions[:stop], mask)[:, start:]
+
+    def head(self, hidden: Tensor) -> Tensor:
+        return hidden @ self.rows.T
+
+
+def build(folder: object, description: object, device: str, dtype: torch.dtype) -> OwnPolicy:
+    return OwnPolicy()
+
+
+register(Part("target", "own", "examples.own_policy:build"))
