@@ -6,7 +6,7 @@ import os
 
 import typer
 
-from kerv_cli.commands import bench, build, calibrate, demos, doctor, report, rollout, sweep, train, view
+from kerv_cli.commands import bench, build, calibrate, demos, doctor, report, rollout, serve, sweep, train, view
 
 # Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -26,6 +26,7 @@ app.add_typer(build.app, name="build")
 app.command("calibrate")(calibrate.calibrate)
 app.command("rollout")(rollout.rollout)
 app.command("sweep")(sweep.sweep)
+app.command("serve")(serve.serve)
 app.command("report")(report.report)
 app.command("view")(view.view)
 app.command("bench")(bench.bench)

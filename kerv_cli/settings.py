@@ -119,6 +119,33 @@ class RolloutSettings(TaskSettings):
 
 
 @dataclass
+class ServeSettings(RunSettings):
+    """`kerv serve`: a policy and a method, as in `kerv rollout`, for a client over websockets (docs/serving.md)."""
+
+    host: str = "127.0.0.1"  # nobody but this machine; there is no password
+    port: int = 8000  # 0: a free one
+    max_mb: int = 16  # largest message, MiB
+    log_every: int = 100  # answers between two lines of latencies; 0: only at the end of a connection
+    gripper: str = "as_is"  # as_is | signed | signed_inverted: how strict DoFs (0 closed to 1 open) are sent
+    task_name: str = ""  # task=NAME: the task, for parts whose levels differ between tasks
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    method: str = "ar"
+    prefill_draft: Any = field(default_factory=NoSettings)
+    proposer: Any = field(default_factory=NoSettings)
+    acceptance: Any = field(default_factory=lambda: NoSettings("strict"))
+    threshold: Any = field(default_factory=parts.FixedThresholdSettings)
+    rectifier: Any = field(default_factory=lambda: NoSettings("reinfer"))
+    boundary: Any = field(default_factory=lambda: NoSettings("always"))
+    skip: Any = field(default_factory=NoSettings)
+    chunk: int = 0
+    datastore: Any = field(default_factory=lambda: NoSettings("exact"))
+
+    def parts(self) -> dict[str, Any]:
+        """Kind -> settings, for every part of the method."""
+        return {kind: getattr(self, kind) for kind in parts.METHOD_KINDS}
+
+
+@dataclass
 class StudySettings:
     """`conf/study/*.yaml`: which settings are compared."""
 

@@ -177,7 +177,7 @@ class Trial:
             self.prompt.device
         )
         seen = np.eye(1 + len(TREE), dtype=bool)
-        depths = []
+        depths: list[int] = []
         for node, parent in enumerate(TREE):
             seen[node + 1] |= seen[parent + 1]
             depths.append(0 if parent < 0 else depths[parent] + 1)

@@ -1,0 +1,57 @@
+"""The served policy from its settings: interface and decoder, warmed up."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.decoding.build import check, compose, needs
+from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.runtime import set_up
+from kerv_cli.serving.session import GRIPPERS, Interface, Session
+from kerv_cli.settings import ServeSettings
+
+WARM_UP = 4  # decodes
+
+
+def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
+    """The policy's interface and its decoder; everything that may be wrong is found before the first client.
+
+    Raises:
+        UsageError: numbers out of range, parts that do not belong together. CheckpointError: no such policy, or an
+            artifact of another.
+    """
+    if settings.gripper not in GRIPPERS:
+        raise UnknownName("gripper", settings.gripper, GRIPPERS)
+    if not 0 <= settings.port < 2**16 or settings.max_mb < 1 or settings.log_every < 0:
+        numbers = f"port={settings.port} max_mb={settings.max_mb} log_every={settings.log_every}"
+        raise UsageError(f"{numbers}: a port is 0 to 65535, max_mb at least 1, log_every 0 or more")
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
+    described, method = artifacts.description, settings.parts()
+    check(method, settings.chunk, described.chunk)
+    artifacts.check(needs(method))
+    decoder = compose(method, artifacts.target, artifacts.load, settings.task_name, settings.chunk)
+    interface = Interface(
+        name=settings.policy.target,
+        method=settings.method,
+        actions=described.actions,
+        observation=described.observation,
+        cameras=tuple(described.cameras),
+        size=int(described.settings.get("image_size", 0)) if described.cameras else 0,
+        privileged=not described.cameras and described.observation.state > 0,
+        gripper=settings.gripper,
+        task=settings.task_name,
+    )
+    warm_up(interface, decoder)
+    return interface, decoder
+
+
+def warm_up(interface: Interface, decoder: Decoder) -> None:
+    """Answers a few observations of zeros: first calls allocate memory and choose kernels."""
+    session = Session(interface, decoder)
+    images = {f"observation/{c}": np.zeros((interface.size, interface.size, 3), np.uint8) for c in interface.cameras}
+    message = {**images, "observation/state": np.zeros(interface.observation.state), "prompt": ""}
+    for _ in range(WARM_UP):
+        session.answer(message)

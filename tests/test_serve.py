@@ -1,0 +1,292 @@
+"""`kerv serve`: the protocol spoken by a minimal client of our own, bad clients, and the same actions as in process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from kerv_cli.app import app
+from kerv_cli.artifacts import Artifacts
+from kerv_cli.config import compose as compose_settings
+from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.serving.policy import served
+from kerv_cli.serving.server import PolicyServer
+from kerv_cli.serving.session import Interface, Session
+from kerv_cli.serving.wire import packed, unpacked
+from kerv_cli.settings import PolicySettings, ServeSettings
+from kerv_cli.spaces import Observation
+
+
+def encoded(value: Any) -> Any:
+    """An array as the documented protocol writes it, independent of kerv's own code."""
+    if isinstance(value, np.ndarray):
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": list(value.shape)}
+    raise TypeError
+
+
+def decoded(value: dict[Any, Any]) -> Any:
+    if value.get(b"__ndarray__"):
+        return np.frombuffer(value[b"data"], value[b"dtype"]).reshape(value[b"shape"])
+    return value
+
+
+class Client:
+    """Speaks the protocol and nothing else."""
+
+    def __init__(self, port: int) -> None:
+        self.connection = connect(f"ws://127.0.0.1:{port}", compression=None, max_size=None).__enter__()
+        self.metadata = msgpack.unpackb(self.connection.recv(), object_hook=decoded)
+
+    def infer(self, observation: dict[str, Any]) -> dict[str, Any]:
+        return self.send(msgpack.packb(observation, default=encoded))
+
+    def send(self, frame: Any) -> dict[str, Any]:
+        self.connection.send(frame)
+        answer = self.connection.recv()
+        if isinstance(answer, str):
+            raise RuntimeError(answer)
+        return msgpack.unpackb(answer, object_hook=decoded)  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="module")
+def policy(policies: Path) -> tuple[Interface, Decoder]:
+    words = ["policy.target=nano-vision", f"results={policies}", "method=naive_sd"]
+    return served(compose_settings("serve", words, ServeSettings))
+
+
+@contextmanager
+def serving(policy: tuple[Interface, Decoder], **chosen: Any) -> Iterator[tuple[int, list[str]]]:
+    """The port of a server that runs in a thread, and its log."""
+    log: list[str] = []
+    with PolicyServer(*policy, log.append, **chosen).listening("127.0.0.1", 0) as listening:
+        thread = threading.Thread(target=listening.serve_forever)
+        thread.start()
+        yield listening.socket.getsockname()[1], log
+        listening.shutdown()
+        thread.join(5)
+
+
+def seen(seed: int, **changes: Any) -> dict[str, Any]:
+    random = np.random.default_rng(seed)
+    image = random.integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    return {
+        "observation/image": image,
+        "observation/state": random.normal(size=4),
+        "prompt": "open a drawer",
+        **changes,
+    }
+
+
+def until(condition: Any) -> None:
+    """Waits at most 5 s."""
+    for _ in range(500):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError("waited in vain")
+
+
+def test_a_client_gets_the_actions_of_the_policy(policy: tuple[Interface, Decoder], policies: Path) -> None:
+    target: Any = Artifacts(str(policies), PolicySettings(target="nano-vision")).target
+    with serving(policy, every=2) as (port, log):
+        client = Client(port)
+        assert client.metadata["cameras"] == list(target.cameras)
+        assert client.metadata["actions"] == ["dx", "dy", "dz", "gripper"]
+        for seed in range(3):
+            message = seen(seed)
+            answer = client.infer(message)
+            felt = message["observation/state"]
+            state = np.concatenate([felt, np.zeros(35)])
+            observation = Observation(felt, state, "open a drawer", {target.cameras[0]: message["observation/image"]})
+            np.testing.assert_allclose(answer["actions"], Decoder(target).decode(observation).actions)
+            assert answer["server_timing"]["infer_ms"] > 0
+        client.connection.close()
+        until(lambda: any("disconnected; 3 answers" in line for line in log))
+        assert any(line.startswith("2 answers, decode p50") for line in log)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"observation/image": np.zeros((64, 64, 3), np.uint8)}, "(64, 64, 3) uint8, (96, 96, 3) uint8 is wanted"),
+        ({"observation/image": np.zeros((96, 96, 3), np.float32)}, "(96, 96, 3) float32"),
+        ({"observation/image": "cat"}, "observation/image is str"),
+        ({"observation/state": np.array([0, np.nan, 0, 0])}, "not finite, at [1]"),
+        ({"observation/state": np.zeros(5)}, "has shape (5,), 4 or 39 numbers are wanted"),
+        ({"observation/state": ["a"]}, "does not hold numbers"),
+        ({"prompt": 3}, "prompt is int"),
+        ({"prompt": "word " * 40}, "has 40 words, the policy takes 10"),
+        ({"executed": 99}, "executed=99: 0 to"),
+    ],
+)
+def test_a_wrong_observation_gets_an_error_frame_and_the_next_one_an_answer(
+    policy: tuple[Interface, Decoder], changes: dict[str, Any], said: str
+) -> None:
+    with serving(policy) as (port, log):
+        client = Client(port)
+        client.infer(seen(0))
+        with pytest.raises(RuntimeError, match=r"^kerv: ") as refused:
+            client.infer(seen(0, **changes))
+        assert said in str(refused.value)
+        assert "\n" not in str(refused.value)
+        assert any(said in line for line in log)
+        assert client.infer(seen(0))["actions"].shape == (4, 4)
+
+
+BOMB = {b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [2**40]}
+
+
+@pytest.mark.parametrize(
+    ("frame", "said"),
+    [
+        (b"\xc1garbage", "cannot be read as msgpack"),
+        (b"", "cannot be read as msgpack"),
+        ("text", "a text frame came"),
+        (msgpack.packb([1, 2]), "the message is a list"),
+        (msgpack.packb({"observation/image": BOMB}), "does not fit its bytes"),
+        (msgpack.packb({"x": {**BOMB, b"dtype": "|O"}}), "booleans, integers and floats are accepted"),
+        (msgpack.packb({"x": {**BOMB, b"shape": [-1]}}), "at most 8 whole numbers"),
+        (msgpack.packb({}), "or observation/image is wanted, the message has nothing"),
+    ],
+)
+def test_garbage_gets_an_error_frame_and_the_server_goes_on(
+    policy: tuple[Interface, Decoder], frame: bytes | str, said: str
+) -> None:
+    with serving(policy) as (port, _):
+        client = Client(port)
+        with pytest.raises(RuntimeError) as refused:
+            client.send(frame)
+        assert said in str(refused.value)
+        assert client.infer(seen(1))["actions"].shape == (4, 4)
+
+
+def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: tuple[Interface, Decoder]) -> None:
+    with serving(policy, megabytes=1) as (port, log):
+        client = Client(port)
+        raw: socket.socket = client.connection.socket
+        raw.sendall(b"\x82\xfe\xff\xff")  # the beginning of a frame of 65535 bytes
+        raw.shutdown(socket.SHUT_RDWR)
+        until(lambda: any("disconnected" in line for line in log))
+        large = Client(port)
+        with pytest.raises(ConnectionClosed):
+            large.send(bytes(2**21))  # more than a MiB
+        until(lambda: sum("disconnected" in line for line in log) == 2)
+        assert Client(port).infer(seen(1))["actions"].shape == (4, 4)
+
+
+def test_one_client_at_a_time(policy: tuple[Interface, Decoder]) -> None:
+    with serving(policy) as (port, _):
+        first = Client(port)
+        with pytest.raises(ConnectionClosed, match="another client is being served"):
+            Client(port)
+        assert first.infer(seen(2))["actions"].shape == (4, 4)
+        first.connection.close()
+        until(lambda: _accepted(port))
+
+
+def _accepted(port: int) -> bool:
+    try:
+        Client(port).connection.close()
+    except ConnectionClosed:
+        return False
+    return True
+
+
+class Watching(Decoder):
+    """Notes what it is told between decodes."""
+
+    told: list[tuple[np.ndarray, np.ndarray]]
+    resets = 0
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        self.told = []
+        self.resets += 1
+        super().reset(task, seed, end_effector)
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        self.told.append((action, end_effector))
+        super().observe(action, end_effector)
+
+
+def test_the_decoder_is_told_what_was_executed(policy: tuple[Interface, Decoder]) -> None:
+    decoder = Watching(policy[1].target)
+    session = Session(policy[0], decoder)
+    first = session.answer(seen(0))["actions"]
+    session.answer(seen(1, executed=2))
+    assert len(decoder.told) == 2
+    np.testing.assert_allclose([action for action, _ in decoder.told], first[:2], atol=1e-6)
+    start, end = (seen(seed)["observation/state"][:3] for seed in (0, 1))
+    np.testing.assert_allclose([at for _, at in decoder.told], [(start + end) / 2, end])
+    session.answer(seen(2))
+    assert len(decoder.told) == 6
+    session.answer(seen(3, reset=True))
+    assert decoder.told == []
+    assert decoder.resets == 2
+
+
+@pytest.mark.parametrize(
+    ("gripper", "values"), [("as_is", [0.1, 0.9]), ("signed", [-1, 1]), ("signed_inverted", [1, -1])]
+)
+def test_grippers(policy: tuple[Interface, Decoder], gripper: str, values: list[float]) -> None:
+    from dataclasses import replace
+
+    made = replace(policy[0], gripper=gripper).sent(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
+    np.testing.assert_allclose(made[:, 3], values)
+    np.testing.assert_allclose(made[:, 0], [0.3, 0])
+
+
+def test_messages_survive_the_way_there_and_back() -> None:
+    message = {"a": np.arange(6, dtype=np.int16).reshape(2, 3), "b": [1.5, "x", None, True], "c": np.float32(2)}
+    back = unpacked(packed(message))
+    np.testing.assert_array_equal(back["a"], message["a"])
+    assert (back["b"], back["c"], back["a"].dtype) == (message["b"], 2.0, np.int16)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["gripper=loose"], "unknown gripper 'loose'"),
+        (["port=70000"], "port=70000"),
+        (["policy.target=nobody"], "no target 'nobody'"),
+        (["method=one_pass"], "no early drafter in"),
+        (["host=256.1.1.1", "port=0"], "cannot listen on 256.1.1.1:0"),
+    ],
+)
+def test_a_server_that_cannot_start_says_so(policies: Path, words: list[str], said: str) -> None:
+    run = CliRunner().invoke(app, ["serve", "policy.target=nano-vision", f"results={policies}", *words])
+    assert run.exit_code in (1, 2)
+    assert said in run.output
+
+
+def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path) -> None:
+    words = ["serve", "policy.target=nano-state", f"results={policies}", "port=0"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with (tmp_path / "log").open("w") as log:
+        process = subprocess.Popen([sys.executable, "-m", "kerv_cli.app", *words], stderr=log, env=environment)
+        try:
+            until_slow = time.monotonic() + 60
+            while "listens on" not in (said := (tmp_path / "log").read_text()) and time.monotonic() < until_slow:
+                time.sleep(0.05)
+            client = Client(int(said.rsplit(":", 1)[1]))
+            assert client.infer({"observation/state": np.zeros(39), "prompt": ""})["actions"].shape == (4, 4)
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+    assert "stopped" in (tmp_path / "log").read_text()
