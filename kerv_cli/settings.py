@@ -234,6 +234,29 @@ class DemosSettings(TaskSettings):
 
 
 @dataclass
+class DemosExportSettings(CommandSettings):
+    """`kerv demos export`: demonstrations for other tools."""
+
+    format: str = "lerobot"  # a LeRobot dataset of version 3
+    demos: str = "mt10"
+    to: str = ""  # folder; empty: <results>/lerobot/<demos>
+
+
+@dataclass
+class DemosImportSettings(CommandSettings):
+    """`kerv demos import`: recorded episodes of another tool as demonstrations (docs/data.md)."""
+
+    format: str = "lerobot"
+    source: str = ""  # folder of the dataset
+    name: str | None = None  # default: the folder's
+    camera: str = ""  # which of its images; empty: the first
+    episodes: int = 0  # the first ones; 0: all
+    dofs: str = "own"  # own | openvla: names of the DoFs
+    strict: list[str] | None = None  # DoFs that are never relaxed; None: those with gripper in their name
+    tail: int = 8  # copies of the last action behind an episode, for chunks that begin near its end
+
+
+@dataclass
 class DrafterSettings:
     """Shapes of a drafter (docs/methods.md). eagle: decoder layers of the target's width, behind its states (§2.2).
     early: a residual network from the prompt and the last actions to the whole chunk, before the target runs (§5)."""

@@ -8,6 +8,7 @@ from kerv_cli.commands.common import (
     ShowPlan,
     composed,
     edge,
+    print_figures,
     print_plan,
     print_table,
     progress_bar,
@@ -16,7 +17,11 @@ from kerv_cli.commands.common import (
 
 @edge
 def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
-    """Record successful expert episodes, plain and perturbed, as a dataset."""
+    """Record successful expert episodes, plain and perturbed, as a dataset. `kerv demos export …` writes one as a
+    LeRobot dataset, `kerv demos import …` reads one."""
+    if overrides and overrides[0] in OTHERS:
+        OTHERS[overrides[0]](overrides[1:], cfg)
+        return
     from kerv_cli.settings import DemosSettings, as_plain
 
     settings = composed("demos", overrides, DemosSettings, cfg)
@@ -46,3 +51,52 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         manifest = record(config, folder, advance)
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
+
+
+def _export(words: list[str], cfg: bool) -> None:
+    from kerv_cli.settings import DemosExportSettings
+
+    settings = composed("demos_export", words, DemosExportSettings, cfg)
+    from pathlib import Path
+
+    from kerv_cli.environments.demos.dataset import DemoDataset
+    from kerv_cli.environments.demos.lerobot.export import export
+    from kerv_cli.places import artifact, results_dir
+
+    _check_format(settings.format)
+    dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+    folder = (
+        Path(settings.to).expanduser() if settings.to else results_dir(settings.results) / "lerobot" / settings.demos
+    )
+    with progress_bar("export") as advance:
+        made = export(dataset, folder, advance)
+    figures = {"episodes": len(made.episodes), "frames": made.rows, "tasks": len(made.tasks), "frames/s": made.rate}
+    print_figures("LeRobot dataset", figures, folder)
+
+
+def _import(words: list[str], cfg: bool) -> None:
+    from kerv_cli.settings import DemosImportSettings
+
+    settings = composed("demos_import", words, DemosImportSettings, cfg)
+    from pathlib import Path
+
+    from kerv_cli.environments.demos.lerobot.reading import import_lerobot
+    from kerv_cli.places import artifact
+
+    _check_format(settings.format)
+    folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
+    with progress_bar("import") as advance:
+        manifest = import_lerobot(settings, folder, advance)
+    rows = ((name, len(row["episodes"]), f"{row['mean_steps']:.0f}") for name, row in manifest["tasks"].items())
+    title = f"demonstrations in {folder}, suite {manifest['environment'].upper()}"
+    print_table(("task", "episodes", "mean steps"), rows, title)
+
+
+def _check_format(name: str) -> None:
+    from kerv_cli.errors import UnknownName
+
+    if name != "lerobot":
+        raise UnknownName("format", name, ("lerobot",))
+
+
+OTHERS = {"export": _export, "import": _import}

@@ -108,6 +108,7 @@ class CalibrationRun:
     def __init__(self, settings: CalibrateSettings) -> None:
         self.settings = settings
         _check_settings(settings)
+        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         self.tasks = resolve_tasks(settings.task)
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.described = self.artifacts.description
@@ -119,7 +120,6 @@ class CalibrationRun:
         self.path = self.artifacts.place("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
-        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         check_spaces(self.dataset, self.described.actions, self.described.observation, "the target")
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
         self.datastore = self.artifacts.place("datastore")
@@ -195,7 +195,7 @@ class CalibrationRun:
             levels: list[float] = []
             for index in self._training(name):
                 episode = self.dataset.load(index)
-                if decoder.cameras:
+                if decoder.cameras and self.described.family == "compact":  # others resize their images
                     check_frames(episode, pixels)
                 budget = min(share, self.settings.decodes - len(levels))
                 levels += presample(decoder, episode, space, budget)

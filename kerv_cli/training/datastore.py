@@ -38,9 +38,11 @@ from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import BuildDatastoreSettings
+from kerv_cli.spaces import ObservationSpace
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_spaces, read_chunks, read_observations
+from kerv_cli.training.recorded import prompts_of, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
 
 BATCH = 128  # observations encoded at once
@@ -59,12 +61,17 @@ class Entries:
 
 
 @torch.inference_mode()
-def entries_of(target: CompactTarget, episode: DemoEpisode, segments: Sequence[str], stride: int = 1) -> Entries:
+def entries_of(
+    target: Any, episode: DemoEpisode, segments: Sequence[str], stride: int = 1, space: ObservationSpace | None = None
+) -> Entries:
     """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions.
+    space: the demonstrations' observations, where they are not the target's.
 
     Raises:
         CheckpointError: too few labels, or frames of another size than the target takes.
     """
+    if not isinstance(target, CompactTarget):
+        return _recorded_entries(target, episode, segments, stride, space)
     seen = read_observations(episode, target.settings, target.observation, target.words, slice(None, None, stride))
     steps = seen.steps.numpy()
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
@@ -73,6 +80,17 @@ def entries_of(target: CompactTarget, episode: DemoEpisode, segments: Sequence[s
         prompt, _ = target.encode_batch(seen.inputs(torch.from_numpy(rows), target.device))
         keys.append(prompt_key(prompt, target, segments))
     return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
+
+
+def _recorded_entries(
+    target: Any, episode: DemoEpisode, segments: Sequence[str], stride: int, space: ObservationSpace | None
+) -> Entries:
+    """As `entries_of`, one observation at a time, for a target of any family."""
+    steps = steps_of(target, episode)[::stride]
+    tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
+    prompts = prompts_of(target, episode, space or target.observation, steps)
+    keys = np.concatenate([prompt_key(prompt, target, segments) for prompt in prompts])
+    return Entries(keys, tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
 
 
 def directions(keys: np.ndarray, count: int) -> np.ndarray:
@@ -93,6 +111,7 @@ class DatastoreBuild:
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         self.settings = settings
+        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         tasks = sorted(resolve_tasks(settings.task))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
@@ -108,7 +127,6 @@ class DatastoreBuild:
         self.folder = self.artifacts.place("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
-        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         described = self.artifacts.description
         check_spaces(self.dataset, described.actions, described.observation, "the target")
         self.chosen = {name: self._episodes_of(name) for name in tasks}
@@ -145,12 +163,13 @@ class DatastoreBuild:
             CheckpointError: as `entries_of`. StorageError: writing failed.
         """
         target: Any = self.artifacts.target
+        space = self.dataset.manifest.observation
         total, parts, seeds, shards, rows = sum(map(len, self.chosen.values())), [], [], {}, 0
         for name, chosen in self.chosen.items():
             first = rows
             for index in chosen:
                 episode = self.dataset.load(index)
-                parts.append(entries_of(target, episode, self.settings.key, self.settings.stride))
+                parts.append(entries_of(target, episode, self.settings.key, self.settings.stride, space))
                 seeds.append(np.full(len(parts[-1].steps), episode.seed))
                 rows += len(parts[-1].steps)
                 progress(len(parts), total)

@@ -34,6 +34,39 @@ class TeacherStates(Rows):
     hidden: Tensor  # (n, P + N − 1, E) float16
     tokens: Tensor  # (n, N) int64
 
+    def parts(self, indices: Tensor) -> list[TeacherStates]:
+        """The rows at `indices` (B,), in batches of one prompt length: here one."""
+        return [self.where(indices)]
+
+    def prompts(self, count: int) -> list[Tensor]:
+        """At most `count` prompts (1, P, E), evenly spread."""
+        chosen = torch.linspace(0, len(self) - 1, min(count, len(self))).long().tolist()
+        return [self.prompt[i : i + 1] for i in chosen]
+
+
+@dataclass(frozen=True)
+class StatesByLength:
+    """Teacher states whose prompts differ in length: a group per length, rows counted through all groups."""
+
+    groups: tuple[TeacherStates, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.groups))
+
+    def parts(self, indices: Tensor) -> list[TeacherStates]:
+        """The rows at `indices` (B,), in batches of one prompt length."""
+        found, first = [], 0
+        for group in self.groups:
+            own = indices[(indices >= first) & (indices < first + len(group))] - first
+            if len(own):
+                found.append(group.where(own))
+            first += len(group)
+        return found
+
+    def prompts(self, count: int) -> list[Tensor]:
+        """As `TeacherStates.prompts`, from every group as many as its share."""
+        return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
+
 
 @torch.inference_mode()
 def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
@@ -71,8 +104,8 @@ class Distillation:
         self,
         drafter: Drafter,
         target: Target,
-        states: TeacherStates,
-        held_out: TeacherStates,
+        states: TeacherStates | StatesByLength,
+        held_out: TeacherStates | StatesByLength,
         settings: DrafterSettings,
     ) -> None:
         self.drafter, self.target, self.settings = drafter, target, settings
@@ -81,9 +114,18 @@ class Distillation:
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Mean loss over the unrolled passes for the states at `indices` (B,), and the token loss of each pass."""
-        prompt = self.states.prompt[indices].to(self.device).float()
-        hidden = self.states.hidden[indices].to(self.device).float()
-        tokens = self.states.tokens[indices].to(self.device)
+        losses: list[Tensor] = []
+        metrics: Metrics = {}
+        for states in self.states.parts(indices):
+            loss, measured = self.unrolled(states, step)
+            losses.append(loss * len(states) / len(indices))
+            metrics |= measured
+        return torch.stack(losses).sum(), metrics
+
+    def unrolled(self, states: TeacherStates, step: int) -> tuple[Tensor, Metrics]:
+        """As `loss`, for states of one prompt length."""
+        prompt, hidden = states.prompt.to(self.device).float(), states.hidden.to(self.device).float()
+        tokens = states.tokens.to(self.device)
         total, metrics = hidden.new_zeros(()), {}
         inputs = self.noisy(hidden[:, :-1], step)
         for unrolled in range(self.settings.unroll):
@@ -123,8 +165,7 @@ class Distillation:
     def validate(self, module: nn.Module, observations: int = 60) -> Metrics:
         """Real decodes of held-out observations: tokens committed per verification, strict and at r = 9."""
         assert isinstance(module, Drafter)
-        chosen = torch.linspace(0, len(self.held_out) - 1, min(observations, len(self.held_out))).long().tolist()
-        prompts = [self.held_out.prompt[i : i + 1].to(self.device).float() for i in chosen]
+        prompts = [prompt.to(self.device).float() for prompt in self.held_out.prompts(observations)]
         strict = acceptance_length(self.target, module, prompts, 0)
         relaxed = acceptance_length(self.target, module, prompts, 9)
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, Rows, observed_steps, read_observations
+from kerv_cli.training.recorded import prompts_of, spread_steps
 
 BATCH = 64  # observations that the target decodes at once
 RADII = {"strict": 0, "r3": 3, "r9": 9}
@@ -51,7 +53,7 @@ class EarlyObservations(Observations):
 
 @torch.inference_mode()
 def teach_early(
-    target: CompactTarget,
+    target: Any,
     dataset: DemoDataset,
     settings: DrafterSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -61,6 +63,8 @@ def teach_early(
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
     """
+    if not isinstance(target, CompactTarget):
+        return _teach_recorded(target, dataset, settings, on_progress)
     stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1
     share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
     parts: list[EarlySamples] = []
@@ -71,6 +75,26 @@ def teach_early(
             parts.append(decode(target, EarlyObservations.joined(waiting)))
             waiting = []
         on_progress(index + 1, len(dataset.episodes))
+    return EarlySamples.joined(parts)
+
+
+def _teach_recorded(
+    target: Any, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
+) -> EarlySamples:
+    """As `teach_early`, one observation at a time, for a target of any family that has `pooled`."""
+    parts, count, space = [], len(dataset.episodes), dataset.manifest.observation
+    for index in range(count):
+        episode = dataset.load(index)
+        chosen = spread_steps(target, episode, -(-settings.samples // count))
+        executed = target.actions.normalise(episode.executed)
+        shown = [padded(executed[:t], settings.history, target.actions.dofs) for t in chosen.tolist()]
+        history, known = (torch.from_numpy(np.stack(x)) for x in zip(*shown, strict=True))
+        prompts = list(prompts_of(target, episode, space, chosen))
+        features = torch.cat([target.pooled(prompt) for prompt in prompts]).half().cpu()
+        tokens = torch.cat([greedy(target, prompt)[0] for prompt in prompts]).cpu()
+        of_all = (torch.full((len(chosen),), value) for value in (index, episode.perturbed))
+        parts.append(EarlySamples(features, history, known, tokens, *of_all))
+        on_progress(index + 1, count)
     return EarlySamples.joined(parts)
 
 

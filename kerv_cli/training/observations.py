@@ -140,7 +140,7 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
     """
     where = f"the demonstrations in {dataset.path}"
     dataset.manifest.actions.check_same(actions, where, owner)
-    if observation != dataset.manifest.observation:
+    if observation.state and observation != dataset.manifest.observation:  # without a state it reads images alone
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
 
 

@@ -25,7 +25,7 @@ from kerv_cli.runtime import set_up
 from kerv_cli.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.distillation import Distillation, teach
+from kerv_cli.training.distillation import Distillation, StatesByLength, TeacherStates, teach
 from kerv_cli.training.early_distillation import EarlyDistillation, teach_early
 from kerv_cli.training.imitation import (
     Imitation,
@@ -39,6 +39,7 @@ from kerv_cli.training.imitation import (
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
 from kerv_cli.training.observations import check_spaces, split
+from kerv_cli.training.recorded import teach_recorded
 
 Progress = Callable[[int, int], None]
 
@@ -243,6 +244,9 @@ class DrafterRun(Run):
 
     kind = noun = "drafter"
     settings: TrainDrafterSettings
+    target: Any  # a ReadableTarget
+    states: TeacherStates | StatesByLength
+    held_out: TeacherStates | StatesByLength
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
         self.settings = settings
@@ -283,6 +287,10 @@ class DrafterRun(Run):
 
     def teach(self, progress: Progress) -> None:
         """Collects the target's states for training and validation."""
+        if not isinstance(self.target, CompactTarget):
+            limit, share = self.settings.drafter.samples, self.settings.train.held_out
+            self.states, self.held_out = teach_recorded(self.target, self.dataset, limit, share, progress)
+            return
         tasks = tuple(dict.fromkeys(e.task for e in self.dataset.episodes))
         samples = load_samples(self.dataset, self.target.settings, self.target.words, tasks)
         training, held_out = split(samples, self.settings.train.held_out)

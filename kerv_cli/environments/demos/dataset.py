@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode
+from kerv_cli.environments.recorded import register_recorded
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of
 from kerv_cli.manifests import read
@@ -44,7 +45,8 @@ class DemoManifest:
 
     environment, actions, observation: of the tasks' environment. config: the fields of DemoConfig without the workers.
     versions: of the packages that the physics and the frames depend on. sha256: over the hashes of all episode files.
-    seeds: the first and the last. missing: how many of the requested episodes failed.
+    seeds: the first and the last. missing: how many of the requested episodes failed. instructions: of the tasks of
+    recorded data, which no registered environment has.
     """
 
     format: int
@@ -58,6 +60,7 @@ class DemoManifest:
     seeds: dict[str, int] = field(default_factory=dict)
     episodes: int = 0
     missing: int = 0
+    instructions: dict[str, str] = field(default_factory=dict)
 
 
 def with_environment(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -124,6 +127,9 @@ class DemoDataset:
                 raise CheckpointError(f"the demonstrations in {path} are unfinished: run 'kerv demos' again to go on")
             raise CheckpointError(f"no demonstrations in {path}: record them with 'kerv demos'")
         manifest = _read_manifest(path / "manifest.json")
+        if manifest.instructions:
+            camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)
+            register_recorded(manifest.environment, *spaces, manifest.instructions, camera)
         entries = [
             DemoEntry(**asdict(entry), task=task, path=episode_path(path, task, entry.seed))
             for task, summary in manifest.tasks.items()
