@@ -1,0 +1,207 @@
+"""LeRobot datasets of version 3: written, read back, with images and with videos; what was read can be trained on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from test_openvla import imported, kerv
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.demos.lerobot.reading import _groups
+from kerv_cli.environments.demos.recording import DemoConfig, record
+from kerv_cli.targets.openvla.tiny import write_checkpoint
+
+SIZE = 56
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Demonstrations of insertion, the same as a LeRobot dataset, and read back under the name `back`."""
+    results = tmp_path_factory.mktemp("lerobot")
+    config = DemoConfig(("insert-peg", "fetch-peg"), 2, camera=CameraConfig(size=SIZE), workers=1)
+    record(config, results / "artifacts/demos/pegs")
+    assert kerv("demos", "export", "format=lerobot", "demos=pegs", f"results={results}")[0] == 0
+    read = ["demos", "import", f"source={results}/lerobot/pegs", "name=back", "dofs=openvla", "tail=3"]
+    assert kerv(*read, f"results={results}")[0] == 0
+    return results
+
+
+def both(results: Path) -> tuple[DemoDataset, DemoDataset]:
+    folder = results / "artifacts/demos"
+    return DemoDataset.open(folder / "pegs"), DemoDataset.open(folder / "back")
+
+
+def test_the_published_layout(results: Path) -> None:
+    """Against the format's description: paths, columns and their types, tasks by the index, statistics."""
+    import pandas as pd
+
+    folder = results / "lerobot/pegs"
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert (info["total_episodes"], info["total_tasks"], info["fps"]) == (4, 2, 20)
+    path = folder / info["data_path"].format(chunk_index=0, file_index=0)
+    table = pq.read_table(path)
+    assert set(table.column_names) == set(info["features"])
+    assert len(table) == info["total_frames"]
+    for name, feature in info["features"].items():
+        kind = table.schema.field(name).type
+        if feature["dtype"] == "image":
+            assert kind == pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        elif feature["shape"] != [1]:
+            assert kind == pa.list_(pa.float32(), feature["shape"][0])
+            assert len(feature["names"]) == feature["shape"][0]
+        else:
+            assert kind == {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}[feature["dtype"]]
+    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [e["dataset_from_index"] for e in episodes[1:]] == [e["dataset_to_index"] for e in episodes[:-1]]
+    assert table["index"].to_pylist() == list(range(len(table)))
+    tasks = pd.read_parquet(folder / "meta/tasks.parquet")
+    assert tasks.iloc[0].name == "turn the peg and push it into the tilted slot"
+    assert episodes[0]["tasks"] == [tasks.iloc[0].name]
+    stats = json.loads((folder / "meta/stats.json").read_text())
+    actions = np.stack(table["action"].to_pylist())
+    np.testing.assert_allclose(stats["action"]["mean"], actions.mean(0), atol=1e-6)
+    assert np.shape(stats["observation.images.front"]["mean"]) == (3, 1, 1)
+
+
+def test_what_was_written_is_read_back(results: Path) -> None:
+    before, after = both(results)
+    assert len(before.episodes) == len(after.episodes) == 4
+    for index in range(4):
+        ours, theirs = before.load(index), after.load(index)
+        np.testing.assert_array_equal(ours.frames, theirs.frames)
+        np.testing.assert_array_equal(ours.states, theirs.states)
+        np.testing.assert_array_equal(ours.executed, theirs.executed)
+        np.testing.assert_array_equal(ours.labels[: ours.steps], theirs.labels[: theirs.steps])
+        assert len(theirs.labels) == theirs.steps + 3
+        np.testing.assert_array_equal(theirs.labels[-1], theirs.labels[theirs.steps - 1])
+    manifest = after.manifest
+    assert manifest.actions.names == ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+    assert [group.size for group in manifest.actions.groups] == [3, 3, 1]
+    assert (manifest.actions.strict, manifest.actions.control_hz) == (("gripper",), 20.0)
+    assert (
+        manifest.instructions["pick-up-the-peg-and-put-it-into-the-slot"] == "pick up the peg and put it into the slot"
+    )
+
+
+def test_everything_trains_on_recorded_observations_of_an_openvla(results: Path) -> None:
+    imported(write_checkpoint(results / "tiny"), results, name="rec", control_hz=20.0)
+    common = ["policy.target=rec", "demos=back", f"results={results}"]
+    short = ["train.steps=2", "train.batch=2", "train.warmup=1", "train.validate_every=2", "drafter.samples=6"]
+    assert kerv("train", "drafter", *common, *short, "train.held_out=0.5")[0] == 0
+    assert kerv("train", "drafter", "drafter=early", *common, *short, "train.held_out=0.5")[0] == 0
+    assert kerv("build", "datastore", *common, "task=BACK", "key=[vision]", "stride=4")[0] == 0
+    calibrate = ["calibrate", *common, "task=BACK", "decodes=2", "held_out=0.5", "window=5", "boundary_windows=[5]"]
+    assert kerv(*calibrate)[0] == 0
+    made = json.loads((results / "artifacts/calibration/rec/calibration.json").read_text())
+    assert set(made["variability"]) == set(both(results)[1].manifest.instructions)
+    code, line = kerv("build", "datastore", *common, "task=BACK", "key=[scene]")
+    assert code == 2
+    assert "unknown part of the prompt 'scene'" in line
+
+
+def test_a_recording_cannot_be_rolled_out(results: Path) -> None:
+    both(results)
+    words = ["rollout", "task=BACK", "policy.target=rec", "method=ar", "episodes=1", "world.camera.size=56"]
+    code, line = kerv(*words, f"results={results}")
+    assert code == 2
+    assert "back is a recording: nothing can be executed in it" in line
+
+
+def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
+    copy = Path(shutil.copytree(results / "lerobot/pegs", tmp_path / "copy"))
+    info = json.loads((copy / "meta/info.json").read_text())
+    (copy / "meta/info.json").write_text(json.dumps({**info, **changes}))
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("changes", "words", "said"),
+    [
+        ({}, [], "source=DIR: name the folder"),
+        ({}, ["source=/nowhere"], "/nowhere/meta/info.json is missing"),
+        ({"codebase_version": "v2.1"}, ["SOURCE"], "is of version v2.1, v3.x is read"),
+        ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, ["SOURCE"], "has no images or no action"),
+        ({}, ["SOURCE", "camera=side"], "unknown camera 'side': known: front"),
+        ({}, ["SOURCE", "strict=[jaw]"], "unknown strict DoF 'jaw'"),
+        ({}, ["SOURCE", "dofs=six"], "unknown dofs 'six': known: own, openvla"),
+        ({}, ["SOURCE", "format=hdf5"], "unknown format 'hdf5': known: lerobot"),
+        ({}, ["SOURCE", "name=pegs", "RESULTS"], "exists: give the new demonstrations another name"),
+        ({}, ["SOURCE", "tail=-1"], "tail=-1"),
+    ],
+)
+def test_an_import_refuses_in_one_line(
+    results: Path, tmp_path: Path, changes: dict[str, Any], words: list[str], said: str
+) -> None:
+    source = edited(results, tmp_path, **changes)
+    where = f"results={results}" if "RESULTS" in words else f"results={tmp_path}"
+    given = [f"source={source}" if word == "SOURCE" else word for word in words if word != "RESULTS"]
+    code, line = kerv("demos", "import", *given, where)
+    assert code in (1, 2)
+    assert said in line
+
+
+def test_a_truncated_table_is_refused(results: Path, tmp_path: Path) -> None:
+    source = edited(results, tmp_path)
+    data = source / "data/chunk-000/file-000.parquet"
+    data.write_bytes(data.read_bytes()[:-2000])
+    code, line = kerv("demos", "import", f"source={source}", f"results={tmp_path}")
+    assert code == 1
+    assert "file-000.parquet is missing or damaged" in line
+
+
+def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    source = edited(results, tmp_path)
+    info = json.loads((source / "meta/info.json").read_text())
+    key = "observation.images.front"
+    info["features"][key]["dtype"] = "video"
+    before = both(results)[0]
+    frames = np.concatenate([before.load(i).frames for i in range(4)])
+    path = source / info["video_path"].format(video_key=key, chunk_index=0, file_index=0)
+    path.parent.mkdir(parents=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=20)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = SIZE, SIZE, "yuv420p", 4_000_000
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    (source / "meta/info.json").write_text(json.dumps(info))
+    rows = pq.read_table(source / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    for row in rows:
+        first, last = row["dataset_from_index"], row["dataset_to_index"]
+        place = {"chunk_index": 0, "file_index": 0, "from_timestamp": first / 20, "to_timestamp": last / 20}
+        row |= {f"videos/{key}/{name}": value for name, value in place.items()}
+    pq.write_table(pa.Table.from_pylist(rows), source / "meta/episodes/chunk-000/file-000.parquet")
+    data = source / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(data).drop_columns([key]), data)
+    run = CliRunner().invoke(app, ["demos", "import", f"source={source}", "name=video", f"results={tmp_path}"])
+    assert run.exit_code == 0, run.output
+    after = DemoDataset.open(tmp_path / "artifacts/demos/video")
+    for index in range(4):
+        ours, theirs = before.load(index).frames.astype(int), after.load(index).frames.astype(int)
+        own = np.abs(ours - theirs).mean()
+        shifted = np.abs(ours[1:] - theirs[:-1]).mean()
+        assert own < 6  # grey levels: what the codec loses
+        assert own < shifted
+    path.write_bytes(path.read_bytes()[:1000])
+    code, line = kerv("demos", "import", f"source={source}", "name=cut", f"results={tmp_path}")
+    assert code == 1
+    assert "file-000.mp4 is missing or damaged" in line
+
+
+def test_groups_of_dofs() -> None:
+    names = ["a", "b", "left_gripper", "c", "right_gripper"]
+    found = _groups(names, ["left_gripper", "right_gripper"])
+    assert [group.size for group in found] == [2, 1, 1, 1]
+    assert len({group.name for group in found}) == 4
