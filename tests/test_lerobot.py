@@ -189,7 +189,7 @@ def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
     assert run.exit_code == 0, run.output
     after = DemoDataset.open(tmp_path / "artifacts/demos/video")
     for index in range(4):
-        ours, theirs = before.load(index).frames.astype(int), after.load(index).frames.astype(int)
+        ours, theirs = (np.asarray(dataset.load(index).frames).astype(int) for dataset in (before, after))
         own = np.abs(ours - theirs).mean()
         shifted = np.abs(ours[1:] - theirs[:-1]).mean()
         assert own < 6  # grey levels: what the codec loses

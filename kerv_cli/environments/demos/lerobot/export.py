@@ -7,7 +7,6 @@ between them are left out and the rate is lower.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
+from kerv_cli.environments.demos.frames import encode_png
 from kerv_cli.environments.demos.lerobot.layout import (
     ACTION,
     COUNTERS,
@@ -118,10 +118,11 @@ class Export:
             if name != DONE:
                 self.moments.setdefault(name, Moments()).add(values.reshape(len(values), -1))
         key = f"{IMAGES}{self.camera}"
-        pictures = [{"bytes": _png(frame), "path": None} for frame in episode.frames]
+        frames = np.asarray(episode.frames)
+        pictures = [{"bytes": encode_png(frame), "path": None} for frame in frames]
         arrays[key] = pa.array(pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
-        self.moments.setdefault(key, Moments((3, 1, 1))).add(episode.frames[::EVERY].reshape(-1, 3) / 255)
-        self.size = episode.frames.shape[1:]
+        self.moments.setdefault(key, Moments((3, 1, 1))).add(frames[::EVERY].reshape(-1, 3) / 255)
+        self.size = frames.shape[1:]
         self.episodes.append(
             {
                 "episode_index": len(self.episodes),
@@ -227,11 +228,3 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
 
 def _instruction(task: str) -> str:
     return spec_of(task).task(task).instruction
-
-
-def _png(frame: np.ndarray) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
-    return buffer.getvalue()
