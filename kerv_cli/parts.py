@@ -323,6 +323,7 @@ _add(
     *("target", "openvla", "targets.openvla.target:build"),
     weights="kerv_cli.targets.openvla.target:check_weights",
     importer="kerv_cli.targets.openvla.importing:import_checkpoint",
+    images_alone=True,  # reads no state
 )
 _add("artifact", "drafter", "drafting.eagle:ARTIFACT")
 _add("artifact", "early", "drafting.early:ARTIFACT")

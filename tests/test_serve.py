@@ -290,3 +290,11 @@ def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path)
         finally:
             process.kill()
     assert "stopped" in (tmp_path / "log").read_text()
+
+
+def test_a_policy_that_reads_images_alone_needs_no_state(policy: tuple[Interface, Decoder]) -> None:
+    from dataclasses import replace
+
+    message = {key: value for key, value in seen(0).items() if key != "observation/state"}
+    given = replace(policy[0], images_alone=True).observation_of(message)
+    assert (given.proprioception.shape, given.state.shape) == ((4,), (39,))

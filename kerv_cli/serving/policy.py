@@ -8,6 +8,7 @@ from kerv_cli.artifacts import Artifacts
 from kerv_cli.decoding.build import check, compose, needs
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.registry import find
 from kerv_cli.runtime import set_up
 from kerv_cli.serving.session import GRIPPERS, Interface, Session
 from kerv_cli.settings import ServeSettings
@@ -43,6 +44,7 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
         privileged=not described.cameras and described.observation.state > 0,
         gripper=settings.gripper,
         task=settings.task_name,
+        images_alone=bool(find("target", described.family).traits.get("images_alone")),
     )
     warm_up(interface, decoder)
     return interface, decoder

@@ -27,7 +27,8 @@ which LIBERO's simulator wants."""
 @dataclass(frozen=True)
 class Interface:
     """What a policy takes and gives. size: pixels of its images, 0 where it sees none. privileged: it reads the whole
-    state. gripper: one of GRIPPERS. task: name for parts whose levels differ between tasks."""
+    state; images_alone: none of it, so that it may be left out. gripper: one of GRIPPERS. task: name for parts whose
+    levels differ between tasks."""
 
     name: str
     method: str
@@ -38,6 +39,7 @@ class Interface:
     privileged: bool
     gripper: str
     task: str
+    images_alone: bool = False
 
     def metadata(self, chunk: int) -> dict[str, Any]:
         """The first frame that a client gets. chunk: H."""
@@ -86,6 +88,8 @@ class Interface:
         if not many:
             return np.zeros(0), np.zeros(0)
         given = message.get(STATE)
+        if given is None and self.images_alone:
+            return np.zeros(few), np.zeros(many)
         sizes = [many] if self.privileged else [few, many]
         if not isinstance(given, np.ndarray | list):
             raise UsageError(f"no {STATE}: {sizes[0]} numbers are wanted, the message has {_keys(message)}")

@@ -13,7 +13,7 @@ from kerv_cli.files import write_json
 from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import BuildTargetSettings
-from kerv_cli.spaces import ObservationSpace
+from kerv_cli.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import FORMAT
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.image import read_normalisations
@@ -57,11 +57,23 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         prompt_tokens=settings.prompt_tokens,
         image_size=shape.towers[0].image,
     )
-    computed = {"prompt": chosen.prompt, "crop": chosen.crop, "int8": chosen.int8}
-    folder = artifact(settings.results, "target", settings.name)
-    observation = spec.observation if spec else SEES_NOTHING_ELSE
     made = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
-    description = {
+    folder = artifact(settings.results, "target", settings.name)
+    camera = spec.camera_name(settings.camera) if spec else settings.camera or "primary"
+    written = _description(chosen, spec, actions, camera, hashes)
+    write_json(folder / "target.json", {**written, "provenance": {**made, **provenance(settings.runtime.device)}})
+    prompt = shape.patches + len(prompter.ids("move"))
+    figures = {"parameters": parameters, "prompt tokens": prompt, "action tokens": actions.tokens, "DoFs": actions.dofs}
+    return folder, figures
+
+
+def _description(
+    chosen: OpenVLASettings, spec: EnvironmentSpec | None, actions: ActionSpace, camera: str, hashes: dict[str, str]
+) -> dict[str, Any]:
+    """The contents of target.json, but for the provenance."""
+    computed = {"prompt": chosen.prompt, "crop": chosen.crop, "int8": chosen.int8}
+    observation = spec.observation if spec else SEES_NOTHING_ELSE
+    return {
         "format": FORMAT,
         "kind": "target",
         "sha256": digest_of(hashes, computed),
@@ -70,16 +82,8 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         "settings": asdict(chosen),
         "actions": actions.as_dict(),
         "observation": observation.as_dict(),
-        "cameras": [spec.camera_name(settings.camera) if spec else settings.camera or "primary"],
+        "cameras": [camera],
         "words": [],
-        "provenance": {**made, **provenance(settings.runtime.device)},
-    }
-    write_json(folder / "target.json", description)
-    return folder, {
-        "parameters": parameters,
-        "prompt tokens": shape.patches + len(prompter.ids("move")),
-        "action tokens": actions.tokens,
-        "DoFs": actions.dofs,
     }
 
 

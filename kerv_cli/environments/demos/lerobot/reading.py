@@ -176,10 +176,7 @@ def _manifest(
 ) -> dict[str, Any]:
     felt = source.names(STATE, "state")
     observation = ObservationSpace(tuple(felt[:state]), state, (), (0.0, 0.0, 0.0))
-    tasks = {
-        task: {"mean_steps": sum(e["steps"] for e in rows) / len(rows), "failed_seeds": [], "episodes": rows}
-        for task, rows in entries.items()
-    }
+    tasks = {task: _summary(rows) for task, rows in entries.items()}
     seeds = [e["seed"] for rows in entries.values() for e in rows]
     config = {
         "source": str(source.folder.resolve()),
@@ -204,6 +201,10 @@ def _manifest(
     }
     plain: dict[str, Any] = json.loads(json.dumps(manifest))
     return plain
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"mean_steps": sum(e["steps"] for e in rows) / len(rows), "failed_seeds": [], "episodes": rows}
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
