@@ -108,7 +108,7 @@ class EncodedFrames:
         data = self.sources[self.source[i]][self.start[i] : self.end[i]].tobytes()
         try:
             with Image.open(io.BytesIO(data)) as image:
-                return np.asarray(image)
+                return np.array(image)  # a copy: torch warns of memory that may not be written to
         except (OSError, SyntaxError, ValueError) as error:
             raise CheckpointError(f"a frame of the demonstrations is damaged: {error}") from error
 
