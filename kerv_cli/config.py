@@ -6,19 +6,25 @@ one line with the nearest known keys.
 
 from __future__ import annotations
 
+import copy
 import difflib
 import functools
 import itertools
+import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from kerv_cli import registry
 from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.parts import PART_GROUPS, PREFILL
+from kerv_cli.limits import check_settings
+from kerv_cli.parts import PART_GROUPS, PREFILL, part_of
 
 T = TypeVar("T")
+
+MOST_POINTS = 10_000
+"""Points of a grid; more are refused before they are expanded."""
 
 
 def conf_dir() -> Path:
@@ -56,22 +62,76 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     """The command's settings: the dataclass `schema`, `conf/<command>.yaml`, its groups and the overrides.
 
     Raises:
-        UsageError: an override that cannot be parsed, an unknown key or name, a value of the wrong type.
+        UsageError: an override that cannot be parsed, an unknown key or name, a value of another type or out of range.
     """
-    _check(command, overrides)
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
+    return Composer(command, schema).compose(overrides)
 
-    overrides = [_task_list(word) for word in overrides]
-    try:
-        settings = OmegaConf.to_object(_composed(command, overrides, schema))
-    except HydraException as error:
-        raise _explained(command, error, overrides, schema) from error
-    except OmegaConfBaseException as error:
-        raise UsageError(_one_line(error)) from error
-    assert isinstance(settings, schema)
-    return settings
+
+class Composer(Generic[T]):
+    """Composes many settings of one command: what the same choices of groups compose to is composed once."""
+
+    def __init__(self, command: str, schema: type[T]) -> None:
+        self.command, self.schema, self.known = command, schema, groups()
+        self._composed: dict[tuple[str, ...], Any] = {}
+
+    def compose(self, overrides: Sequence[str]) -> T:
+        """As the function `compose`."""
+        from hydra.errors import HydraException
+        from omegaconf import OmegaConf
+        from omegaconf.errors import OmegaConfBaseException
+
+        overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
+        _check(self.command, overrides, self.known)
+        words = [_task_list(word) for word in overrides]
+        try:
+            settings = OmegaConf.to_object(self._nodes(words))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise _explained(self.command, error, words, self.schema) from error
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
+            raise UsageError(f"cannot read '{' '.join(overrides)[:200]}': {_one_line(error)}") from error
+        assert isinstance(settings, self.schema)
+        _check_ranges(settings)
+        return settings
+
+    def _nodes(self, words: Sequence[str]) -> Any:
+        """Typed nodes of the words: Hydra composes all but plain values, which are set afterwards as it sets them."""
+        from omegaconf import OmegaConf
+
+        parsed = [(word, _parsed(word)) for word in words]
+        values = [(word, override) for word, override in parsed if self._is_value(override)]
+        rest = tuple(word for word, override in parsed if not self._is_value(override))
+        if rest not in self._composed:
+            self._composed[rest] = _composed(self.command, rest, self.schema)
+        nodes = copy.deepcopy(self._composed[rest])
+        for _, override in values:
+            OmegaConf.update(nodes, override.key_or_group, override.value(), merge=True)
+        return nodes
+
+    def _is_value(self, override: Any) -> bool:
+        """Whether an override sets one key to one value."""
+        from hydra.core.override_parser.types import OverrideType
+
+        plain = override.type == OverrideType.CHANGE and override.package is None and not override.is_sweep_override()
+        return plain and override.key_or_group not in self.known
+
+
+def _check_ranges(settings: Any) -> None:
+    """Checks every setting against its range, and what only a part knows about its settings."""
+    check_settings(settings)
+    for group in PART_GROUPS:
+        chosen = getattr(settings, group, None)
+        part = None if chosen is None else part_of(group, chosen.kind)
+        # another part's settings are refused by the method's check
+        if part is not None and part.check is not None and isinstance(chosen, part.settings):
+            part.check(chosen)
+
+
+@functools.lru_cache(maxsize=4096)
+def _parsed(word: str) -> Any:
+    """The override as Hydra parses it; raises as Hydra."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return OverridesParser.create().parse_overrides([word])[0]
 
 
 def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
@@ -116,23 +176,60 @@ def _store_part(group: str, name: str, settings: type) -> None:
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
     """Hydra's grid grammar -> one override list per point: `threshold.r=0,3` or `threshold.r=range(0,4)`.
 
-    A string is split at white space outside quotes.
+    A string is split at white space outside quotes. The grid is counted before it is expanded.
 
     Raises:
-        UsageError: an override that cannot be parsed.
+        UsageError: an override that cannot be parsed, or more than MOST_POINTS points.
     """
-    import shlex
-
-    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
-    words = shlex.split(overrides) if isinstance(overrides, str) else list(overrides)
+    words = split_words(overrides) if isinstance(overrides, str) else list(overrides)
     try:
-        parsed = OverridesParser.create().parse_overrides(words)
+        parsed = [_parsed(word) for word in words]
+        points = math.prod(map(_count, parsed))
+        if points > MOST_POINTS:
+            raise UsageError(f"'{' '.join(words)}' is a grid of {points:.6g} points: at most {MOST_POINTS}")
         axes = [list(_points(o)) for o in parsed]
     except HydraException as error:
         raise UsageError(f"cannot read '{' '.join(words)}': {_one_line(error)}") from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
+        raise UsageError(f"cannot read '{' '.join(words)[:200]}': {_one_line(error)}") from error
     return [list(point) for point in itertools.product(*axes)]
+
+
+def split_words(text: str) -> list[str]:
+    """The words of a line of overrides, split at white space outside quotes.
+
+    Raises:
+        UsageError: a quote or a backslash without its end.
+    """
+    import shlex
+
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise UsageError(f"cannot read '{text}': {error}") from error
+
+
+def _count(override: Any) -> float:
+    """How many points an override stands for.
+
+    Raises:
+        UsageError: a range without an end or with steps of 0, an interval, a glob.
+    """
+    from hydra.core.override_parser.types import ChoiceSweep, RangeSweep
+
+    value = override.value()
+    if not override.is_sweep_override():
+        return 1
+    if isinstance(value, ChoiceSweep):
+        return len(value.list)
+    if not isinstance(value, RangeSweep):
+        raise UsageError(f"'{override.input_line}' is no list of values: write key=a,b,c or key=range(first,end,step)")
+    numbers = value.start, value.stop, value.step
+    if any(number is None or not math.isfinite(number) for number in numbers) or not value.step:
+        raise UsageError(f"'{override.input_line}': a range needs a first number, an end and a step that is not 0")
+    return max(0, math.ceil((value.stop - value.start) / value.step))  # type: ignore[operator]
 
 
 def _points(override: Any) -> Iterator[str]:
@@ -158,15 +255,20 @@ def to_yaml(settings: Any) -> str:
     return OmegaConf.to_yaml(OmegaConf.structured(settings))
 
 
-def _check(command: str, overrides: Sequence[str]) -> None:
-    """Refuses unknown group choices before Hydra sees them: its own message about a missing file is long."""
-    known = groups()
+def _check(command: str, overrides: Sequence[str], known: Mapping[str, Sequence[str]]) -> None:
+    """Refuses what Hydra would answer at length or not at all: words that are no overrides, unknown group choices,
+    several choices where one is wanted."""
     for word in overrides:
-        if "=" not in word:
+        key, equals, value = word.partition("=")
+        if not equals or not key or key[0] == "~":  # nothing is taken away from settings
             raise UsageError(f"'{word}' is not an override: write key=value, see 'kerv {command} --cfg' for the keys")
-        key, value = word.split("=", 1)
-        if key.lstrip("+~") in known and value not in known[key.lstrip("+~")]:
-            raise UnknownName(key.lstrip("+~"), value, known[key.lstrip("+~")])
+        if key not in known or value in known[key]:
+            continue
+        several = [name.strip() for name in value.split(",")]
+        if len(several) > 1 and set(several) <= set(known[key]):
+            hint = "run each in turn with 'kerv rollout -m', or" if command == "rollout" else "this command takes one:"
+            raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
+        raise UnknownName(key, value, known[key])
 
 
 def _task_list(word: str) -> str:
@@ -185,7 +287,7 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
     except HydraException:  # the choices alone do not compose
         return UsageError(_one_line(error.__cause__ or error))
     for word in overrides:
-        key = word.split("=", 1)[0].lstrip("+~")
+        key = word.split("=", 1)[0]
         if key not in keys and key not in groups():
             near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
             near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]

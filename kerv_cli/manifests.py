@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 from kerv_cli.errors import CheckpointError, KervError
 from kerv_cli.files import read_json
+from kerv_cli.limits import check_settings
 
 T = TypeVar("T")
 
@@ -47,7 +48,8 @@ def read(kind: type[T], value: Any, what: str) -> T:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
-    except KervError as error:  # what the dataclass itself refuses
+        check_settings(checked)
+    except KervError as error:  # what the dataclass itself refuses, and settings out of range
         raise CheckpointError(f"{what} is damaged: {error}") from error
     return checked
 

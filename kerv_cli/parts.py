@@ -12,13 +12,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from kerv_cli.errors import UsageError
-from kerv_cli.registry import NoSettings, Part, find, number, register
+from kerv_cli.limits import number
+from kerv_cli.registry import NoSettings, Part, find, register
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
 
 PART_GROUPS = (*METHOD_KINDS, "datastore")
 """Settings of a rollout whose choices are parts; YAML files in conf/<group>/ are further choices."""
+
+MOST_TOKENS = 65_536  # of a draft or its tree
+MOST_BINS = 65_536
+MOST_DECODES = 1_000_000  # of an episode, in which a setting may count
 
 PREFILL, STATES = "prefill", "states"
 """When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
@@ -42,9 +47,9 @@ class DrafterProposerSettings:
     relaxed acceptance accepts most of what siblings would catch, and every verified node costs time (study=tree)."""
 
     kind: str = "drafter"
-    depth: int = number(15, 1)  # tokens
-    top_k: int = number(1, 1)  # children expanded per level
-    nodes: int = number(15, 1)  # tree nodes kept after reranking
+    depth: int = number(15, 1, MOST_TOKENS)  # tokens
+    top_k: int = number(1, 1, MOST_TOKENS)  # children expanded per level
+    nodes: int = number(15, 1, MOST_TOKENS)  # tree nodes kept after reranking
 
 
 @dataclass
@@ -52,8 +57,8 @@ class RetrievalProposerSettings:
     """The nearest stored chunks of the task as one tree (§4.2)."""
 
     kind: str = "retrieval"
-    neighbours: int = number(5, 1)  # stored chunks
-    nodes: int = number(50, 1)  # tree nodes
+    neighbours: int = number(5, 1, MOST_TOKENS)  # stored chunks
+    nodes: int = number(50, 1, MOST_TOKENS)  # tree nodes
 
 
 @dataclass
@@ -62,10 +67,10 @@ class HybridProposerSettings:
     about 50 nodes and cost more than they gain here."""
 
     kind: str = "hybrid"
-    depth: int = number(15, 1)  # the drafter's, tokens
-    top_k: int = number(1, 1)
-    nodes: int = number(24, 1)  # of either side's tree
-    neighbours: int = number(3, 1)
+    depth: int = number(15, 1, MOST_TOKENS)  # the drafter's, tokens
+    top_k: int = number(1, 1, MOST_TOKENS)
+    nodes: int = number(24, 1, MOST_TOKENS)  # of either side's tree
+    neighbours: int = number(3, 1, MOST_TOKENS)
 
 
 @dataclass
@@ -73,7 +78,7 @@ class JacobiProposerSettings:
     """PD-VLA: the parallel argmax of the guess before, over the rest of the chunk (§6)."""
 
     kind: str = "jacobi"
-    depth: int = number(0, 0)  # tokens guessed at once; 0: all that are left
+    depth: int = number(0, 0, MOST_TOKENS)  # tokens guessed at once; 0: all that are left
 
 
 @dataclass
@@ -84,8 +89,8 @@ class MergedProposerSettings:
     kind: str = "merged"
     sources: list[str] = field(default_factory=lambda: ["early"])
     fallback: list[str] = field(default_factory=lambda: ["hold"])
-    nodes: int = number(48, 1)  # the last sources' chains are dropped first
-    neighbours: int = number(1, 1)  # retrieval: stored chunks
+    nodes: int = number(48, 1, MOST_TOKENS)  # the last sources' chains are dropped first
+    neighbours: int = number(1, 1, MOST_TOKENS)  # retrieval: stored chunks
 
 
 # --- acceptance: which drafts are good enough (§2.1)
@@ -104,8 +109,8 @@ class SequenceAcceptanceSettings:
     """HeiSD: a kinematic group of one control step is accepted or rejected as a whole; strict DoFs must match."""
 
     kind: str = "sequence"
-    group_limit: int = 30  # summed bias of a group, bins
-    token_limit: int = 15  # bias of one token, bins
+    group_limit: int = number(30, 0, MOST_BINS)  # summed bias of a group, bins
+    token_limit: int = number(15, 0, MOST_BINS)  # bias of one token, bins
 
 
 @dataclass
@@ -114,8 +119,8 @@ class HybridAcceptanceSettings:
 
     kind: str = "hybrid"
     strict_dofs: bool = True
-    group_limit: int = 30
-    token_limit: int = 15
+    group_limit: int = number(30, 0, MOST_BINS)
+    token_limit: int = number(15, 0, MOST_BINS)
 
 
 # --- thresholds: r, in bins (§3.2); that it lies below the number of tokens is checked when it is built
@@ -126,7 +131,7 @@ class FixedThresholdSettings:
     """Spec-VLA: one radius."""
 
     kind: str = "fixed"
-    r: int = number(9, 0)
+    r: int = number(9, 0, MOST_BINS)
 
 
 @dataclass
@@ -135,8 +140,8 @@ class KinematicThresholdSettings:
     of K (ablation)."""
 
     kind: str = "kinematic"
-    r_min: int = 5
-    r_max: int = 15
+    r_min: int = number(5, 0, MOST_BINS)
+    r_max: int = number(15, 0, MOST_BINS)
     phi: float = number(2.0, above=0, most=50)
     k_s: float | None = number(None, above=0, most=1e9)  # reference level of K; None: the task's, from the calibration
 
@@ -146,8 +151,8 @@ class ScheduleThresholdSettings:
     """KERV's public code, r = 3 + 12 exp(−(t / τ)³) in decode t: open loop, K is not used."""
 
     kind: str = "schedule"
-    r_min: int = 3
-    r_max: int = 15
+    r_min: int = number(3, 0, MOST_BINS)
+    r_max: int = number(15, 0, MOST_BINS)
     phi: float = number(3.0, above=0, most=50)
     tau: float = number(20.0, above=0, most=1e9)  # decodes
 
@@ -161,11 +166,11 @@ class CompensateSettings:
 
     kind: str = "compensate"
     predictor: str = "hold"  # a predictor, or draft: the rejected draft's remaining tokens (ours)
-    steps: int = number(1, 1)  # PL: control steps that a prediction may fill
+    steps: int = number(1, 1, MOST_TOKENS)  # PL: control steps that a prediction may fill
     use_target_token: bool = True  # ours: the target's token at the rejected position is kept; false: predicted (KERV)
-    min_verified: int = number(1, 0)  # DoFs of a step that must be known for it to be filled
-    rest: int = number(0, 0)  # decodes without compensation after one (KERV: 4)
-    max_dropped: int = -1  # control steps of the chunk that a compensation may drop; -1: any number (KERV)
+    min_verified: int = number(1, 0, MOST_TOKENS)  # DoFs of a step that must be known for it to be filled
+    rest: int = number(0, 0, MOST_DECODES)  # decodes without compensation after one (KERV: 4)
+    max_dropped: int = number(-1, -1, MOST_TOKENS)  # control steps that a compensation may drop; -1: any (KERV)
 
 
 # --- boundaries: which side of a hybrid proposer drafts (§4.4)
@@ -177,8 +182,8 @@ class FusedBoundarySettings:
 
     kind: str = "fused"
     alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature against the path length
-    window: int = number(15, 3)  # newest measured positions
-    f_star: float = number(0.3)  # fused metric from which retrieval drafts (measured; HeiSD: 0.5)
+    window: int = number(15, 3, MOST_DECODES)  # newest measured positions
+    f_star: float = number(0.3, -1e9, 1e9)  # fused metric from which retrieval drafts (measured; HeiSD: 0.5)
 
 
 @dataclass
@@ -187,7 +192,7 @@ class RandomBoundarySettings:
 
     kind: str = "random"
     p: float = number(0.5, 0, 1)  # probability of retrieval
-    seed: int = 0
+    seed: int = number(0, 0, 2**32 - 1)
 
 
 # --- skip: what is executed without a verification (§4.3)
@@ -198,10 +203,12 @@ class SimilaritySkipSettings:
     """HeiSD: a retrieved chunk whose similarity reaches s_min is executed without a forward of the target's trunk."""
 
     kind: str = "similarity"
-    s_min: float | None = None  # None: the task's, from the calibration
-    max_skips: int = number(2, 1)  # decodes in a row without a verification
-    up: float = number(0.0, 0)  # share of the calibrated range that s_min rises after a failed episode (HeiSD: 0.25)
-    down: float = number(0.0, 0)  # and falls after a successful one; above 0 results depend on the order of episodes
+    s_min: float | None = number(None, -1e9, 1e9)  # None: the task's, from the calibration
+    max_skips: int = number(2, 1, MOST_DECODES)  # decodes in a row without a verification
+    # share of the calibrated range that s_min rises after a failed episode (HeiSD: 0.25), and falls after a successful
+    # one; above 0 results depend on the order of episodes
+    up: float = number(0.0, 0, 1e9)
+    down: float = number(0.0, 0, 1e9)
 
 
 @dataclass
@@ -239,9 +246,9 @@ class SlurmOptions:
 
     cluster: str = "slurm"  # slurm | local (submitit's own processes on this machine)
     partition: str = ""  # empty: the cluster's default
-    minutes: int = 120  # longest time of a job
-    memory_gb: int = 8
-    gpus: int = 0
+    minutes: int = number(120, 1, 100_000)  # longest time of a job
+    memory_gb: int = number(8, 1, 100_000)
+    gpus: int = number(0, 0, 1024)
     setup: list[str] = field(default_factory=list)  # shell lines before the job's Python starts
 
 
@@ -250,7 +257,7 @@ class RayOptions:
     """`runtime.executor_options` of ray: a block is a task."""
 
     address: str = ""  # of a running cluster, e.g. auto or ray://host:10001; empty: a Ray of its own on this machine
-    gpus: float = 0.0  # per block
+    gpus: float = number(0.0, 0, 1024)  # per block
 
 
 # --- checks of settings together, and the artifacts that settings need

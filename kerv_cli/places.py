@@ -4,26 +4,38 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.errors import UsageError
+from kerv_cli.limits import check_name
 
 
 def results_dir(results: str) -> Path:
     """The results folder.
 
     Raises:
-        UsageError: it is a file.
+        UsageError: it is a file, or no path.
     """
-    path = Path(results).expanduser()
+    path = as_path(results)
     if path.exists() and not path.is_dir():
         raise UsageError(f"results={results} is a file: name a folder")
     return path
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
-    """Folder of a trained or built artifact: results/artifacts/<kind>/<name>, or `name` itself with a slash in it."""
+    """Folder of a trained or built artifact: results/artifacts/<kind>/<name>, or `name` itself with a slash in it.
+
+    Raises:
+        UsageError: neither a plain folder name nor a path.
+    """
     if "/" in name:
-        return Path(name).expanduser()
-    return results_dir(results) / "artifacts" / kind / name
+        return as_path(name)
+    return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name")
+
+
+def as_path(text: str) -> Path:
+    """A path that a user wrote; raises UsageError for one that no file system takes."""
+    if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
+        raise UsageError(f"'{text[:80]}…' is no path")
+    return Path(text).expanduser()
 
 
 def shipped_dir() -> Path:
@@ -35,10 +47,10 @@ def find_target(results: str, name: str) -> Path:
     """Folder of the target `name`: `name` itself if it is a path, else an artifact, else a shipped policy.
 
     Raises:
-        CheckpointError: nothing of that name; the line lists what there is.
+        UsageError: nothing of that name; the line lists what there is.
     """
     if "/" in name:
-        places = [Path(name).expanduser()]
+        places = [as_path(name)]
     else:
         shipped = (folder / name / "target" for folder in (results_dir(results) / "pretrained", shipped_dir()))
         places = [artifact(results, "target", name), *shipped]
@@ -47,7 +59,7 @@ def find_target(results: str, name: str) -> Path:
             return place
     known = sorted({p.parent.parent.name for p in shipped_dir().glob("*/target/target.json")})
     known += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("*/target.json")})
-    raise CheckpointError(
+    raise UsageError(
         f"no target '{name}' in {', '.join(map(str, places))}: train it with 'kerv train target name={name}'"
         + (f", or take one of {', '.join(dict.fromkeys(known))}" if known else "")
     )

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import functools
 import importlib
-import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any
 
 from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.limits import check_settings
 
 PLUGINS = "KERV_PLUGINS"
 
@@ -29,11 +29,6 @@ class NoSettings:
     """A part without settings but its name."""
 
     kind: str = "none"
-
-
-def number(default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> Any:
-    """A field of a part's settings with limits: least ≤ value ≤ most and value > above; None is let through."""
-    return field(default=default, metadata={"limits": (least, most, above)})
 
 
 def nothing(settings: Any) -> tuple[str, ...]:
@@ -47,9 +42,9 @@ class Part:
 
     kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
     environment or executor. build: `module:function`; its arguments are documented where the kind is used. settings:
-    dataclass of its settings, with defaults; limits by `number`. needs: artifact kinds that these settings need. check:
-    raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines and timeline. traits:
-    further properties that the kind asks for, e.g. when a proposer can draft.
+    dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these settings need.
+    check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines and timeline.
+    traits: further properties that the kind asks for, e.g. when a proposer can draft.
     """
 
     kind: str
@@ -66,19 +61,12 @@ class Part:
         return load(self.build)(*arguments, **keywords)
 
     def check_settings(self, settings: Any, what: str) -> None:
-        """Checks every number against its limits, then `check`. what: how messages call the settings.
+        """Checks these settings as `limits.check_settings`, then by `check`. what: how messages call the settings.
 
         Raises:
             UsageError: a number out of range, or settings that do not fit together.
         """
-        for name, limits in ((f.name, f.metadata["limits"]) for f in fields(settings) if "limits" in f.metadata):
-            value, (least, most, above) = getattr(settings, name), limits
-            if value is None or (least <= value <= most and value > above):
-                continue
-            wanted = "a number" if math.isinf(least) else f"at least {least:g}"
-            if not math.isinf(most):
-                wanted = f"from {least:g} to {most:g}" if math.isinf(above) else f"above {above:g}, at most {most:g}"
-            raise UsageError(f"{what}.{name}={value}: {wanted}")
+        check_settings(settings, what)
         if self.check is not None:
             self.check(settings)
 

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from kerv_cli import manifests, parts
+from kerv_cli.errors import UsageError
+from kerv_cli.limits import choice, limits, number
 from kerv_cli.registry import NoSettings
 
 EVALUATION_SEED = 100_000
@@ -21,9 +23,9 @@ class CameraSettings:
     """The policy's view: a camera of the environment, vertical field of view in degrees, pixels, supersampling."""
 
     name: str = ""  # empty: the environment's first camera
-    fovy: float = 45.0
-    size: int = 96  # pixels, square
-    supersample: int = 2
+    fovy: float = number(45.0, above=0, most=179)
+    size: int = number(96, 8, 4096)  # pixels, square
+    supersample: int = number(2, 1, 16)
 
 
 @dataclass
@@ -31,7 +33,7 @@ class WorldSettings:
     """The simulated world of an episode."""
 
     camera: CameraSettings = field(default_factory=CameraSettings)
-    horizon: int = 0  # control steps; 0: the environment's
+    horizon: int = number(0, 0, 1_000_000)  # control steps; 0: the environment's
 
 
 @dataclass
@@ -39,10 +41,10 @@ class RuntimeSettings:
     """Device, number format and parallelism of a process."""
 
     device: str = "cpu"  # cpu | cuda | auto
-    dtype: str = "float32"
-    threads: int = 1  # torch threads of each process
+    dtype: str = choice("float32", "float32", "bfloat16", "float16")
+    threads: int = number(1, 1, 256)  # torch threads of each process
     executor: str = "local"  # sweeps: what runs the blocks: local (processes here) | slurm | ray
-    workers: int = 1  # sweeps: blocks that run at the same time
+    workers: int = number(1, 1, 4096)  # sweeps: blocks that run at the same time
     executor_options: dict[str, Any] = field(default_factory=dict)  # see SlurmOptions, RayOptions in parts.py
 
 
@@ -74,7 +76,7 @@ MODEL, EXPERT = "model", "expert"
 class PolicySettings:
     """What chooses the actions. Weights are named by folders of results/pretrained or results/artifacts, or paths."""
 
-    kind: str = MODEL  # model | expert (the environment's scripted policy: privileged, the reference of success)
+    kind: str = choice(MODEL, MODEL, EXPERT)  # expert: the environment's script, privileged, the reference of success
     target: str = "mt10-vision"
     drafter: str | None = None  # these: default the one beside the target
     early: str | None = None
@@ -91,8 +93,9 @@ class PolicySettings:
 class RolloutSettings(TaskSettings):
     """`kerv rollout`: episodes of one method. Its parts are settings of the classes in kerv_cli/parts.py."""
 
-    episodes: int = 3  # per task
-    seed: int = EVALUATION_SEED  # first seed; episode i uses seed + i in every setting: that is the pairing
+    episodes: int = number(3, 1, 1_000_000)  # per task
+    # first seed; episode i uses seed + i in every setting: that is the pairing
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1)
     policy: PolicySettings = field(default_factory=PolicySettings)
     method: str = "ar"  # name of the composition; its parts follow
     prefill_draft: Any = field(default_factory=NoSettings)  # a proposer, before the prefill
@@ -102,12 +105,12 @@ class RolloutSettings(TaskSettings):
     rectifier: Any = field(default_factory=lambda: NoSettings("reinfer"))
     boundary: Any = field(default_factory=lambda: NoSettings("always"))
     skip: Any = field(default_factory=NoSettings)
-    chunk: int = 0  # H, control steps decoded at once; 0: as many as the target was trained for
+    chunk: int = number(0, 0, 1024)  # H, control steps decoded at once; 0: as many as the target was trained for
     datastore: Any = field(default_factory=lambda: NoSettings("exact"))
     world: WorldSettings = field(default_factory=WorldSettings)
-    deviation_every: int = 0  # decodes between two deviation samples; 0: never
-    record: int = 1  # episodes per task that are saved as .rrd; -1: all
-    record_size: int = 240  # pixels of the logged camera
+    deviation_every: int = number(0, 0, 1_000_000)  # decodes between two deviation samples; 0: never
+    record: int = number(1, -1, 1_000_000)  # episodes per task that are saved as .rrd; -1: all
+    record_size: int = number(240, 8, 4096)  # pixels of the logged camera
 
     def __post_init__(self) -> None:
         if self.policy.kind == EXPERT:
@@ -155,8 +158,8 @@ class StudySettings:
     common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
-    block: int = 5  # seeds for which the settings take turns in one process, episode by episode
-    repeats: int = 1  # how often every episode is measured
+    block: int = number(5, 1, 10_000)  # seeds for which the settings take turns in one process, episode by episode
+    repeats: int = number(1, 1, 1_000)  # how often every episode is measured
 
 
 @dataclass
@@ -171,41 +174,48 @@ class TargetSettings:
     """Shapes of the target (docs/methods.md §0). `conf/target/*.yaml` are the sizes."""
 
     size: str = "small"
-    observation: str = "vision"  # vision | state (privileged: the places' positions are given)
-    width: int = 192
-    layers: int = 8
-    heads: int = 6
-    feed_forward: int = 512
-    chunk: int = 4  # H, control steps per decode
-    grid: int = 4  # vision tokens per side
-    keypoints: int = 32  # spatial soft-argmax points of the vision encoder
-    channels: int = 24  # width of the vision encoder's first stage
-    scene_tokens: int = 4  # tokens that carry the places' positions, estimated (vision) or given (state)
-    instruction_tokens: int = 10
-    image_size: int = 96
+    observation: str = choice("vision", "vision", "state")  # state: privileged, the places' positions are given
+    width: int = number(192, 2, 65_536)
+    layers: int = number(8, 1, 1024)
+    heads: int = number(6, 1, 1024)
+    feed_forward: int = number(512, 1, 262_144)
+    chunk: int = number(4, 1, 1024)  # H, control steps per decode
+    grid: int = number(4, 1, 512)  # vision tokens per side
+    keypoints: int = number(32, 1, 4096)  # spatial soft-argmax points of the vision encoder
+    channels: int = number(24, 1, 4096)  # width of the vision encoder's first stage
+    scene_tokens: int = number(4, 1, 1024)  # they carry the places' positions, estimated (vision) or given (state)
+    instruction_tokens: int = number(10, 1, 1024)
+    image_size: int = number(96, 8, 4096)
     parallel: bool = False  # decodes all tokens of a chunk at once, each without the others (docs/methods.md §6)
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError for a width that the heads do not divide, or an image that the grid does not divide."""
+        if self.width % (2 * self.heads):
+            raise UsageError(f"{prefix}width={self.width} must be a multiple of 2 x {prefix}heads={self.heads}")
+        if self.observation == "vision" and self.image_size % (8 * self.grid):
+            raise UsageError(f"{prefix}image_size={self.image_size} must be a multiple of 8 x {prefix}grid={self.grid}")
 
 
 @dataclass
 class TrainSettings:
     """Optimisation. The batch of step s depends on (seed, s) alone, so a resumed run repeats the uninterrupted one."""
 
-    steps: int = 20_000
-    batch: int = 64
-    lr: float = 1e-3
-    warmup: int = 300
-    weight_decay: float = 0.02
-    clip: float = 1.0
-    ema: float = 0.999
+    steps: int = number(20_000, 1, 10**9)
+    batch: int = number(64, 1, 65_536)
+    lr: float = number(1e-3, 0, 10)
+    warmup: int = number(300, 0, 10**9)
+    weight_decay: float = number(0.02, 0, 100)
+    clip: float = number(1.0, above=0, most=1e9)
+    ema: float = number(0.999, 0, 0.999999)
     init: str | None = None  # target that gives the initial weights; its chunk may be shorter or longer
     freeze: list[str] = field(default_factory=list)  # modules of the target that keep the weights of `init`
-    label_sigma: float = 1.0  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
-    scene_weight: float = 1.0  # weight of the position loss (vision only)
-    scene_steps: int = 0  # first steps that train only the vision encoder, on positions
-    held_out: float = 0.1  # share of episodes kept for validation
-    validate_every: int = 2_000
-    closed_loop: int = 0  # episodes per task and validation, closed loop
-    seed: int = 0
+    label_sigma: float = number(1.0, 0, 1000)  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
+    scene_weight: float = number(1.0, 0, 1e6)  # weight of the position loss (vision only)
+    scene_steps: int = number(0, 0, 10**9)  # first steps that train only the vision encoder, on positions
+    held_out: float = number(0.1, above=0, most=0.5)  # share of episodes kept for validation
+    validate_every: int = number(2_000, 1, 10**9)
+    closed_loop: int = number(0, 0, 100_000)  # episodes per task and validation, closed loop
+    seed: int = number(0, 0, 2**31 - 1)
     bf16: bool = True  # autocast the training forward to bfloat16
     half: bool = False  # weights on disk in float16: half the size, for shipping
 
@@ -214,7 +224,7 @@ class TrainSettings:
 class TrainTargetSettings(TaskSettings):
     """`kerv train target`."""
 
-    name: str = "mt10-vision"
+    name: str = "mt10-vision"  # of the folder below results/artifacts/target, or a path
     demos: str = "mt10"
     target: TargetSettings = field(default_factory=TargetSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
@@ -226,10 +236,10 @@ class DemosSettings(TaskSettings):
     """`kerv demos`."""
 
     name: str | None = None  # default: the tasks' names, in small letters
-    episodes: int = 100  # per task
-    seed: int = 0
-    perturbed: float = 0.5
-    frame_stride: int = 2
+    episodes: int = number(100, 1, 100_000)  # per task
+    seed: int = number(0, 0, 2**31 - 1)
+    perturbed: float = number(0.5, 0, 1)
+    frame_stride: int = number(2, 1, 10_000)
     world: WorldSettings = field(default_factory=WorldSettings)
 
 
@@ -262,15 +272,15 @@ class DrafterSettings:
     early: a residual network from the prompt and the last actions to the whole chunk, before the target runs (§5)."""
 
     kind: str = "eagle"  # eagle | early
-    layers: int = 1
-    width: int = 512  # early: hidden units
-    rank: int = 64  # early: features per token in front of the bins
-    history: int = 2  # early: last executed actions it reads
-    noise: float = 0.0  # uniform noise on the input states, training only
-    unroll: int = 3  # passes that feed the drafter its own predicted states, as drafting does; 1: the paper's
-    samples: int = 12_000  # observations whose greedy decodes it is trained on
-    state_weight: float = 1.0  # smooth-L1 on the hidden state
-    token_weight: float = 0.1  # soft cross-entropy with the target's distribution
+    layers: int = number(1, 0, 1024)
+    width: int = number(512, 1, 65_536)  # early: hidden units
+    rank: int = number(64, 1, 65_536)  # early: features per token in front of the bins
+    history: int = number(2, 0, 1024)  # early: last executed actions it reads
+    noise: float = number(0.0, 0, 100)  # uniform noise on the input states, training only
+    unroll: int = number(3, 1, 64)  # passes fed with its own predicted states, as drafting does; 1: the paper's
+    samples: int = number(12_000, 1, 10**8)  # observations whose greedy decodes it is trained on
+    state_weight: float = number(1.0, 0, 1e6)  # smooth-L1 on the hidden state
+    token_weight: float = number(0.1, 0, 1e6)  # soft cross-entropy with the target's distribution
 
 
 @dataclass
@@ -289,7 +299,7 @@ class DoctorSettings(RunSettings):
 
     policy: PolicySettings = field(default_factory=lambda: PolicySettings(target=""))  # target=NAME says policy.target
     environment: str | None = None
-    seed: int = EVALUATION_SEED
+    seed: int = number(EVALUATION_SEED, 0, 2**31 - 1)
     world: WorldSettings = field(default_factory=WorldSettings)
 
 
@@ -366,10 +376,10 @@ class BuildDatastoreSettings(TaskSettings):
     policy: PolicySettings = field(default_factory=PolicySettings)
     name: str | None = None  # default: datastore/ beside the target
     demos: str = "mt10"
-    episodes: int = 0  # per task, the first ones by seed; 0: all
-    stride: int = 1  # of an episode's observations every so many become entries
+    episodes: int = number(0, 0, 100_000)  # per task, the first ones by seed; 0: all
+    stride: int = number(1, 1, 10_000)  # of an episode's observations every so many become entries
     half: bool = False  # keys on disk in float16: half the size, for shipping
-    components: int = 0  # directions that keys are projected onto; 0: keys stay as they are
+    components: int = number(0, 0, 65_536)  # directions that keys are projected onto; 0: keys stay as they are
     key: list[str] = field(default_factory=lambda: ["scene"])  # pooled parts of the prompt; also vision, proprioception
 
 
@@ -380,18 +390,28 @@ class CalibrateSettings(TaskSettings):
     policy: PolicySettings = field(default_factory=PolicySettings)
     name: str | None = None  # default: beside the target
     demos: str = "mt10"
-    episodes: int = 0  # per task, the first ones by seed; 0: all
-    held_out: float = 0.1  # share of episodes that the errors are measured on
-    history: str = "labels"  # what predictions are made from: labels (clean) | executed (perturbed episodes: noisy)
-    window: int = 10  # control steps of history
-    fit_steps: int = 0  # steps ahead whose mean error is fitted; 0: the target's chunk
-    epsilon: float = 0.1  # verify-skip: mean abs error of a retrieved chunk that is good enough, normalised units
-    confidence: float = 0.9  # verify-skip: share of skipped chunks whose error stays below epsilon
-    boundary_windows: list[int] = field(default_factory=lambda: [5, 15, 30])  # positions; each has ranges of its own
-    decodes: int = 60  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
+    episodes: int = number(0, 0, 100_000)  # per task, the first ones by seed; 0: all
+    held_out: float = number(0.1, above=0, most=0.5)  # share of episodes that the errors are measured on
+    # what predictions are made from; labels: clean, executed: noisy in perturbed episodes
+    history: str = choice("labels", "labels", "executed")
+    window: int = number(10, 4, 10_000)  # control steps of history; predictors need four
+    fit_steps: int = number(0, 0, 1024)  # steps ahead whose mean error is fitted; 0: the target's chunk
+    # verify-skip: mean abs error of a retrieved chunk that is good enough, normalised units
+    epsilon: float = number(0.1, above=0, most=1e6)
+    confidence: float = number(0.9, 0.5, 0.999999)  # verify-skip: share of skipped chunks with an error below epsilon
+    # positions; each has ranges of its own
+    boundary_windows: list[int] = field(default_factory=lambda: [5, 15, 30], metadata=limits(3, 10_000))
+    decodes: int = number(60, 0, 100_000)  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
     proposer: Any = field(default_factory=parts.DrafterProposerSettings)  # pre-sampling decodes with these parts
     acceptance: Any = field(default_factory=parts.RelaxedAcceptanceSettings)
     threshold: Any = field(default_factory=parts.FixedThresholdSettings)
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError without a window, or for a pre-sampling that drafts nothing."""
+        if not self.boundary_windows:
+            raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
+        if self.decodes and self.proposer.kind == "none":
+            raise UsageError("proposer.kind=none drafts nothing to compare: choose a proposer, or decodes=0")
 
 
 def as_plain(settings: Any) -> dict[str, Any]:

@@ -267,7 +267,7 @@ def test_always_chooses_nothing() -> None:
     ("kind", "values", "error", "says"),
     [
         ("fusd", {}, UnknownName, "unknown boundary 'fusd': did you mean fused"),
-        ("fused", {"window": 2}, UsageError, "boundary.window=2: at least 3"),
+        ("fused", {"window": 2}, UsageError, "boundary.window=2: from 3 to"),
         ("fused", {"alpha": 1.5}, UsageError, "boundary.alpha=1.5: from 0 to 1"),
         ("fused", {"alpha": math.nan}, UsageError, "boundary.alpha=nan: from 0 to 1"),
         ("fused", {"f_star": math.nan}, UsageError, "boundary.f_star=nan"),

@@ -372,12 +372,12 @@ def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
         ("epsilon=0", UsageError, "epsilon=0"),
         ("confidence=0.4", UsageError, "confidence=0.4"),
         ("confidence=1", UsageError, "confidence=1"),
-        ("boundary_windows=[2]", UsageError, "boundary_windows=.2"),
+        ("boundary_windows=[2]", UsageError, "boundary_windows=2"),
         ("fit_steps=5", UsageError, "the target's chunk of 4"),
         ("proposer=none", UsageError, "drafts nothing to compare"),
         ("task=push", CheckpointError, "no episode of push-v3"),
         ("demos=absent", CheckpointError, "kerv demos"),
-        ("policy.target=absent", CheckpointError, "no target 'absent'"),
+        ("policy.target=absent", UsageError, "no target 'absent'"),
     ],
 )
 def test_wrong_requests_get_one_line(results: Path, override: str, kind: type[KervError], says: str) -> None:

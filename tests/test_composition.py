@@ -103,6 +103,11 @@ def composed(*overrides: str) -> RolloutSettings:
     return compose("rollout", overrides, RolloutSettings)
 
 
+def checked(overrides: str) -> None:
+    asked = composed(*overrides.split())
+    check(asked.parts(), asked.chunk, 4)
+
+
 def test_every_method_has_a_row_here() -> None:
     assert set(METHODS) == set(PRESETS)
 
@@ -182,7 +187,7 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
         ("prefill_draft=retrieval prefill_draft.neighbours=0", "neighbours=0"),
         ("prefill_draft.kind=drafter", "prefill_draft=drafter"),
         ("chunk=5", "trained for 4 control steps"),
-        ("chunk=-1", "trained for 4 control steps"),
+        ("chunk=-1", "chunk=-1: from 0 to 1024"),
         ("proposer.kind=nope", "proposer.kind 'nope'"),
         ("proposer=drafter proposer.kind=hold", "choose proposer=hold"),
         ("boundary.kind=nope", "boundary.kind 'nope'"),
@@ -200,9 +205,8 @@ def test_a_damaged_stored_setting_gets_one_line(change: Any, error: type[Excepti
     ],
 )
 def test_what_does_not_belong_together_is_refused(overrides: str, says: str) -> None:
-    asked = composed(*overrides.split())
     with pytest.raises(KervError) as refused:
-        check(asked.parts(), asked.chunk, 4)
+        checked(overrides)
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 

@@ -351,5 +351,5 @@ def test_progress_on_a_terminal_is_a_bar_that_goes_away(store: StudyStore) -> No
 
 
 def test_no_workers_is_refused(store: StudyStore) -> None:
-    with pytest.raises(UsageError, match=r"runtime\.workers=0: at least 1"):
+    with pytest.raises(UsageError, match=r"runtime\.workers=0: from 1 to"):
         execute([], prepare, store, RuntimeSettings(workers=0))

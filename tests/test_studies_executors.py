@@ -136,7 +136,7 @@ def test_a_package_that_is_not_installed_is_named_with_its_command(name: str, mo
     ("settings", "message"),
     [
         (RuntimeSettings(executor="slrum"), "unknown executor 'slrum': did you mean slurm"),
-        (RuntimeSettings(workers=0), r"runtime\.workers=0: at least 1"),
+        (RuntimeSettings(workers=0), r"runtime\.workers=0: from 1 to"),
         (runtime("slurm", minutes="long"), r"runtime\.executor_options: minutes: input should be a valid integer"),
         (runtime("local", partition="x"), r"runtime\.executor_options: partition: unexpected"),
     ],

@@ -119,8 +119,12 @@ def test_seeds_come_in_blocks_and_repeats_are_cells_of_their_own() -> None:
     assert all([cell.label for cell in block.cells] == ["ar", "b"] for block in blocks)
     assert blocks[0].name == "reach-v3 100000-100002"
     assert blocks[-1].name == "push-v3 100006 repeat 1"
-    with pytest.raises(UsageError, match=r"study\.block=0"):
-        plan(settings, ["reach-v3"], IDENTITY, block=0)
+
+
+def test_a_plan_is_counted_before_it_is_made() -> None:
+    settings = {"ar": settings_of("ar", episodes=1_000_000)}
+    with pytest.raises(UsageError, match="the study has 200000 cells: at most 100000"):
+        plan(settings, ["reach-v3"], IDENTITY, block=5)
 
 
 def test_what_differs_in_threads_cannot_take_turns_in_one_process() -> None:

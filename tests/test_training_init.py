@@ -140,7 +140,7 @@ def test_another_shape_is_refused_by_its_name(results: Path, override: str, shap
 
 
 def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
-    with pytest.raises(CheckpointError, match="no target 'nobody'"):
+    with pytest.raises(UsageError, match="no target 'nobody'"):
         TargetRun(settings(results, "train.init=nobody"))
     for same in ("train.init=old", f"train.init={results}/artifacts/target/old"):
         with pytest.raises(UsageError, match="would be overwritten"):

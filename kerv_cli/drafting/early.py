@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
-from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import Description, TargetDescription, read_description, save_module
@@ -56,9 +56,6 @@ class EarlyDrafter(nn.Module):
     """A residual network from (pooled prompt (F,), h past actions (h, D)) to the logits (N, V) of all tokens.
 
     actions: the action space of its tokens; chunk: H; features: F.
-
-    Raises:
-        UsageError: a width, rank, number of layers or history out of range.
     """
 
     mean: Tensor
@@ -67,8 +64,6 @@ class EarlyDrafter(nn.Module):
 
     def __init__(self, settings: DrafterSettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
-        if min(settings.width, settings.rank) < 1 or min(settings.layers, settings.history) < 0:
-            raise UsageError("drafter: width and rank must be at least 1, layers and history at least 0")
         self.settings, self.actions, self.chunk = settings, actions, chunk
         self.tokens = chunk * actions.dofs
         # prompt embeddings differ in size by orders of magnitude; actions lie in [-1, 1] as they are

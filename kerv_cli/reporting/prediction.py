@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from kerv_cli.decoding.calibration_file import Calibration, Errors, calibration_place, read_calibration
 from kerv_cli.drafting.kinematics import PREDICTORS
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import UsageError
 from kerv_cli.files import sha256_of
 from kerv_cli.places import find_target
 from kerv_cli.reporting.drawing import INK, STYLE, colour, entitle, new_figure
@@ -49,7 +49,7 @@ def read_predictions(results: Path, target: str) -> Predictions | None:
     """
     try:
         path = calibration_place(str(results), None, find_target(str(results), target))
-    except CheckpointError:
+    except UsageError:  # no such target
         return None
     if not path.is_file():
         return None

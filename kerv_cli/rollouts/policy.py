@@ -14,11 +14,11 @@ from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.errors import UsageError
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.runtime import set_up
-from kerv_cli.settings import EXPERT, MODEL, RolloutSettings
+from kerv_cli.settings import EXPERT, RolloutSettings
 from kerv_cli.spaces import Observation
 
 WARM_UP_DECODES = 6
@@ -65,10 +65,6 @@ def check(settings: RolloutSettings) -> None:
             not belong together.
         CheckpointError: no such policy, a damaged one, an artifact of another target or another action space.
     """
-    if settings.episodes < 1:
-        raise UsageError(f"episodes={settings.episodes}: at least 1")
-    if settings.policy.kind not in (MODEL, EXPERT):
-        raise UnknownName("policy.kind", settings.policy.kind, (MODEL, EXPERT))
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)

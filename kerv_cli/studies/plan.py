@@ -18,6 +18,9 @@ from kerv_cli.studies.code import code_hash
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
 
+MOST_CELLS = 100_000
+"""Cells of a study; more are refused before they are planned."""
+
 OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
@@ -159,12 +162,14 @@ def plan(
 
     Raises:
         ValueError: `baseline` is no label, or a device is `auto`.
-        UsageError: `block` or `repeats` is less than 1.
+        UsageError: more than MOST_CELLS cells.
     """
     if baseline is not None and baseline not in settings_by_label:
         raise ValueError(f"baseline '{baseline}' is not among the settings {list(settings_by_label)}")
-    if min(block, repeats) < 1:
-        raise UsageError(f"study.block={block} and study.repeats={repeats} must be at least 1")
+    blocks = sum(-(-settings.episodes // block) for settings in settings_by_label.values())
+    tasks = list(dict.fromkeys(tasks))
+    if blocks * len(tasks) * repeats > MOST_CELLS:
+        raise UsageError(f"the study has {blocks * len(tasks) * repeats} cells: at most {MOST_CELLS}, plan fewer")
     labels = sorted(settings_by_label, key=lambda label: label != baseline)
     hashes = {label: identity(s) if callable(identity) else identity for label, s in settings_by_label.items()}
     plain = {label: dataclasses.asdict(settings) for label, settings in settings_by_label.items()}
@@ -172,7 +177,7 @@ def plan(
     return [
         make_cell(label, written.get(label, ""), plain[label], hashes[label], task, seeds, repeat)
         for repeat in range(repeats)
-        for task in dict.fromkeys(tasks)
+        for task in tasks
         for label in labels
         for seeds in _seed_blocks(settings_by_label[label], block)
     ]

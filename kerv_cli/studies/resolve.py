@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from kerv_cli.config import compose, expand, swept_keys
+from kerv_cli.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
 from kerv_cli.environments import resolve_tasks, settled, spec_of
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
@@ -25,13 +24,13 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     """The chosen study; overrides of `study…` and `results` go to the sweep, all others to each of its settings.
 
     Raises:
-        UsageError: an unknown key or name; a key on the command line that the study itself varies.
+        UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
     """
     mine = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in ("study", "results")]
     theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
     sweep = compose("sweep", mine, SweepSettings)
     given = {_key(o) for o in theirs}
-    common = [o for o in shlex.split(sweep.study.common) if _key(o) not in given] + theirs
+    common = [o for o in split_words(sweep.study.common) if _key(o) not in given] + theirs
     written = _points(sweep.study)
     for words in written.values():
         varied = given & {_key(word) for word in words}
@@ -39,7 +38,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
             raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
     if sweep.study.baseline not in written:
         raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(written)}")
-    settings = {label: compose("rollout", [*common, *words], RolloutSettings) for label, words in written.items()}
+    composer = Composer("rollout", RolloutSettings)
+    settings = {label: composer.compose([*common, *words]) for label, words in written.items()}
     for setting in settings.values():
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
     return ResolvedStudy(sweep.study, settings, {label: " ".join(words) for label, words in written.items()})
@@ -57,4 +57,6 @@ def _points(study: StudySettings) -> dict[str, list[str]]:
         for words in expand(text):
             values = [f"{_key(w).rsplit('.', 1)[-1]}={w.split('=', 1)[1]}" for w in words if _key(w) in varied]
             written[" ".join([label, *values])] = words
+        if len(written) > MOST_POINTS:
+            raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
     return written

@@ -34,6 +34,7 @@ import yaml
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, sync
+from kerv_cli.limits import check_name
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies import rows
 from kerv_cli.studies.claims import is_alive, write_lock
@@ -66,9 +67,7 @@ class StudyStore:
     """
 
     def __init__(self, results: Path | str, name: str) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-            raise UsageError(f"study name '{name}' must be letters, digits, '_', '-', '.'")
-        self.name = name
+        self.name = check_name(name, "study name")
         self.root = Path(results) / "studies" / name
         self.cells = self.root / "cells"
         self.rollouts = self.root / "rollouts"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kerv_cli.artifacts import Artifacts, MadeFor
-from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
+from kerv_cli.decoding.boundary import BoundaryRanges
 from kerv_cli.decoding.build import compose
 from kerv_cli.decoding.calibration_file import (
     BoundarySection,
@@ -23,17 +23,15 @@ from kerv_cli.decoding.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from kerv_cli.drafting.kinematics import MINIMUM
 from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.errors import CheckpointError, KervError, UsageError
 from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.spaces import Observation, ObservationSpace
 from kerv_cli.training.observations import check_frames, check_spaces, instruction_of
 from kerv_cli.training.predictor_fit import (
-    HISTORIES,
     Windows,
     choose_episodes,
     fit_filters,
@@ -107,13 +105,12 @@ class CalibrationRun:
 
     def __init__(self, settings: CalibrateSettings) -> None:
         self.settings = settings
-        _check_settings(settings)
         self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
         self.tasks = resolve_tasks(settings.task)
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.described = self.artifacts.description
         self.described.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
-        if not 0 <= settings.fit_steps <= self.described.chunk:
+        if settings.fit_steps > self.described.chunk:
             raise UsageError(
                 f"fit_steps={settings.fit_steps}: at most the target's chunk of {self.described.chunk}, 0 for all of it"
             )
@@ -266,23 +263,6 @@ class CalibrationRun:
                 origins[name] = earlier.provenance.get("kept", {}).get(name, made)
             self.notes.append(f"{reasons.get(name, name)}; {'kept from the earlier run' if kept else 'left empty'}")
         return sections, origins
-
-
-def _check_settings(settings: CalibrateSettings) -> None:
-    if settings.history not in HISTORIES:
-        raise UnknownName("history", settings.history, HISTORIES)
-    if settings.window < MINIMUM:
-        raise UsageError(f"window={settings.window}: at least {MINIMUM}")
-    if not 0 < settings.epsilon < math.inf:
-        raise UsageError(f"epsilon={settings.epsilon}: above 0, in normalised action units")
-    if not 0.5 <= settings.confidence < 1:
-        raise UsageError(f"confidence={settings.confidence}: from 0.5 to below 1")
-    if not settings.boundary_windows or min(settings.boundary_windows) < LEAST:
-        raise UsageError(f"boundary_windows={settings.boundary_windows}: at least {LEAST} positions each")
-    if settings.decodes < 0:
-        raise UsageError(f"decodes={settings.decodes}: 0 for none, or the number per task")
-    if settings.decodes and settings.proposer.kind == "none":
-        raise UsageError("proposer.kind=none drafts nothing to compare: choose a proposer, or decodes=0")
 
 
 def spread(levels: Sequence[float], least: float) -> Variability:

@@ -115,11 +115,8 @@ class DatastoreBuild:
         tasks = sorted(resolve_tasks(settings.task))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
-        if not settings.key or settings.episodes < 0 or settings.stride < 1 or settings.components < 0:
-            raise UsageError(
-                f"key={settings.key} episodes={settings.episodes} stride={settings.stride} "
-                f"components={settings.components}: name a key, episodes and components from 0 on, stride from 1 on"
-            )
+        if not settings.key:
+            raise UsageError(f"key=[]: name at least one part of the prompt: {', '.join(KEYS)}")
         known = [name for name in KEYS if name != "vision" or self.artifacts.description.cameras]
         for name in settings.key:
             if name not in known:

@@ -14,7 +14,7 @@ from kerv_cli.environments import spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.demos.frames import EncodedFrames
-from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import TargetSettings
 from kerv_cli.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.compact.target import Inputs
@@ -154,17 +154,15 @@ S = TypeVar("S", bound=Rows)
 
 def split(samples: S, share: float) -> tuple[S, S]:
     """(training, held out) by whole episodes, of samples with a tensor `episodes`. Every k-th episode is held out, so
-    that each task, plain and perturbed, is in both parts.
+    that each task, plain and perturbed, is in both parts. share: above 0, at most 0.5.
 
     Raises:
-        UsageError: a share out of range. CheckpointError: a single episode.
+        CheckpointError: a single episode.
     """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
     count = int(episodes.max()) + 1
     if count < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    if not 0 < share <= 0.5:
-        raise UsageError(f"train.held_out={share}: more than 0, at most 0.5")
     every = min(max(2, round(1 / share)), count)
     held = episodes % every == every - 1
     return samples.where(~held), samples.where(held)

@@ -12,7 +12,7 @@ import numpy as np
 
 from kerv_cli.decoding.calibration_file import Errors
 from kerv_cli.drafting.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
-from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.errors import CheckpointError, KervError
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.training.observations import check_tail
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 RATIOS = np.logspace(-3, 3, 49)  # q / r that are tried, r = 1
 DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)  # tried by the damped filter
-HISTORIES = ("labels", "executed")
 
 
 @dataclass(frozen=True)
@@ -112,12 +111,7 @@ def choose_episodes(dataset: DemoDataset, tasks: Iterable[str], limit: int, shar
 
     Raises:
         CheckpointError: a task has no demonstration.
-        UsageError: `share` or `limit` out of range.
     """
-    if not 0 < share <= 0.5:
-        raise UsageError(f"held_out={share}: more than 0, at most 0.5")
-    if limit < 0:
-        raise UsageError(f"episodes={limit}: 0 for all, or the number per task")
     by_task: dict[str, list[int]] = defaultdict(list)
     for index, entry in enumerate(dataset.episodes):
         by_task[entry.task].append(index)

@@ -131,8 +131,6 @@ class TargetRun(Run):
         self.tasks = resolve_tasks(settings.task)
         self.spec = spec_of(self.tasks[0])
         self.world = settled(settings.world, self.spec)
-        if settings.target.observation not in ("vision", "state"):
-            raise UsageError(f"target.observation={settings.target.observation}: vision or state")
         if settings.target.image_size != settings.world.camera.size:
             raise UsageError(
                 f"target.image_size={settings.target.image_size} but world.camera.size={settings.world.camera.size}: "

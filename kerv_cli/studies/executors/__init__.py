@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.limits import check_settings
 from kerv_cli.manifests import read
 from kerv_cli.registry import find
 from kerv_cli.settings import RuntimeSettings
@@ -48,11 +49,10 @@ def check_executor(runtime: RuntimeSettings) -> Any:
 
     Raises:
         UnknownName: no such executor.
-        UsageError: an unknown option, a package that is not installed, fewer than one worker.
+        UsageError: an unknown option, a package that is not installed, a setting out of range.
     """
     part = find("executor", runtime.executor)
-    if runtime.workers < 1:
-        raise UsageError(f"runtime.workers={runtime.workers}: at least 1")
+    check_settings(runtime, "runtime")
     package = part.traits.get("package")
     if package is not None and importlib.util.find_spec(package) is None:
         raise UsageError(

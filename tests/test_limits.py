@@ -1,0 +1,146 @@
+"""Every setting has a range, and what lies outside it is refused when it is composed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import Field, fields, is_dataclass
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+from kerv_cli import settings as s
+from kerv_cli.config import MOST_POINTS, PART_GROUPS, compose, expand
+from kerv_cli.drafting.kinematics import MINIMUM
+from kerv_cli.errors import UsageError
+from kerv_cli.limits import check_settings
+from kerv_cli.places import artifact, find_target, results_dir
+from kerv_cli.registry import parts
+from kerv_cli.studies.resolve import resolve
+
+SCHEMAS = {
+    "rollout": s.RolloutSettings,
+    "sweep": s.SweepSettings,
+    "train_target": s.TrainTargetSettings,
+    "train_drafter": s.TrainDrafterSettings,
+    "demos": s.DemosSettings,
+    "doctor": s.DoctorSettings,
+    "build_datastore": s.BuildDatastoreSettings,
+    "calibrate": s.CalibrateSettings,
+}
+
+
+def numbers(kind: type) -> Iterator[tuple[type, Field[Any]]]:
+    """Every number among the fields of a dataclass and of those that it holds."""
+    hints = get_type_hints(kind)
+    for at in fields(kind):
+        hint = hints[at.name]
+        if is_dataclass(hint):
+            assert isinstance(hint, type)
+            yield from numbers(hint)
+        elif {int, float} & {hint, *get_args(hint)}:
+            yield kind, at
+
+
+def test_every_number_has_limits_and_its_default_lies_within_them() -> None:
+    kinds = list(SCHEMAS.values())
+    kinds += [part.settings for group in (*PART_GROUPS, "executor") for part in parts(group).values()]
+    open_ended = [f"{kind.__name__}.{at.name}" for k in kinds for kind, at in numbers(k) if "limits" not in at.metadata]
+    assert open_ended == []
+    for kind in kinds:
+        check_settings(kind())
+
+
+WRONG = [
+    ("rollout", "task={a:1}", "task="),
+    ("rollout", "task=[[reach]]", "task="),
+    ("rollout", "task=glob(*)", "task="),
+    ("rollout", "=1", "'=1' is not an override"),
+    ("rollout", "~method", "'~method' is not an override"),
+    ("rollout", "+foo=1", "unknown key 'foo'"),
+    ("rollout", "seed=4294967296", "seed=4294967296: from 0 to 2147483647"),
+    ("rollout", "runtime.threads=99999", "runtime.threads=99999: from 1 to 256"),
+    ("rollout", "runtime.dtype=float64", "unknown runtime.dtype 'float64'"),
+    ("rollout", "world.camera.fovy=nan", "world.camera.fovy=nan: above 0, at most 179"),
+    ("rollout", "record=-7", "record=-7"),
+    ("rollout", "policy.others={a:[1]}", "policy.others="),
+    ("rollout", "method=ar,spec_vla", "run each in turn with 'kerv rollout -m'"),
+    ("train_target", "target=tiny,small", "this command takes one"),
+    ("train_target", "train.steps=0", "train.steps=0: from 1 to"),
+    ("train_target", "train.lr=nan", "train.lr=nan"),
+    ("train_target", "train.ema=2", "train.ema=2"),
+    ("train_target", "train.batch=0", "train.batch=0"),
+    ("train_target", "target.heads=0", "target.heads=0"),
+    ("train_target", "target.layers=0", "target.layers=0"),
+    ("train_target", "target.chunk=0", "target.chunk=0"),
+    ("train_target", "target.width=33", "target.width=33 must be a multiple of 2 x target.heads=6"),
+    ("train_target", "target.image_size=90", "target.image_size=90 must be a multiple of 8 x target.grid=4"),
+    ("sweep", "study.block=0", "study.block=0"),
+    ("calibrate", "boundary_windows=[5,2]", "boundary_windows=2: from 3 to"),
+]
+
+
+@pytest.mark.parametrize(("command", "override", "says"), WRONG)
+def test_what_is_out_of_range_is_refused_in_one_line(command: str, override: str, says: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        compose(command, [override], SCHEMAS[command])
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("override", ["boundary.f_star=nan", "boundary.window=2", "skip.up=nan", "skip.up=inf"])
+def test_a_parts_numbers_have_ranges_too(override: str) -> None:
+    with pytest.raises(UsageError, match=override.partition("=")[0]):
+        compose("rollout", ["method=heisd", override], s.RolloutSettings)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        "seed=range(0,100000000)",
+        "seed=range(0,200) record=range(0,200)",
+        "seed=shuffle(range(0,100000000))",
+        "seed=range(0,10,0)",
+        "seed=range(0,inf)",
+        "seed=interval(0,1)",
+        "seed=glob(*)",
+        "study.common=\\",
+        "seed='1",
+    ],
+)
+def test_a_grid_is_counted_before_it_is_expanded(grid: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(UsageError) as refused:
+        expand(grid)
+    assert time.monotonic() - began < 5
+    assert "\n" not in str(refused.value)
+
+
+def test_a_grid_as_large_as_allowed_is_expanded() -> None:
+    assert len(expand(f"seed=range(0,{MOST_POINTS})")) == MOST_POINTS
+    assert expand("seed=range(3,0,-1)") == [["seed=3"], ["seed=2"], ["seed=1"]]
+
+
+@pytest.mark.parametrize("word", ["study.common=\\\\", "study.settings={a:'seed=range(0,1e9)'}"])
+def test_a_study_that_cannot_be_read_is_refused(word: str) -> None:
+    with pytest.raises(UsageError):
+        resolve([word])
+
+
+@pytest.mark.parametrize("name", ["..", ".", "", ".hidden", "a b", "a\0b", "n" * 300, "n" * 300 + "/x", "/a\0b"])
+def test_a_name_stays_in_its_own_kind_of_folder(name: str) -> None:
+    with pytest.raises(UsageError):
+        artifact("results", "drafter", name)
+    with pytest.raises(UsageError):
+        find_target("results", name)
+
+
+def test_a_plain_name_or_a_path_is_taken() -> None:
+    assert artifact("results", "drafter", "mt10-v1.2+b").parts[-2:] == ("drafter", "mt10-v1.2+b")
+    assert artifact("results", "drafter", "a/b").parts == ("a", "b")
+    assert results_dir("results/x").parts == ("results", "x")
+
+
+def test_limits_that_repeat_a_constant_agree_with_it() -> None:
+    window = next(at for at in fields(s.CalibrateSettings) if at.name == "window")
+    assert window.metadata["limits"][0] == MINIMUM
