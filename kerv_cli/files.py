@@ -87,14 +87,58 @@ def read_json(path: Path) -> Any:
     """The value in a JSON file.
 
     Raises:
-        CheckpointError: the file is missing, unreadable or not JSON.
+        CheckpointError: the file is missing, unreadable, not JSON, or nested deeper than kerv's own files are.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        check_shape(value)
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} cannot be read as JSON: {error}") from error
+    return value
+
+
+def read_yaml(text: str) -> Any:
+    """The plain values in a YAML text.
+
+    Raises:
+        ValueError: it is not YAML, nested too deep, or its aliases stand for more values than a file of kerv's holds.
+    """
+    import yaml
+
+    try:
+        value = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"not YAML: {error}") from error
+    check_shape(value)
+    return value
+
+
+def to_yaml(value: Any, **options: Any) -> str:
+    """Plain values as YAML."""
+    import yaml
+
+    text: str = yaml.dump(value, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False, **options)
+    return text
+
+
+def check_shape(value: Any, depth: int = 64, most: int = 5_000_000) -> None:
+    """Refuses values that later code would follow without end.
+
+    Raises:
+        ValueError: containers more than `depth` deep, or more than `most` values with every alias followed.
+    """
+    level, count = [v for v in [value] if isinstance(v, dict | list)], 0
+    for _ in range(depth):
+        if not level:
+            return
+        count += sum(map(len, level))
+        if count > most:
+            raise ValueError(f"it holds more than {most} values")
+        values = (x for v in level for x in (v.values() if isinstance(v, dict) else v))
+        level = [x for x in values if isinstance(x, dict | list)]
+    raise ValueError(f"it is nested more than {depth} deep")
 
 
 def sha256_of(path: Path) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -55,6 +55,12 @@ def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bo
         typer.echo(to_yaml(settings), nl=False)
         raise typer.Exit(0)
     return settings
+
+
+def print_notes(idle: Mapping[str, str]) -> None:
+    """Prints a line on stderr for each override that has no effect. idle: override -> why."""
+    for override, reason in idle.items():
+        typer.echo(f"note: {override} has no effect: {reason}", err=True)
 
 
 def print_plan(text: str) -> None:

@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, edge, print_table, progress_bar
+from kerv_cli.commands.common import (
+    Overrides,
+    ShowConfig,
+    ShowPlan,
+    called,
+    edge,
+    print_notes,
+    print_table,
+    progress_bar,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,6 +32,7 @@ def rollout(
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per episode."""
     from kerv_cli.config import compose, expand, to_yaml
+    from kerv_cli.effects import without_effect
     from kerv_cli.settings import RolloutSettings
 
     points = expand(overrides or []) if multirun else [list(overrides or [])]
@@ -33,6 +43,7 @@ def rollout(
             continue
         if multirun:
             typer.echo(" ".join(point))
+        print_notes(without_effect(settings, point))
         _run(settings, plan)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge, print_table
+from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge, print_notes, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.settings import RuntimeSettings
@@ -23,7 +23,7 @@ def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
     from kerv_cli.config import to_yaml
     from kerv_cli.environments import resolve_tasks
     from kerv_cli.studies.executors import check_executor
-    from kerv_cli.studies.resolve import resolve
+    from kerv_cli.studies.resolve import idle_overrides, resolve
 
     resolved = resolve(overrides or [])
     first = next(iter(resolved.settings.values()))
@@ -33,6 +33,7 @@ def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         for label, settings in resolved.settings.items():
             typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
         return
+    print_notes(idle_overrides(resolved))
     check_executor(first.runtime)
     from kerv_cli.rollouts.policy import check, identity_of
     from kerv_cli.studies.plan import plan as plan_cells

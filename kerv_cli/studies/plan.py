@@ -21,6 +21,9 @@ Identity = Mapping[str, str]
 MOST_CELLS = 100_000
 """Cells of a study; more are refused before they are planned."""
 
+MOST_SEEDS = 10_000
+"""Seeds of a cell, at most `study.block` of them."""
+
 OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
@@ -224,7 +227,10 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         ValueError: not a list of ranges.
     """
     seeds: list[int] = []
-    for part in str(text).split(";"):
+    for part in text.split(";"):
         first, _, last = part.partition("-")
-        seeds.extend(range(int(first), int(last or first) + 1))
+        drawn = range(int(first), int(last or first) + 1)
+        if not 0 < len(drawn) <= MOST_SEEDS:
+            raise ValueError(f"'{part}' is no range of seeds")
+        seeds.extend(drawn)
     return tuple(seeds)

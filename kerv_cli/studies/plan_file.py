@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import yaml
-
+from kerv_cli.files import read_yaml, to_yaml
+from kerv_cli.manifests import read
+from kerv_cli.parts import METHOD_KINDS
+from kerv_cli.settings import RolloutSettings
 from kerv_cli.studies.plan import Cell, make_cell, parse_seeds, seeds_text
 
 
@@ -26,44 +29,81 @@ class StudyPlan:
         return list(dict.fromkeys(cell.label for cell in self.cells))
 
 
+@dataclass(frozen=True)
+class _Label:
+    overrides: str
+    identity: dict[str, str]
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A cell in the file. seeds: as `seeds_text`."""
+
+    id: str
+    label: str
+    task: str
+    seeds: str
+    repeat: int
+
+
+@dataclass(frozen=True)
+class _File:
+    """plan.yaml: every label's settings once, then one line per cell."""
+
+    study: str
+    title: str
+    baseline: str
+    axis: str
+    labels: dict[str, _Label]
+    cells: tuple[_Line, ...]
+
+
 def plan_text(plan: StudyPlan) -> str:
     """The plan as YAML: every label's settings once, then one line per cell."""
     labels: dict[str, dict[str, Any]] = {}
     for cell in plan.cells:
-        settings = {key: value for key, value in cell.settings.items() if key != "task"}
-        labels.setdefault(cell.label, {"overrides": cell.overrides, "identity": cell.identity, "settings": settings})
+        if cell.label not in labels:
+            settings = {key: value for key, value in cell.settings.items() if key != "task"}
+            labels[cell.label] = {"overrides": cell.overrides, "identity": cell.identity, "settings": settings}
     head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "labels": labels}
     cells = [
         {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}
         for c in plan.cells
     ]
-    lines = yaml.safe_dump({"cells": cells}, sort_keys=False, default_flow_style=None, width=1000)
-    return yaml.safe_dump(head, sort_keys=False) + lines
+    return to_yaml(head) + to_yaml({"cells": cells}, default_flow_style=None, width=1000)
 
 
 def plan_from_text(text: str) -> StudyPlan:
     """The inverse of `plan_text`.
 
     Raises:
-        yaml.YAMLError, KeyError, TypeError, ValueError: not a plan.
+        CheckpointError, ValueError: not a plan, or one that contradicts itself.
     """
-    loaded = yaml.safe_load(text)
-    cells = []
-    for entry in loaded["cells"]:
-        label = loaded["labels"][entry["label"]]
-        cells.append(
-            Cell(
-                id=str(entry["id"]),
-                label=entry["label"],
-                overrides=label["overrides"],
-                task=entry["task"],
-                seeds=parse_seeds(entry["seeds"]),
-                settings={**label["settings"], "task": [entry["task"]]},
-                identity=label["identity"],
-                repeat=entry["repeat"],
-            )
+    found = read(_File, read_yaml(text), "the plan")
+    for label in found.labels.values():
+        read(RolloutSettings, label.settings, "the plan")
+        if any(not isinstance(label.settings.get(kind), dict) for kind in METHOD_KINDS):
+            raise ValueError(f"a label has no {' or no '.join(METHOD_KINDS)}")
+    unknown = {line.label for line in found.cells} - set(found.labels)
+    if unknown or found.baseline not in found.labels:
+        raise ValueError(f"it has no label {', '.join(sorted(unknown)) or found.baseline}")
+    return StudyPlan(found.study, found.title, found.baseline, found.axis, tuple(_cells(found)))
+
+
+def _cells(found: _File) -> Iterator[Cell]:
+    for line in found.cells:
+        label = found.labels[line.label]
+        yield Cell(
+            id=line.id,
+            label=line.label,
+            overrides=label.overrides,
+            task=line.task,
+            seeds=parse_seeds(line.seeds),
+            settings={**label.settings, "task": [line.task]},
+            identity=label.identity,
+            repeat=line.repeat,
         )
-    return StudyPlan(loaded["study"], loaded["title"], loaded["baseline"], loaded["axis"], tuple(cells))
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:

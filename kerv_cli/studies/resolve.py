@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from kerv_cli.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
+from kerv_cli.effects import without_effect
 from kerv_cli.environments import resolve_tasks, settled, spec_of
 from kerv_cli.errors import UsageError
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
@@ -18,6 +19,7 @@ class ResolvedStudy:
     study: StudySettings
     settings: Mapping[str, RolloutSettings]  # by label, the study's order
     overrides: Mapping[str, str]  # by label, as written
+    common: tuple[str, ...] = ()  # of the command line, for every setting
 
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
@@ -42,7 +44,18 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     settings = {label: composer.compose([*common, *words]) for label, words in written.items()}
     for setting in settings.values():
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
-    return ResolvedStudy(sweep.study, settings, {label: " ".join(words) for label, words in written.items()})
+    texts = {label: " ".join(words) for label, words in written.items()}
+    return ResolvedStudy(sweep.study, settings, texts, tuple(theirs))
+
+
+def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
+    """Overrides without effect -> why: a setting's own in that setting, those of the command line in every setting."""
+    found: dict[str, str] = {}
+    for label, settings in resolved.settings.items():
+        own = without_effect(settings, resolved.overrides[label].split(), sweep=True)
+        found |= {f"{label}: {word}": why for word, why in own.items()}
+    of_all = [without_effect(settings, resolved.common, sweep=True) for settings in resolved.settings.values()]
+    return found | {word: why for word, why in of_all[0].items() if all(word in idle for idle in of_all)}
 
 
 def _key(override: str) -> str:

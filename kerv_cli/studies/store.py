@@ -104,7 +104,7 @@ class StudyStore:
             return plan_from_text(self.plan_path.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"no study '{self.name}' in {self.root.parent}: {self.how_to_run()}") from None
-        except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, CheckpointError) as error:
             why = " ".join(str(error).split())[:120]
             raise CheckpointError(f"{self.plan_path} is damaged ({why}): {self.how_to_run()} again") from error
 

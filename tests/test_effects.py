@@ -1,0 +1,41 @@
+"""What a method does not read is said in one line."""
+
+from __future__ import annotations
+
+import pytest
+
+from kerv_cli.config import compose
+from kerv_cli.effects import without_effect
+from kerv_cli.settings import RolloutSettings
+from kerv_cli.studies.resolve import idle_overrides, resolve
+
+
+@pytest.mark.parametrize(
+    ("words", "idle"),
+    [
+        ("method=ar acceptance=relaxed", "acceptance=relaxed"),
+        ("method=ar threshold.r=5", "threshold.r=5"),
+        ("method=ar rectifier=compensate", "rectifier=compensate"),
+        ("method=naive_sd threshold.r=5", "threshold.r=5"),
+        ("method=spec_vla threshold.r=5", ""),
+        ("method=spec_vla acceptance=sequence threshold.r=5", "threshold.r=5"),
+        ("method=spec_vla policy.datastore=mine", "policy.datastore=mine"),
+        ("method=spec_vla policy.drafter=mine", ""),
+        ("method=spec_vla datastore=qdrant", "datastore=qdrant"),
+        ("method=early_unverified rectifier=compensate", "rectifier=compensate"),
+        ("method=ar runtime.workers=4", "runtime.workers=4"),
+        ("method=ar record=0 record_size=64", "record_size=64"),
+        ("method=ar episodes=2 seed=100007 world.horizon=9", ""),
+    ],
+)
+def test_an_override_without_effect_is_found(words: str, idle: str) -> None:
+    settings = compose("rollout", words.split(), RolloutSettings)
+    assert " ".join(without_effect(settings, words.split())) == idle
+
+
+def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
+    study = ["study.name=s", "study.baseline=a", "study.common='task=reach'"]
+    both = "study.settings={a:'method=ar',b:'method=spec_vla'}"
+    assert idle_overrides(resolve([*study, both, "threshold.r=5", "runtime.workers=2"])) == {}
+    found = idle_overrides(resolve([*study, "study.settings={a:'method=ar threshold.r=3'}", "acceptance=relaxed"]))
+    assert list(found) == ["a: threshold.r=3", "acceptance=relaxed"]
