@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from kerv_cli.parts import METHOD_KINDS, part_of
 from kerv_cli.settings import EXPERT, RolloutSettings
@@ -30,7 +30,7 @@ def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: b
     return found
 
 
-def _idle(settings: RolloutSettings) -> Mapping[str, str]:
+def _idle(settings: RolloutSettings) -> dict[str, str]:
     """Key -> why it is not read."""
     method = settings.parts()
     chosen = {kind: method[kind].kind for kind in METHOD_KINDS}

@@ -1,19 +1,21 @@
-"""Atomic writes (a file is complete or absent), JSON, hashes."""
+"""Atomic writes (a file or a folder is complete or absent), JSON and YAML, hashes."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import functools
 import hashlib
 import json
 import os
-import secrets
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from kerv_cli.errors import CheckpointError, StorageError
+from kerv_cli.leftovers import clean, temporary_beside
 
 _REFUSALS = {
     errno.ENOSPC: "the disk is full",
@@ -51,7 +53,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            candidate = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+            _clean_once(path.parent)
+            candidate = temporary_beside(path)
             candidate.touch(exist_ok=False)
             temporary = candidate
             yield temporary
@@ -61,6 +64,63 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = False) -> bool:
+    """Writes a folder atomically: `fill` gets a temporary one, which is synced and renamed -> whether it is in place.
+
+    replace: an older folder of that name is exchanged for the new one in one step; otherwise it stays and the new one
+    is discarded. When `fill` raises, everything stays as it was.
+
+    Raises:
+        StorageError: as `atomic_path`.
+    """
+    temporary = temporary_beside(folder)
+    try:
+        with storage_errors(folder):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            _clean_once(folder.parent)
+            temporary.mkdir()
+            fill(temporary)
+            for path in (*temporary.iterdir(), temporary):
+                sync(path)
+            placed = _rename_once(temporary, folder)
+            if not placed and replace:
+                _exchange(temporary, folder)
+            sync(folder.parent)
+            return placed or replace
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _rename_once(temporary: Path, folder: Path) -> bool:
+    """Renames a folder to `folder`; False if that exists already and is not empty."""
+    try:
+        os.rename(temporary, folder)
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            return False
+        raise
+    return True
+
+
+def _exchange(a: Path, b: Path) -> None:
+    """Exchanges the names of two folders in one step; in two where the file system or the system cannot."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if hasattr(libc, "renameat2"):
+        here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+        if libc.renameat2(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0:
+            return
+    aside = temporary_beside(b)
+    os.rename(b, aside)
+    os.rename(a, b)
+    os.rename(aside, a)
+
+
+@functools.cache
+def _clean_once(folder: Path) -> None:
+    """Once per process and folder: a command that goes on removes what its killed predecessor left there."""
+    clean(folder)
 
 
 def sync(path: Path) -> None:

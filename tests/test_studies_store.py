@@ -18,6 +18,7 @@ from studies_synthetic import episode, run_cell, threshold_settings, threshold_s
 
 from kerv_cli.decoding.record import PHASES
 from kerv_cli.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.leftovers import is_left_over
 from kerv_cli.studies import claims, rows
 from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.store import StudyStore, begun_studies
@@ -106,13 +107,15 @@ def test_records_of_other_seeds_are_refused(store: StudyStore, cell: Cell) -> No
 KILLED_WRITER = """
 import os, signal, sys
 from studies_synthetic import run_cell, threshold_study
+from pathlib import Path
+from kerv_cli import files
 from kerv_cli.studies import store as module
 
 cell = threshold_study(["reach-v3"])[-1]
 store = module.StudyStore(sys.argv[1], "threshold")
 records = run_cell(cell)
-write, sync = module._write_synced, module.sync
-for stage in range(5):  # before each of the four files, and between the last one and the rename
+write, sync = Path.write_bytes, files.sync
+for stage in range(9):  # within each of the four files, before each sync
     child = os.fork()
     if child == 0:
         left = [stage]
@@ -124,8 +127,8 @@ for stage in range(5):  # before each of the four files, and between the last on
             write(path, content[: len(content) // 2])
             die_when_due()
             write(path, content)
-        module._write_synced = half_written
-        module.sync = lambda folder: (die_when_due(), sync(folder))
+        Path.write_bytes = half_written
+        files.sync = lambda folder: (die_when_due(), sync(folder))
         store.write_cell(cell, records, {})
         os._exit(0)
     _, status = os.waitpid(child, 0)
@@ -137,14 +140,11 @@ for stage in range(5):  # before each of the four files, and between the last on
 def test_a_writer_killed_at_any_point_leaves_no_half_cell(store: StudyStore, cell: Cell, tmp_path: Path) -> None:
     finish(python(KILLED_WRITER, tmp_path))
     left = list(store.cells.iterdir())
-    assert len(left) == 5
-    assert all(folder.name.startswith(".") for folder in left)
-    assert store.clean_stale() == []  # young: might be in use
-    for folder in left:
-        os.utime(folder, (0, time.time() - 7 * 3600))
-    assert sorted(store.clean_stale()) == sorted(left)
+    assert len(left) == 1  # each attempt removed what the one before it left
+    assert all(is_left_over(folder) for folder in left)
     assert store.write_cell(cell, run_cell(cell), STATUS)
     assert store.has_cell(cell.id)
+    assert [folder.name for folder in store.cells.iterdir()] == [cell.id]
 
 
 def test_a_lock_that_is_a_link_is_refused_and_a_file_behind_it_stays(store: StudyStore, tmp_path: Path) -> None:
@@ -176,6 +176,20 @@ def test_claims_exclude_others_until_their_process_is_gone(store: StudyStore) ->
     assert list(folder.iterdir()) == []
 
 
+def test_what_a_killed_sweep_claimed_is_removed(store: StudyStore) -> None:
+    cells, folder = threshold_study(["reach-v3"]), store.claims
+    assert claims.claim(folder, cells[:1], "run", "living")
+    claims.note_running(folder, cells[0], "living")
+    assert claims.claim(folder, cells[1:2], "run", "dead")
+    claims.note_running(folder, cells[1], "dead")
+    path = folder / f"{cells[1].id}.json"
+    path.write_text(path.read_text().replace(str(os.getpid()), "999999999"))
+    (folder / "old.running").write_text("x")
+    (folder / f"{cells[2].id}.json").write_text("[")
+    claims.clean_void(folder)
+    assert sorted(p.name for p in folder.iterdir()) == sorted([f"{cells[0].id}.json", "living.running"])
+
+
 @pytest.mark.parametrize(("host", "pid", "hours", "held"), [
     ("here", "dead", 0, False), ("here", "alive", 0, True), ("here", "alive", 7, False),
     ("elsewhere", "dead", 0, True), ("elsewhere", "dead", 7, False),
@@ -198,17 +212,6 @@ def test_claims_expire(store: StudyStore, cell: Cell, host: str, pid: str, hours
         os.utime(path, (0, time.time() - 3600 * hours))
         claims.note_running(store.claims, cell, "block3")
         assert claims.is_claimed(store.claims, cell)
-
-
-def test_folders_of_living_processes_and_young_ones_of_other_machines_stay(store: StudyStore, cell: Cell) -> None:
-    import socket
-
-    mine = store.cells / f".{cell.id}.{socket.gethostname()}.{os.getpid()}-abcd.tmp"
-    theirs = store.cells / f".{cell.id}.elsewhere.1-abcd.tmp"
-    for folder in (mine, theirs):
-        folder.mkdir(parents=True)
-        os.utime(folder, (0, time.time() - 24 * 3600))
-    assert store.clean_stale() == []
 
 
 CONCURRENT_WRITER = """

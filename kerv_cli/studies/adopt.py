@@ -3,17 +3,14 @@ of a larger one needs no run of its own."""
 
 from __future__ import annotations
 
-import os
-import secrets
 import shutil
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 from kerv_cli.errors import CheckpointError
-from kerv_cli.files import storage_errors
+from kerv_cli.files import write_folder
 from kerv_cli.studies.plan import Block
-from kerv_cli.studies.store import StudyStore, rename_once
+from kerv_cli.studies.store import StudyStore
 
 
 def adopt(store: StudyStore, block: Block) -> bool:
@@ -54,11 +51,4 @@ def _runs(store: StudyStore, block: Block) -> dict[str, str]:
 
 
 def _copy(source: Path, folder: Path) -> None:
-    temporary = folder.parent / f".{folder.name}.{socket.gethostname()}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
-    try:
-        with storage_errors(folder):
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copytree(source, temporary)
-            rename_once(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    write_folder(folder, lambda temporary: shutil.copytree(source, temporary, dirs_exist_ok=True))

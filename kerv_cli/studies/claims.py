@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
 import socket
 import time
@@ -17,8 +16,10 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from kerv_cli.errors import StorageError
-from kerv_cli.files import storage_errors, write_json
+from kerv_cli.errors import CheckpointError, StorageError
+from kerv_cli.files import read_json, storage_errors, write_json
+from kerv_cli.leftovers import is_alive, temporary_beside
+from kerv_cli.manifests import read
 from kerv_cli.studies.plan import Cell
 
 EXPIRES_HOURS = 6.0
@@ -54,8 +55,28 @@ def claim(folder: Path, cells: Sequence[Cell], run: str, block: str) -> bool:
 
 def is_claimed(folder: Path, cell: Cell) -> bool:
     """Whether a process that may still live computes the cell."""
-    path = folder / f"{cell.id}.json"
-    found = _read(path)
+    return _is_held(folder / f"{cell.id}.json")
+
+
+def void(folder: Path) -> list[Path]:
+    """The claims whose process has ended or whose time is up, and the notes that belong to no claim."""
+    claims = sorted(folder.glob("*.json"))
+    held = {path for path in claims if _is_held(path)}
+    blocks = {found.block for path in held if (found := _read(path)) is not None}
+    notes = [path for path in sorted(folder.glob("*.running")) if path.stem not in blocks]
+    return [path for path in claims if path not in held] + notes
+
+
+def clean_void(folder: Path) -> None:
+    """Removes void claims and notes, e.g. of a sweep that was killed."""
+    if folder.is_dir():
+        with write_lock(folder):
+            for path in void(folder):
+                path.unlink(missing_ok=True)
+
+
+def _is_held(path: Path) -> bool:
+    folder, found = path.parent, _read(path)
     if found is None:
         return False
     young = max(_changed(path), _changed(folder / f"{found.block}.running")) > time.time() - 3600 * EXPIRES_HOURS
@@ -65,7 +86,7 @@ def is_claimed(folder: Path, cell: Cell) -> bool:
 def note_running(folder: Path, cell: Cell, block: str) -> None:
     """Notes which cell of a block runs now: if this process is killed, that cell has failed."""
     path = folder / f"{block}.running"
-    temporary = path.with_suffix(".next")
+    temporary = temporary_beside(path)
     with storage_errors(path):
         temporary.write_text(cell.id, encoding="utf-8")
         os.replace(temporary, path)
@@ -91,8 +112,8 @@ def release(folder: Path, cells: Sequence[Cell], block: str) -> None:
 
 def _read(path: Path) -> Claim | None:
     try:
-        return Claim(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):  # missing, or not a claim
+        return read(Claim, read_json(path), "a claim")
+    except CheckpointError:  # missing, or not a claim
         return None
 
 
@@ -101,17 +122,6 @@ def _changed(path: Path) -> float:
         return path.stat().st_mtime
     except OSError:
         return 0.0
-
-
-def is_alive(pid: int) -> bool:
-    """Whether a process of this machine has that number."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 @contextlib.contextmanager

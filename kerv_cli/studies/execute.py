@@ -14,12 +14,13 @@ from datetime import UTC, datetime
 from typing import Any
 
 from kerv_cli.errors import CheckpointError, StorageError
+from kerv_cli.leftovers import clean
 from kerv_cli.provenance import git_commit
 from kerv_cli.settings import RuntimeSettings
 from kerv_cli.studies import events
 from kerv_cli.studies.adopt import adopt
 from kerv_cli.studies.block import BlockRun, CellResult, Gauge, Prepare, failed
-from kerv_cli.studies.claims import is_claimed, release, running_cell
+from kerv_cli.studies.claims import clean_void, is_claimed, release, running_cell
 from kerv_cli.studies.executors import Executor, WorkerLost, check_executor, open_executor
 from kerv_cli.studies.plan import Block, Cell, blocks_of
 from kerv_cli.studies.store import StudyStore
@@ -49,7 +50,8 @@ def execute(
     check_executor(runtime)
     clock = time.perf_counter()
     sweep = _Sweep(prepare, store, runtime, on_event, gauge)
-    store.clean_stale()
+    clean(store.cells)
+    clean_void(store.claims)
     blocks, damaged = sweep.split(cells)
     threads = max((cell.settings["runtime"]["threads"] for cell in cells), default=1)
     executor = open_executor(runtime, threads, store.jobs) if blocks else None

@@ -117,6 +117,16 @@ def determinants(
     }
 
 
+def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
+    """Whether a stored cell's config.yaml holds what determines the result of `cell`."""
+    try:
+        own = config["settings"], config["identity"], config["task"], config["seeds"], config["repeat"], ""
+        wanted = cell.settings, cell.identity, cell.task, list(cell.seeds), cell.repeat, ""
+        return determinants(*own) == determinants(*wanted)
+    except (KeyError, TypeError, AttributeError):
+        return False
+
+
 def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
     """The settings without those keys."""
     return {key: value for key, value in settings.items() if key not in names}

@@ -11,15 +11,8 @@ results/studies/<name>/
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import json
-import os
-import re
-import secrets
-import shutil
-import socket
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,23 +22,20 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-import yaml
 
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, sync
+from kerv_cli.files import atomic_path, read_json, read_yaml, sha256_of, to_yaml, write_folder
 from kerv_cli.limits import check_name
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies import rows
-from kerv_cli.studies.claims import is_alive, write_lock
-from kerv_cli.studies.plan import Cell
+from kerv_cli.studies.claims import write_lock
+from kerv_cli.studies.plan import Cell, is_result_of
 from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
 from kerv_cli.studies.rows import Circumstances
 
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
-_TEMPORARY = re.compile(r"\.(?P<id>[0-9a-f]+)\.(?P<host>.+)\.(?P<pid>\d+)-[0-9a-f]+\.tmp")
-_OTHER_HOSTS_STALE_HOURS = 7 * 24.0  # whether a process of another machine lives is unknown
 
 
 @dataclass(frozen=True)
@@ -132,10 +122,13 @@ class StudyStore:
         folder = self.cells / name
         try:
             status = read_json(folder / _STATUS)
+            # cells from before the seal have none
+            if status.get("sha256") not in (None, _seal(status)):
+                raise CheckpointError(f"{_STATUS} is not what was written")
             for file in _CELL_FILES:
                 if sha256_of(folder / file) != status["files"][file]:
                     raise CheckpointError(f"{file} is not what was written")
-        except (CheckpointError, KeyError, TypeError) as error:
+        except (CheckpointError, KeyError, TypeError, AttributeError) as error:
             raise self._damaged(folder, error) from error
         return status
 
@@ -167,18 +160,13 @@ class StudyStore:
         """
         if [(r.task, r.seed) for r in records] != [(cell.task, seed) for seed in cell.seeds]:
             raise ValueError(f"records of other episodes than cell {cell.id} asks for ({cell.task}, {cell.seeds})")
-        folder = self.cells / cell.id
-        temporary = self.cells / f".{cell.id}.{socket.gethostname()}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
         files = self._cell_files(cell, records, status, circumstances or [Circumstances()] * len(records))
-        try:
-            with storage_errors(folder):
-                temporary.mkdir(parents=True)
-                for file, content in files.items():
-                    _write_synced(temporary / file, content)
-                sync(temporary)
-                return rename_once(temporary, folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+
+        def fill(temporary: Path) -> None:
+            for file, content in files.items():
+                (temporary / file).write_bytes(content)
+
+        return write_folder(self.cells / cell.id, fill)
 
     def _cell_files(
         self,
@@ -193,7 +181,7 @@ class StudyStore:
         ]
         decodes = [row for record in records for row in rows.decode_rows(record)]
         files = {
-            "config.yaml": yaml.safe_dump(config, sort_keys=False).encode(),
+            "config.yaml": to_yaml(config).encode(),
             "episodes.parquet": rows.parquet_bytes(episodes, rows.EPISODE_SCHEMA),
             "decodes.parquet": rows.parquet_bytes(decodes, rows.DECODE_SCHEMA),
         }
@@ -206,6 +194,7 @@ class StudyStore:
             **status,
             "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
         }
+        full["sha256"] = _seal(full)
         files[_STATUS] = (json.dumps(full, indent=2, allow_nan=False) + "\n").encode()
         return files
 
@@ -220,10 +209,10 @@ class StudyStore:
             raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
         status = self.status_of(name)
         try:
-            config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+            config = read_yaml((folder / "config.yaml").read_text(encoding="utf-8"))
             episodes = pq.read_table(folder / "episodes.parquet", columns=rows.EPISODE_SCHEMA.names).to_pandas()
             decodes = pq.read_table(folder / "decodes.parquet", columns=["seed", "seconds"]).to_pandas()
-        except (OSError, yaml.YAMLError, pa.ArrowInvalid, pa.ArrowKeyError) as error:
+        except (OSError, ValueError, pa.ArrowException) as error:
             raise self._damaged(folder, error) from error
         seconds = {seed: group.to_numpy() for seed, group in decodes.groupby("seed")["seconds"]}
         episodes["decode_seconds"] = [seconds[seed] for seed in episodes["seed"]]
@@ -233,7 +222,7 @@ class StudyStore:
         """The complete ones of these cells by id, and those that are absent.
 
         Raises:
-            CheckpointError: a cell is damaged.
+            CheckpointError: a cell is damaged, or is not of these settings.
             UsageError: not one is complete; the message names what to run.
         """
         found: dict[str, StoredCell] = {}
@@ -243,6 +232,11 @@ class StudyStore:
                 continue
             if (self.cells / cell.id).exists():
                 found[cell.id] = self.read_cell(cell.id)
+                if not is_result_of(found[cell.id].config, cell):
+                    raise CheckpointError(
+                        f"{self.plan_path} is damaged (it says something else of cell {cell.id} than the cell): "
+                        f"{self.how_to_run()} again"
+                    )
             else:
                 absent.append(cell)
         if not found:
@@ -276,15 +270,11 @@ class StudyStore:
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
 
-    def clean_stale(self, hours: float = 6.0) -> list[Path]:
-        """Removes temporary folders of processes that are gone, older than `hours` -> those removed."""
-        removed: list[Path] = []
-        for folder in sorted(self.cells.glob(".*.tmp")):
-            named = _TEMPORARY.fullmatch(folder.name)
-            if named and _is_stale(folder, named["host"], int(named["pid"]), hours):
-                shutil.rmtree(folder, ignore_errors=True)
-                removed.append(folder)
-        return removed
+
+def _seal(status: Mapping[str, Any]) -> str:
+    """Hash of all entries of a status but its own."""
+    text = json.dumps({key: value for key, value in status.items() if key != "sha256"}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def begun_studies(results: Path | str) -> list[str]:
@@ -296,32 +286,3 @@ def begun_studies(results: Path | str) -> list[str]:
             if any((store.cells / cell.id).exists() for cell in store.read_plan().cells):
                 names.append(store.name)
     return names
-
-
-def _is_stale(folder: Path, host: str, pid: int, hours: float) -> bool:
-    try:
-        age = (time.time() - folder.stat().st_mtime) / 3600
-    except FileNotFoundError:  # its owner was faster
-        return False
-    if host != socket.gethostname():
-        return age > max(hours, _OTHER_HOSTS_STALE_HOURS)
-    return age > hours and not is_alive(pid)
-
-
-def _write_synced(path: Path, content: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def rename_once(temporary: Path, folder: Path) -> bool:
-    """Renames `temporary` to `folder`; False if `folder` exists already."""
-    try:
-        os.rename(temporary, folder)
-    except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-            return False
-        raise
-    sync(folder.parent)
-    return True

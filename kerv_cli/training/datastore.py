@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import io
-import os
-import secrets
-import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +28,7 @@ from kerv_cli.environments import resolve_tasks
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.files import atomic_path, read_json, sha256_of, storage_errors, write_json
+from kerv_cli.files import read_json, sha256_of, write_folder, write_json
 from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
@@ -128,7 +123,6 @@ class DatastoreBuild:
         check_spaces(self.dataset, described.actions, described.observation, "the target")
         self.chosen = {name: self._episodes_of(name) for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
-        _recover(self.folder)
         _refuse_foreign(self.folder)
 
     def _episodes_of(self, name: str) -> list[int]:
@@ -172,8 +166,7 @@ class DatastoreBuild:
                 progress(len(parts), total)
             shards[name] = Shard((first, rows), tuple(self.seeds[name]))
         files = self._arrays(parts, np.concatenate(seeds), shards)
-        with _new_folder(self.folder) as folder:
-            self._write(folder, files, shards)
+        write_folder(self.folder, lambda folder: self._write(folder, files, shards), replace=True)
         return Datastore.open(self.folder, self.artifacts.description)
 
     def _arrays(self, parts: list[Entries], seeds: np.ndarray, shards: Mapping[str, Shard]) -> dict[str, Any]:
@@ -203,13 +196,13 @@ class DatastoreBuild:
         import pyarrow.parquet as pq
 
         for name, content in files.items():
-            with atomic_path(folder / name) as temporary:
-                if name == PAYLOAD:
-                    pq.write_table(content, temporary, compression="zstd")
-                else:
-                    # np.save to a file reports a full disk without its errno
-                    np.save(buffer := io.BytesIO(), content)
-                    temporary.write_bytes(buffer.getbuffer())
+            # written to memory first: numpy and pyarrow report a full disk without its errno
+            buffer = io.BytesIO()
+            if name == PAYLOAD:
+                pq.write_table(content, buffer, compression="zstd")
+            else:
+                np.save(buffer, content)
+            (folder / name).write_bytes(buffer.getbuffer())
         target = self.artifacts.description
         made = {"command": "kerv build datastore", "settings": asdict(self.settings), **provenance(self.device)}
         manifest = Manifest(
@@ -251,36 +244,6 @@ def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
         "similarity": float(np.median(np.concatenate(similarities))),
         "query_ms": 1000 * float(np.median(seconds)),
     }
-
-
-@contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yields a temporary folder that is renamed to `folder` when the block succeeds. An older folder of that name is
-    removed after that. What a kill between the two renames leaves, `_recover` puts back.
-
-    Raises:
-        StorageError: writing failed.
-    """
-    mark = f"{os.getpid()}-{secrets.token_hex(4)}"
-    new, old = (folder.with_name(f".{folder.name}.{mark}.{state}.tmp") for state in ("new", "old"))
-    try:
-        with storage_errors(folder):
-            new.mkdir(parents=True)
-            yield new
-            if folder.exists():
-                folder.rename(old)
-            new.rename(folder)
-    finally:
-        _recover(folder)
-        for leftover in (new, old):
-            shutil.rmtree(leftover, ignore_errors=True)
-
-
-def _recover(folder: Path) -> None:
-    """Puts the older folder back where a process ended between the two renames of `_new_folder`."""
-    for old in folder.parent.glob(f".{glob.escape(folder.name)}.*.old.tmp"):
-        if not folder.exists():
-            old.rename(folder)
 
 
 def _refuse_foreign(folder: Path) -> None:

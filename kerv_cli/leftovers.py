@@ -1,0 +1,71 @@
+"""Temporary files and folders: their names say whose they are, so that what a dead process left can be removed."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import shutil
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+OTHER_HOSTS_STALE_HOURS = 7 * 24.0
+"""Age from which a temporary of another machine is taken for one of a dead process, which cannot be known from here."""
+
+_NAME = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
+
+
+def temporary_beside(path: Path) -> Path:
+    """A new hidden name in the folder of `path` that names this machine and process: `.<name>.<host>.<pid>-<8>.tmp`."""
+    mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
+    return path.with_name(f".{path.name[:150]}.{mark}.tmp")
+
+
+def is_left_over(path: Path) -> bool:
+    """Whether `path` is a temporary file or folder whose process has ended."""
+    named = _NAME.fullmatch(path.name)
+    if named is None:
+        return False
+    if named["host"] == socket.gethostname().replace(".", "-"):
+        return not is_alive(int(named["pid"]))
+    try:
+        return time.time() - path.stat().st_mtime > 3600 * OTHER_HOSTS_STALE_HOURS
+    except OSError:  # its owner was faster
+        return False
+
+
+def left_over(root: Path) -> Iterator[Path]:
+    """What dead processes left anywhere below `root`; links are not followed."""
+    for folder, folders, files in os.walk(root):
+        found = [Path(folder, name) for name in (*folders, *files) if is_left_over(Path(folder, name))]
+        folders[:] = [name for name in folders if Path(folder, name) not in found]
+        yield from sorted(found)
+
+
+def clean(folder: Path) -> list[Path]:
+    """Removes what dead processes left in `folder` itself -> those removed."""
+    found = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
+    for path in found:
+        remove(path)
+    return sorted(found)
+
+
+def remove(path: Path) -> None:
+    """Removes a file or a folder; what cannot be removed stays."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process of this machine has that number."""
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True

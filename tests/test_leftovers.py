@@ -1,0 +1,123 @@
+"""What dead processes leave is known by its name, listed and removed; what belongs to the living stays."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from kerv_cli import files
+from kerv_cli.files import atomic_path, write_folder
+from kerv_cli.leftovers import clean, is_left_over, left_over, temporary_beside
+
+
+def of_process(path: Path, pid: int, host: str = "") -> Path:
+    """The name that `temporary_beside` gives in another process."""
+    name = temporary_beside(path).name.replace(f".{os.getpid()}-", f".{pid}-")
+    return path.with_name(name.replace(socket.gethostname().replace(".", "-"), host) if host else name)
+
+
+@pytest.fixture
+def dead() -> int:
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    return child.pid
+
+
+def test_only_what_a_dead_process_left_is_left_over(tmp_path: Path, dead: int) -> None:
+    theirs, mine = of_process(tmp_path / "a.b.json", dead), temporary_beside(tmp_path / "a.b.json")
+    far = of_process(tmp_path / "a.b.json", 1, "elsewhere")
+    for path in (theirs, mine, far, tmp_path / ".hidden.tmp", tmp_path / "a.b.json", tmp_path / ".x.1-00.tmp"):
+        path.touch()
+    assert [path for path in tmp_path.iterdir() if is_left_over(path)] == [theirs]
+    os.utime(far, (0, time.time() - 8 * 24 * 3600))
+    assert is_left_over(far)
+    folder = of_process(tmp_path / "deep" / "cell", dead)
+    folder.mkdir(parents=True)
+    (folder / theirs.name).touch()
+    assert set(left_over(tmp_path)) == {theirs, far, folder}  # what lies in a left folder goes with it
+    assert clean(tmp_path) == sorted([theirs, far])
+    assert mine.exists()
+
+
+def test_the_next_write_removes_what_a_killed_one_left(tmp_path: Path, dead: int) -> None:
+    left = of_process(tmp_path / "value.json", dead)
+    left.touch()
+    with atomic_path(tmp_path / "other.json") as temporary:
+        temporary.write_text("new")
+    assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
+
+
+def write(folder: Path, text: str, replace: bool = True) -> bool:
+    return write_folder(folder, lambda new: (new / "file").write_text(text), replace)
+
+
+def test_a_folder_is_exchanged_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "store"
+    assert write(folder, "old")
+    assert not write(folder, "none", replace=False)
+    assert (folder / "file").read_text() == "old"
+    renames: list[object] = []
+    rename = os.rename
+    monkeypatch.setattr(os, "rename", lambda a, b: (renames.append(a), rename(a, b)))
+    assert write(folder, "new")
+    assert (folder / "file").read_text() == "new"
+    assert len(renames) == 1  # the attempt; no moment without a folder
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_where_folders_cannot_be_exchanged_two_renames_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "store"
+    write(folder, "old")
+    monkeypatch.setattr(files.ctypes, "CDLL", lambda name, use_errno: object())
+    assert write(folder, "new")
+    assert (folder / "file").read_text() == "new"
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def fail(folder: Path) -> None:
+    (folder / "file").write_text("half")
+    raise KeyboardInterrupt
+
+
+def test_a_folder_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
+    folder = tmp_path / "store"
+    write(folder, "old")
+    with pytest.raises(KeyboardInterrupt):
+        write_folder(folder, fail, replace=True)
+    assert (folder / "file").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+SIGKILLED = """
+import os, signal, sys
+from pathlib import Path
+from kerv_cli import files
+calls = {"sync": 0}
+sync = files.sync
+def counted(path):
+    calls["sync"] += 1
+    if calls["sync"] == int(sys.argv[2]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    sync(path)
+files.sync = counted
+files.write_folder(Path(sys.argv[1]), lambda new: (new / "file").write_text("new"), replace=True)
+"""
+
+
+@pytest.mark.parametrize("moment", [1, 2, 3])
+def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(tmp_path: Path, moment: int) -> None:
+    folder = tmp_path / "store"
+    write(folder, "old")
+    run = subprocess.run([sys.executable, "-c", SIGKILLED, str(folder), str(moment)], check=False)
+    assert run.returncode < 0
+    assert (folder / "file").read_text() == ("new" if moment == 3 else "old")
+    assert len(list(left_over(tmp_path))) == 1
+    assert write(folder, "newest")
+    clean(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
