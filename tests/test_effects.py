@@ -6,8 +6,8 @@ import pytest
 
 from kerv_cli.config import compose
 from kerv_cli.effects import without_effect
-from kerv_cli.settings import RolloutSettings
-from kerv_cli.studies.resolve import idle_overrides, resolve
+from kerv_cli.settings import RolloutSettings, StudySettings
+from kerv_cli.studies.resolve import ResolvedStudy, idle_overrides
 
 
 @pytest.mark.parametrize(
@@ -34,8 +34,8 @@ def test_an_override_without_effect_is_found(words: str, idle: str) -> None:
 
 
 def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
-    study = ["study.name=s", "study.baseline=a", "study.common='task=reach'"]
-    both = "study.settings={a:'method=ar',b:'method=spec_vla'}"
-    assert idle_overrides(resolve([*study, both, "threshold.r=5", "runtime.workers=2"])) == {}
-    found = idle_overrides(resolve([*study, "study.settings={a:'method=ar threshold.r=3'}", "acceptance=relaxed"]))
-    assert list(found) == ["a: threshold.r=3", "acceptance=relaxed"]
+    written = {"a": "method=ar threshold.r=3", "b": "method=spec_vla"}
+    settings = {label: compose("rollout", text.split(), RolloutSettings) for label, text in written.items()}
+    common = ("acceptance=relaxed", "policy.early=mine", "runtime.workers=2")
+    found = idle_overrides(ResolvedStudy(StudySettings(), settings, written, common))
+    assert list(found) == ["a: threshold.r=3", "policy.early=mine"]
