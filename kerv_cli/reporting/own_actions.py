@@ -4,6 +4,7 @@ decoding they are shown these, and not the demonstrations' labels on which `kerv
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,9 @@ from kerv_cli.reporting.prediction import Predictions, error_rows
 from kerv_cli.reporting.tables import StudyData
 from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.store import StudyStore
-from kerv_cli.training.predictor_fit import Windows, prediction_errors, windows_of
+
+if TYPE_CHECKING:  # it imports torch, which few reports need
+    from kerv_cli.training.predictor_fit import Windows
 
 
 def own_errors(store: StudyStore, data: StudyData, found: Predictions) -> pd.DataFrame | None:
@@ -25,6 +28,8 @@ def own_errors(store: StudyStore, data: StudyData, found: Predictions) -> pd.Dat
     windows = _windows(store, cells, found.calibration)
     if windows is None:
         return None
+    from kerv_cli.training.predictor_fit import prediction_errors
+
     calibration = found.calibration
     errors = prediction_errors(windows, calibration.noise, calibration.target.actions)
     keys = ["predictor", "task", "dof", "steps_ahead"]
@@ -51,6 +56,8 @@ def _autoregressive(data: StudyData, target: str) -> list[Cell]:
 
 def _windows(store: StudyStore, cells: Iterable[Cell], calibration: Calibration) -> Windows | None:
     """Every moment of the cells' episodes, all held out; None where there is none."""
+    from kerv_cli.training.predictor_fit import Windows, windows_of
+
     space, horizon = calibration.target.actions, calibration.target.chunk
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     places: list[str] = []

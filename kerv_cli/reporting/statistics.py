@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -159,31 +160,56 @@ def speedup(
     if np.bincount(members).min() < 2:
         return Estimate(value, math.nan, math.nan)
     blocked = np.arange(a.size) if blocks is None else _numbered(blocks)
-    generator = np.random.default_rng(seed)
-    means = np.zeros((resamples, 2))
-    for stratum in range(int(members.max()) + 1):
-        rows = np.flatnonzero(members == stratum)
+    order = np.lexsort((blocked, members))  # by stratum, then block; stable, so pairs of a block keep their order
+    sizes = _block_sizes(members[order], blocked[order])
+    means, first = np.zeros((resamples, 2)), 0
+    for counts, drawn in _draws(sizes, resamples, seed):
+        rows = order[first : first + counts.shape[1]]
         # a stratum lies within one group, so its pairs have equal weights
-        means += _resampled_means(times[rows], blocked[rows], resamples, generator) * weights[rows].sum()
+        means += _summed(counts, times[rows]) * (weights[rows].sum() / drawn[:, None])
+        first += len(rows)
     low, high = np.quantile(means[:, 0] / means[:, 1], [0.025, 0.975])
     return Estimate(value, float(low), float(high))
 
 
-def _resampled_means(
-    times: np.ndarray, blocks: np.ndarray, resamples: int, generator: np.random.Generator
-) -> np.ndarray:
-    """Means (resamples, 2) of times (pairs, 2) drawn by block (pairs,), then within the block."""
-    _, members, sizes = np.unique(blocks, return_inverse=True, return_counts=True)
-    sorted_times = times[np.argsort(members, kind="stable")]
-    first = np.cumsum(sizes) - sizes  # of every block, in the sorted order
+def _block_sizes(strata: np.ndarray, blocks: np.ndarray) -> tuple[tuple[int, ...], ...]:
+    """Per stratum the numbers of pairs of its blocks, from numbers (pairs,) that are sorted by both."""
+    starts = np.flatnonzero(np.diff(strata, prepend=-1))
+    parts = np.split(blocks, starts[1:])
+    return tuple(tuple(np.unique(part, return_counts=True)[1].tolist()) for part in parts)
+
+
+@functools.lru_cache(maxsize=2)
+def _draws(sizes: tuple[tuple[int, ...], ...], resamples: int, seed: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Per stratum how often every resample draws each pair (resamples, pairs), and how many pairs it draws
+    (resamples,): by block, then within the block. They depend on the sizes of the blocks alone, so that the settings of
+    a study, which share their tasks and seeds, share them."""
+    generator = np.random.default_rng(seed)
+    return tuple(_drawn(np.array(stratum), resamples, generator) for stratum in sizes)
+
+
+def _drawn(sizes: np.ndarray, resamples: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """As `_draws`, of one stratum with blocks of these sizes."""
+    first, pairs = np.cumsum(sizes) - sizes, int(sizes.sum())
     drawn = generator.integers(0, sizes.size, size=(resamples, sizes.size))
-    drawn_sizes = sizes[drawn]  # (resamples, blocks)
-    within = generator.random((resamples, sizes.size, int(sizes.max())))
-    places = first[drawn][..., None] + (within * drawn_sizes[..., None]).astype(np.int64)
-    used = np.arange(sizes.max()) < drawn_sizes[..., None]  # as many pairs as the block has
-    sums = np.einsum("rbpk,rbp->rk", sorted_times[np.where(used, places, 0)], used)
-    means: np.ndarray = sums / drawn_sizes.sum(axis=1, keepdims=True)
-    return means
+    counts = np.empty((resamples, pairs), np.uint16)
+    rows = max(1, 2_000_000 // (sizes.size * int(sizes.max())))  # at a time: memory
+    for begin in range(0, resamples, rows):
+        blocks = drawn[begin : begin + rows]
+        within = generator.random((*blocks.shape, int(sizes.max())))
+        drawn_sizes = sizes[blocks][..., None]
+        places = first[blocks][..., None] + (within * drawn_sizes).astype(np.int64)
+        places += pairs * np.arange(len(blocks))[:, None, None]
+        used = np.arange(sizes.max()) < drawn_sizes  # as many pairs as the block has
+        found = np.bincount(places[used], minlength=len(blocks) * pairs)
+        counts[begin : begin + rows] = found.reshape(-1, pairs)
+    return counts, sizes[drawn].sum(axis=1)
+
+
+def _summed(counts: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Sums (resamples, 2) of times (pairs, 2), each as often as counted (resamples, pairs)."""
+    rows = max(1, 2_000_000 // counts.shape[1])
+    return np.concatenate([counts[i : i + rows].astype(np.float64) @ times for i in range(0, len(counts), rows)])
 
 
 def _numbered(names: Sequence[str]) -> np.ndarray:

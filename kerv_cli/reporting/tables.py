@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from kerv_cli.environments import specs
@@ -40,6 +42,22 @@ class StudyData:
     episodes: pd.DataFrame  # one row per label and episode
     absent: list[Cell]  # planned, not complete
 
+    @functools.cached_property
+    def autoregressive(self) -> list[Cell]:
+        """The first cell of every label that decodes autoregressively; the baseline is first if it does."""
+        first = {cell.label: cell for cell in reversed(self.plan.cells) if is_autoregressive(cell.settings)}
+        order = [label for label in self.plan.labels if label in first]
+        return [first[label] for label in sorted(order, key=lambda label: label != self.plan.baseline)]
+
+    @functools.cached_property
+    def complete(self) -> dict[str, list[Cell]]:
+        """Label -> its complete cells, in the plan's order."""
+        found: dict[str, list[Cell]] = {}
+        for cell in self.plan.cells:
+            if cell.id in self.cells:
+                found.setdefault(cell.label, []).append(cell)
+        return found
+
 
 def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
     """The study's plan and complete cells; with `cells`, a plan of only those cells.
@@ -52,23 +70,33 @@ def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyD
     if cells is not None:
         plan = replace(plan, cells=tuple(cells))
     found, absent = store.read_cells(plan.cells)
-    frames = [_labelled(cell, found[cell.id]) for cell in plan.cells if cell.id in found]
-    return StudyData(plan, found, pd.concat(frames, ignore_index=True), absent)
+    return StudyData(plan, found, _labelled([cell for cell in plan.cells if cell.id in found], found), absent)
 
 
-def _labelled(cell: Cell, stored: StoredCell) -> pd.DataFrame:
-    runtime = cell.settings["runtime"]
-    return stored.episodes.assign(
-        initial_state=stored.episodes["initial_state"].map(tuple),  # comparable
-        label=cell.label,
-        cell=cell.id,
-        difficulty=difficulty_of(cell.task),
-        run=stored.status["run"],
-        device=runtime["device"],
-        device_name=stored.status["device_name"],
-        dtype=runtime["dtype"],
-        threads=runtime["threads"],
-    )
+def _labelled(cells: Sequence[Cell], found: Mapping[str, StoredCell]) -> pd.DataFrame:
+    """The episodes of the cells in order, and what the tables need to know of each one's cell."""
+    stored = [found[cell.id] for cell in cells]
+    episodes = pd.concat([one.episodes for one in stored], ignore_index=True)
+    groups = {task: difficulty_of(task) for task in {cell.task for cell in cells}}
+    columns: dict[str, list[Any]] = {
+        "label": [cell.label for cell in cells],
+        "cell": [cell.id for cell in cells],
+        "difficulty": [groups[cell.task] for cell in cells],
+        "run": [one.status["run"] for one in stored],
+        "device": [cell.settings["runtime"]["device"] for cell in cells],
+        "device_name": [one.status["device_name"] for one in stored],
+        "dtype": [cell.settings["runtime"]["dtype"] for cell in cells],
+        "threads": [cell.settings["runtime"]["threads"] for cell in cells],
+    }
+    lengths = [len(one.episodes) for one in stored]
+    spread = {
+        name: np.repeat(np.array(values, dtype=object if isinstance(values[0], str) else None), lengths)
+        for name, values in columns.items()
+    }
+    states = episodes["initial_state"].map(tuple)  # comparable
+    # strings as Python objects: these frames are cut into hundreds of small ones, which arrow's arrays are slow at
+    texts = {name: episodes[name].astype(object) for name in ("task", "block", "started")}
+    return episodes.assign(initial_state=states, **texts, **spread)
 
 
 def difficulty_of(task: str) -> str:
@@ -109,7 +137,7 @@ def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[S
 
 def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
     tasks = sorted(set(episodes["task"]))
-    cells = [c for c in data.plan.cells if c.label == label and c.task in tasks and c.id in data.cells]
+    cells = [cell for cell in data.complete[label] if cell.task in tasks]
     head = {
         "study": data.plan.name,
         "averaging": averaging,
@@ -133,8 +161,7 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
     if is_autoregressive(cell.settings):
         return NONE
     target = cell.identity.get("target")
-    found = [c for c in data.plan.cells if is_autoregressive(c.settings) and c.identity.get("target") == target]
-    found.sort(key=lambda other: other.label != data.plan.baseline)
+    found = [other for other in data.autoregressive if other.identity.get("target") == target]
     if not found:
         return NONE
     reference = data.episodes[data.episodes["label"] == found[0].label]

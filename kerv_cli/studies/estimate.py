@@ -30,17 +30,20 @@ def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_secon
         CheckpointError: a complete cell is damaged.
     """
     every_cell = [cell for block in blocks_of(cells) for cell in block.cells]
-    known: dict[str, list[float]] = {}
+    seconds: dict[str, float] = {}
+    episodes: dict[str, int] = {}
     todo: list[Cell] = []
     for cell in every_cell:
         if store.has_cell(cell.id):
-            known.setdefault(cell.label, []).extend(store.read_cell(cell.id).episodes["wall_seconds"])
+            status = store.status_of(cell.id)
+            seconds[cell.label] = seconds.get(cell.label, 0.0) + status["wall_seconds"]
+            episodes[cell.label] = episodes.get(cell.label, 0) + status["episodes"]
         else:
             todo.append(cell)
-    every = [seconds for times in known.values() for seconds in times]
-    prior = sum(every) / len(every) if every else prior_seconds
-    means = {label: sum(times) / len(times) for label, times in known.items()}
+    stored = sum(episodes.values())
+    prior = sum(seconds.values()) / stored if stored else prior_seconds
+    means = {label: seconds[label] / count for label, count in episodes.items()}
     total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
-    source = f"measured on {len(every)} stored episodes" if every else f"a guess of {prior_seconds:g} s per episode"
+    source = f"measured on {stored} stored episodes" if stored else f"a guess of {prior_seconds:g} s per episode"
     at_once = max(1, min(workers, len(blocks_of(todo))))
-    return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), bool(every), source)
+    return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), bool(stored), source)

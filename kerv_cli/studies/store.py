@@ -11,8 +11,10 @@ results/studies/<name>/
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +38,8 @@ from kerv_cli.studies.rows import Circumstances
 
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
+_READ_TOGETHER = 100  # cells whose columns are converted at once: many tables of a few rows take much memory
+_DECODE_TIMES = pa.schema([rows.DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
 @dataclass(frozen=True)
@@ -204,19 +208,21 @@ class StudyStore:
         Raises:
             CheckpointError: it is absent or damaged, or its columns are those of another version.
         """
+        return _stored([self._read(name)])[0]
+
+    def _read(self, name: str) -> _ReadCell:
+        """A complete cell as it lies in its files; raises as `read_cell`."""
         folder = self.cells / name
         if not folder.exists():
             raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
         status = self.status_of(name)
         try:
-            config = read_yaml((folder / "config.yaml").read_text(encoding="utf-8"))
-            episodes = pq.read_table(folder / "episodes.parquet", columns=rows.EPISODE_SCHEMA.names).to_pandas()
-            decodes = pq.read_table(folder / "decodes.parquet", columns=["seed", "seconds"]).to_pandas()
+            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+            episodes = _columns(folder / "episodes.parquet", rows.EPISODE_SCHEMA)
+            decodes = _columns(folder / "decodes.parquet", _DECODE_TIMES)
+            return _ReadCell(name, folder, config, status, episodes, _split_by_seed(decodes))
         except (OSError, ValueError, pa.ArrowException) as error:
             raise self._damaged(folder, error) from error
-        seconds = {seed: group.to_numpy() for seed, group in decodes.groupby("seed")["seconds"]}
-        episodes["decode_seconds"] = [seconds[seed] for seed in episodes["seed"]]
-        return StoredCell(name, folder, config, status, episodes)
 
     def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
         """The complete ones of these cells by id, and those that are absent.
@@ -225,23 +231,29 @@ class StudyStore:
             CheckpointError: a cell is damaged, or is not of these settings.
             UsageError: not one is complete; the message names what to run.
         """
-        found: dict[str, StoredCell] = {}
-        absent: list[Cell] = []
-        for cell in cells:
-            if cell.id in found:
-                continue
-            if (self.cells / cell.id).exists():
-                found[cell.id] = self.read_cell(cell.id)
-                if not is_result_of(found[cell.id].config, cell):
-                    raise CheckpointError(
-                        f"{self.plan_path} is damaged (it says something else of cell {cell.id} than the cell): "
-                        f"{self.how_to_run()} again"
-                    )
-            else:
-                absent.append(cell)
-        if not found:
+        unique = list({cell.id: cell for cell in cells}.values())
+        there = [cell for cell in unique if (self.cells / cell.id).exists()]
+        if not there:
             raise UsageError(f"study '{self.name}' has no complete cell: {self.how_to_run()}")
-        return found, absent
+        found: dict[str, StoredCell] = {}
+        for first in range(0, len(there), _READ_TOGETHER):
+            read = [self._read_as(cell) for cell in there[first : first + _READ_TOGETHER]]
+            found |= {stored.id: stored for stored in _stored(read)}
+        return found, [cell for cell in unique if cell.id not in found]
+
+    def _read_as(self, cell: Cell) -> _ReadCell:
+        """A complete cell that is the result of `cell`.
+
+        Raises:
+            CheckpointError: as `read_cells`.
+        """
+        read = self._read(cell.id)
+        if not is_result_of(read.config, cell):
+            raise CheckpointError(
+                f"{self.plan_path} is damaged (it says something else of cell {cell.id} than the cell): "
+                f"{self.how_to_run()} again"
+            )
+        return read
 
     def executed_actions(self, cell_id: str) -> dict[int, np.ndarray]:
         """Seed -> the actions (T, D) that its episode executed, environment units, of a complete cell's repeat.
@@ -269,6 +281,66 @@ class StudyStore:
         """Removes the traceback of an earlier attempt that failed."""
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class _ReadCell:
+    """A cell whose episodes are not converted yet. seconds: seed -> (decodes,) seconds."""
+
+    id: str
+    folder: Path
+    config: dict[str, Any]
+    status: dict[str, Any]
+    episodes: pa.Table
+    seconds: dict[int, np.ndarray]
+
+
+def _read_config(text: str) -> dict[str, Any]:
+    """config.yaml, entry by entry: the settings, by far the longest, are those of many cells and are read once."""
+    entries = (_read_entry(entry) for entry in re.split(r"^(?=\w)", text, flags=re.MULTILINE) if entry)
+    return {key: value for entry in entries for key, value in entry.items()}
+
+
+@functools.lru_cache(maxsize=1024)
+def _read_entry(text: str) -> dict[str, Any]:
+    entry = read_yaml(text)
+    if not isinstance(entry, dict):
+        raise ValueError(f"'{text[:40]}' is no entry")
+    return entry
+
+
+def _columns(path: Path, schema: pa.Schema) -> pa.Table:
+    """The columns of `schema` in a parquet file.
+
+    Raises:
+        ValueError: it has others.
+    """
+    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
+    table = pq.ParquetFile(path).read(columns=schema.names, use_threads=False)
+    if not table.schema.equals(schema):
+        raise ValueError(f"{path.name} has the columns of another version")
+    return table
+
+
+def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
+    """Seed -> seconds of its decodes, in order; the decodes of an episode stand together."""
+    seeds, seconds = (decodes[name].to_numpy() for name in ("seed", "seconds"))
+    starts = np.flatnonzero(np.diff(seeds, prepend=-1))
+    return dict(zip(seeds[starts].tolist(), np.split(seconds, starts[1:]), strict=True))
+
+
+def _stored(cells: Sequence[_ReadCell]) -> list[StoredCell]:
+    """The cells with their episodes as data frames, converted all at once."""
+    whole = pa.concat_tables([cell.episodes for cell in cells]).to_pandas()
+    try:
+        whole["decode_seconds"] = [cell.seconds[s] for cell in cells for s in cell.episodes["seed"].to_pylist()]
+    except KeyError as error:
+        raise CheckpointError(f"a cell in {cells[0].folder.parent} has no decodes of seed {error}") from error
+    stops = np.cumsum([cell.episodes.num_rows for cell in cells]).tolist()
+    return [
+        StoredCell(cell.id, cell.folder, cell.config, cell.status, whole.iloc[stop - cell.episodes.num_rows : stop])
+        for cell, stop in zip(cells, stops, strict=True)
+    ]
 
 
 def _seal(status: Mapping[str, Any]) -> str:

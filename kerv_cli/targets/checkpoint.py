@@ -7,18 +7,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
-from torch import Tensor, nn
-
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
 from kerv_cli.manifests import read
 from kerv_cli.registry import find, load, parts
 from kerv_cli.spaces import ActionSpace, ObservationSpace
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # torch is imported where weights are read or written: a description is read without it
+    import torch
+    from torch import Tensor, nn
+
     from kerv_cli.targets.compact.target import CompactTarget
 
 FORMAT = 2
@@ -78,6 +76,8 @@ T = TypeVar("T", bound=Description)
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Writes a safetensors file atomically. Raises StorageError: writing failed."""
+    from safetensors.torch import save
+
     payload = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata)
     with atomic_path(path) as temporary:
         temporary.write_bytes(payload)
@@ -89,6 +89,10 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
     Raises:
         CheckpointError: it is missing, damaged, or holds numbers that are not finite.
     """
+    import torch
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
     if not path.is_file():
         raise CheckpointError(f"no {what} at {path}: train it, or name another with its folder")
     try:
@@ -191,12 +195,15 @@ def read_target(folder: Path) -> TargetDescription:
     return description
 
 
-def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> tuple[Any, TargetDescription]:
-    """The target in `folder`, ready for inference, built by its family, and its description.
+def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> tuple[Any, TargetDescription]:
+    """The target in `folder`, ready for inference, built by its family, and its description. dtype: float32 by default.
 
     Raises:
         CheckpointError: it is missing or damaged.
         UnknownName: a family that is not registered.
     """
+    import torch
+
     description = read_target(folder)
-    return find("target", description.family, "target family").built(folder, description, device, dtype), description
+    part = find("target", description.family, "target family")
+    return part.built(folder, description, device, dtype or torch.float32), description
