@@ -70,6 +70,8 @@ class TaskSettings(RunSettings):
 
 
 MODEL, EXPERT = "model", "expert"
+DERIVED_FROM = ("policy.kind",)
+"""Keys of settings that others are derived from when a dataclass is made."""
 
 
 @dataclass

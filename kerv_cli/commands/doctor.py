@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kerv_cli.commands.common import Overrides, ShowConfig, composed, edge, print_table
+from kerv_cli.errors import StorageError
 from kerv_cli.findings import Finding
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from kerv_cli.environments.spec import EnvironmentSpec
     from kerv_cli.settings import DoctorSettings
 
 
+Repair = Annotated[bool, typer.Option("--repair", help="List and remove what killed commands left in the results.")]
+
+
 @edge
-def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+def doctor(overrides: Overrides = None, cfg: ShowConfig = False, repair: Repair = False) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
     target=NAME or environment=NAME: whether that keeps its protocol."""
     from kerv_cli.settings import DoctorSettings
@@ -23,6 +29,9 @@ def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
     # here target=NAME is a policy's folder; to Hydra it would be a choice among the files of conf/target
     words = [f"policy.{o}" if o.startswith("target=") else o for o in overrides or []]
     settings = composed("doctor", words, DoctorSettings, cfg)
+    if repair:
+        _repair(settings)
+        return
     if settings.policy.target or settings.environment:
         findings = [*_target(settings), *_environment(settings)]
     else:
@@ -33,7 +42,8 @@ def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
 
 
 def _machine(settings: DoctorSettings) -> list[Finding]:
-    return [_versions(), *_rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
+    findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings)]
+    return [*findings, _disk(settings), _left(settings), _display()]
 
 
 def _target(settings: DoctorSettings) -> list[Finding]:
@@ -143,7 +153,6 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
 def _disk(settings: DoctorSettings) -> Finding:
     import shutil
 
-    from kerv_cli.errors import StorageError
     from kerv_cli.files import atomic_path
     from kerv_cli.places import results_dir
 
@@ -157,6 +166,37 @@ def _disk(settings: DoctorSettings) -> Finding:
         return Finding("results", False, str(error))
     free = shutil.disk_usage(folder).free / 1e9
     return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
+
+
+def _left_over(settings: DoctorSettings) -> list[Path]:
+    """Temporary files and folders of dead processes, and claims and notes of dead sweeps, in the results."""
+    from kerv_cli.leftovers import left_over
+    from kerv_cli.places import results_dir
+    from kerv_cli.studies.claims import void
+
+    root = results_dir(settings.results)
+    claims = [path for folder in sorted(root.glob("studies/*/claims")) for path in void(folder)]
+    return [*left_over(root), *claims]
+
+
+def _left(settings: DoctorSettings) -> Finding:
+    found = _left_over(settings)
+    says = f"{len(found)} files of killed commands, kerv doctor --repair removes them" if found else "nothing"
+    return Finding("left over", True, says)
+
+
+def _repair(settings: DoctorSettings) -> None:
+    """Lists and removes what `_left_over` finds."""
+    from kerv_cli.leftovers import remove
+
+    found = _left_over(settings)
+    for path in found:
+        remove(path)
+        typer.echo(f"removed {path}")
+    kept = [path for path in found if path.exists()]
+    if kept:
+        raise StorageError(f"{kept[0]} cannot be removed: permission denied?")
+    typer.echo(f"{len(found)} left over files removed; everything else is complete or absent")
 
 
 def _display() -> Finding:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -134,10 +136,10 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     path = folder / f"{kind}.json"
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
-    value = read_json(path)
-    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
-        raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
-    return read(schema, value, str(path))
+    found = os.stat(path)
+    version = found.st_ino, found.st_size, found.st_mtime_ns
+    description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]
+    return description
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
@@ -151,6 +153,15 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
         raise CheckpointError(f"{weights} is missing: the {kind} is incomplete, train or copy it again")
     if sha256_of(weights) != sha256:
         raise CheckpointError(f"{weights} does not match its description: damaged or mixed up, copy the folder again")
+
+
+@functools.lru_cache(maxsize=256)
+def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int, int, int]) -> T:
+    """The JSON file, read once per process as long as inode, size and time of change (version) stay the same."""
+    value = read_json(path)
+    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
+        raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
+    return read(schema, value, str(path))
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
