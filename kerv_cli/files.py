@@ -189,15 +189,20 @@ def check_shape(value: Any, depth: int = 64, most: int = 5_000_000) -> None:
     Raises:
         ValueError: containers more than `depth` deep, or more than `most` values with every alias followed.
     """
-    level, count = [v for v in [value] if isinstance(v, dict | list)], 0
+    # every container once, with how often it occurs on its level: aliases may repeat one beyond all bounds
+    level, count = {id(v): (v, 1) for v in [value] if isinstance(v, dict | list)}, 0
     for _ in range(depth):
         if not level:
             return
-        count += sum(map(len, level))
+        count += sum(times * len(found) for found, times in level.values())
         if count > most:
             raise ValueError(f"it holds more than {most} values")
-        values = (x for v in level for x in (v.values() if isinstance(v, dict) else v))
-        level = [x for x in values if isinstance(x, dict | list)]
+        below: dict[int, tuple[Any, int]] = {}
+        for found, times in level.values():
+            for inner in found.values() if isinstance(found, dict) else found:
+                if isinstance(inner, dict | list):
+                    below[id(inner)] = inner, times + below.get(id(inner), (inner, 0))[1]
+        level = below
     raise ValueError(f"it is nested more than {depth} deep")
 
 

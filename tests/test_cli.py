@@ -167,3 +167,29 @@ def test_completion_knows_groups_and_names() -> None:
     assert "method=spec_vla" in complete_overrides("method=s")
     assert "method=" in complete_overrides("me")
     assert "task=drawer-open-v3" in complete_overrides("task=drawer")
+
+
+def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> None:
+    from test_leftovers import of_process
+
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    left = of_process(tmp_path / "artifacts" / "drafter" / "a" / "drafter.json", child.pid)
+    left.parent.mkdir(parents=True)
+    left.touch()
+    claims = tmp_path / "studies" / "main" / "claims"
+    claims.mkdir(parents=True)
+    (claims / "old.running").write_text("x")
+    run = kerv("doctor", "--repair", f"results={tmp_path}")
+    assert run.returncode == 0, run.stderr
+    assert [line.split()[0] for line in run.stdout.splitlines()] == ["removed", "removed", "2"]
+    assert not left.exists()
+    assert list(claims.iterdir()) == []
+    assert kerv("doctor", "--repair", f"results={tmp_path}").stdout.startswith("0 left over files")
+
+
+def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
+    words = ["policy=state", "policy.target=nano-state", f"results={policies}", "task=reach", *FAST]
+    run = kerv("rollout", "--plan", "method=ar", "acceptance=relaxed", *words)
+    assert run.returncode == 0
+    assert run.stderr == "note: acceptance=relaxed has no effect: method ar drafts nothing\n"
