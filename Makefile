@@ -8,7 +8,7 @@ CODE := kerv_cli tests scripts
 test: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test demo lint format pages clean
+.PHONY: help setup test demo torture lint format pages clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -25,6 +25,11 @@ test: lint ## check style and types, then run the tests
 demo: setup ## run the demo study and report it
 	@$(BIN)/kerv sweep study=demo
 	@$(BIN)/kerv report study=demo
+
+torture: export OMP_NUM_THREADS := 1
+
+torture: setup ## kill commands and damage files for at most 15 minutes (MINUTES=, SHORT=1); see docs/torture.md
+	@$(BIN)/python scripts/torture.py --minutes $(or $(MINUTES),15) $(if $(SHORT),--short)
 
 lint: setup ## check style and types
 	@$(BIN)/ruff check $(CODE)
