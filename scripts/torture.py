@@ -86,7 +86,7 @@ class Ended:
 
 
 def run(
-    words: list[str], limit: float = 120.0, kill_at: int = 0, kill_after: float = 0.0, log: Path | None = None
+    words: list[str], limit: float = 900.0, kill_at: int = 0, kill_after: float = 0.0, log: Path | None = None
 ) -> Ended:
     """Runs a command in a fork of this process, in its own process group.
 

@@ -239,6 +239,8 @@ class StudyStore:
         for first in range(0, len(there), _READ_TOGETHER):
             read = [self._read_as(cell) for cell in there[first : first + _READ_TOGETHER]]
             found |= {stored.id: stored for stored in _stored(read)}
+            del read
+            pa.default_memory_pool().release_unused()
         return found, [cell for cell in unique if cell.id not in found]
 
     def _read_as(self, cell: Cell) -> _ReadCell:
