@@ -80,6 +80,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
         with storage_errors(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
             _clean_once(folder.parent)
+            _put_back(folder)
             temporary.mkdir()
             fill(temporary)
             for path in (*temporary.iterdir(), temporary):
@@ -111,10 +112,25 @@ def _exchange(a: Path, b: Path) -> None:
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
         if libc.renameat2(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0:
             return
-    aside = temporary_beside(b)
+    aside = _aside(b)
     os.rename(b, aside)
-    os.rename(a, b)
+    try:
+        os.rename(a, b)
+    except OSError:
+        os.rename(aside, b)
+        raise
     os.rename(aside, a)
+
+
+def _aside(folder: Path) -> Path:
+    """Where the older folder lies between the two renames; no temporary name, so that nothing removes it."""
+    return folder.with_name(f".{folder.name}.older")
+
+
+def _put_back(folder: Path) -> None:
+    """Puts the older folder back where a process ended between the two renames."""
+    if not folder.exists() and _aside(folder).is_dir():
+        os.rename(_aside(folder), folder)
 
 
 @functools.cache
