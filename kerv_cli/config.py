@@ -58,6 +58,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of the wrong type.
     """
+    overrides, name = method_of_file(overrides)
     _check(command, overrides)
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
@@ -71,6 +72,8 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     except OmegaConfBaseException as error:
         raise UsageError(_one_line(error)) from error
     assert isinstance(settings, schema)
+    if name is not None:
+        settings.method = name  # type: ignore[attr-defined]
     return settings
 
 
@@ -111,6 +114,41 @@ def _store_part(group: str, name: str, settings: type) -> None:
     from hydra.core.config_store import ConfigStore
 
     ConfigStore.instance().store(group=group, name=name, node=settings(kind=name))
+
+
+def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
+    """Overrides with a `method=FILE.yaml` replaced by what the file chooses, and the method's name: the file's. The
+    command line's own choices outrank it. Such a file looks like those of conf/method.
+
+    Raises:
+        UsageError: the file cannot be read, or is no method.
+    """
+    import yaml
+
+    files = [word for word in overrides if word.startswith("method=") and word.endswith((".yaml", ".yml"))]
+    if not files:
+        return list(overrides), None
+    path = Path(files[-1].split("=", 1)[1]).expanduser()
+    try:
+        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+        chosen = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
+        parts = {key.removeprefix("override /"): name for choice in chosen for key, name in choice.items()}
+        words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
+    except OSError as error:
+        raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, AttributeError, TypeError) as error:
+        raise UsageError(f"method={path} is no method: see conf/method/kerv.yaml for one") from error
+    rest = [word for word in overrides if word not in files]
+    given = {word.split("=", 1)[0] for word in rest}
+    return [*(word for word in words if word.split("=", 1)[0] not in given), *rest], path.stem
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif value is not None:
+            yield f"{prefix}{key}={str(value).lower() if isinstance(value, bool) else value}"
 
 
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
@@ -163,10 +201,15 @@ def _check(command: str, overrides: Sequence[str]) -> None:
     known = groups()
     for word in overrides:
         if "=" not in word:
-            raise UsageError(f"'{word}' is not an override: write key=value, see 'kerv {command} --cfg' for the keys")
+            raise UsageError(f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys")
         key, value = word.split("=", 1)
         if key.lstrip("+~") in known and value not in known[key.lstrip("+~")]:
             raise UnknownName(key.lstrip("+~"), value, known[key.lstrip("+~")])
+
+
+def spoken(command: str) -> str:
+    """A command's name as it is typed: `train_drafter` -> `train drafter`."""
+    return command.replace("_", " ")
 
 
 def _task_list(word: str) -> str:
@@ -189,7 +232,7 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
         if key not in keys and key not in groups():
             near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
             near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
-            hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {command} --cfg' for the keys"
+            hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {spoken(command)} --cfg' for the keys"
             return UsageError(f"unknown key '{key}': {hint}")
     return UsageError(_one_line(error.__cause__ or error))
 

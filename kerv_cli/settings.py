@@ -137,6 +137,8 @@ class SweepSettings(CommandSettings):
     """`kerv sweep`: a study. Everything else on the command line goes to each of its settings."""
 
     study: StudySettings = field(default_factory=StudySettings)
+    until: str = "done"  # done: every planned episode | decided: settings stop when their question is answered
+    loss: float = 3.0  # until=decided: is the loss of success against the baseline below so many points?
 
 
 @dataclass
@@ -247,6 +249,7 @@ class ReportSettings(CommandSettings):
 
     only: str | None = None  # name of one study (study=NAME on the command line); default: all that are there
     against: str | None = None  # results folder with another run of that study: how far the two agree
+    loss: float = 3.0  # --choose: bound on the loss of success against the baseline, points
 
 
 @dataclass

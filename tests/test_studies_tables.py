@@ -407,7 +407,7 @@ def test_figures_show_the_axis_and_the_references(results: Path) -> None:
 
 
 def test_nothing_to_report_names_what_to_run(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="run `kerv sweep study=NAME`"):
+    with pytest.raises(UsageError, match="run `kerv sweep study=demo`"):
         report(tmp_path)
     with pytest.raises(UsageError, match="run `kerv sweep study=threshold`"):
         report(tmp_path, "threshold")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, composed, edge, print_table
+from kerv_cli.commands.common import AsJson, Overrides, ShowConfig, composed, edge, print_json, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.environments.spec import EnvironmentSpec
@@ -24,13 +24,16 @@ class Finding:
 
 
 @edge
-def doctor(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+def doctor(overrides: Overrides = None, cfg: ShowConfig = False, as_json: AsJson = False) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing."""
     from kerv_cli.settings import DoctorSettings
 
-    settings = composed("doctor", overrides, DoctorSettings, cfg)
+    settings = composed("doctor", overrides, DoctorSettings, cfg, writes=False)
     findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings), _disk(settings), _display()]
-    print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
     if not all(finding.ok for finding in findings):
         raise typer.Exit(1)
 
@@ -69,7 +72,7 @@ def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Findin
         return Finding(what, False, str(error))
     size = settings.world.camera.size
     if spread == 0:
-        return Finding(what, False, f"{backend} draws empty frames: try MUJOCO_GL=osmesa kerv doctor")
+        return Finding(what, False, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
     return Finding(what, milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
 
 
@@ -101,7 +104,7 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
             findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
-    return findings or [Finding("policies", True, "none shipped here: 'kerv train target' trains one")]
+    return findings or [Finding("policies", False, "none here: install kerv from its wheel or run it in a checkout, both bring mt10-vision")]
 
 
 def _disk(settings: DoctorSettings) -> Finding:

@@ -23,7 +23,7 @@ def view(
 
     words = arguments or []
     overrides = [w for w in words if w.split("=", 1)[0] == "results" and "=" in w]
-    settings = composed("view", overrides, ViewSettings, cfg)
+    settings = composed("view", overrides, ViewSettings, cfg, writes=False)
     from kerv_cli.viewing.viewer import find_recordings, open_recording, read_summary
 
     places = [Path(w) for w in words if w not in overrides] or [Path(settings.results)]

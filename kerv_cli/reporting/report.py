@@ -61,7 +61,7 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
     names = begun_studies(results)
     calibrated = prediction.calibrated_targets(Path(results))
     if not names and not calibrated:
-        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=NAME`")
+        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=demo`")
     for name in names:
         reporter.report_study(name)
     for target in calibrated:

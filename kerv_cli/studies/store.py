@@ -1,6 +1,7 @@
 """The results folder of a study. A cell is either complete or absent.
 
-results/studies/<name>/
+results/studies/<name>/, results/rollouts/<run>/
+    run.json                      the commands that ran it; see run_file.py
     plan.yaml                     what was asked for
     cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
     failures/<id>.txt             traceback of the last attempt, until one succeeds
@@ -58,18 +59,22 @@ class StoredCell:
     episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA, and decode_seconds: per episode (decodes,) seconds
 
 
+STUDIES, ROLLOUTS = "studies", "rollouts"
+"""Families of stores: what `kerv sweep` and what `kerv rollout` leaves, in the same files."""
+
+
 class StudyStore:
-    """`results/studies/<name>`. Only a path: picklable, and nothing is created before the first write.
+    """`results/<family>/<name>`. Only a path: picklable, and nothing is created before the first write.
 
     Raises:
         UsageError: a name that is no plain folder name.
     """
 
-    def __init__(self, results: Path | str, name: str) -> None:
+    def __init__(self, results: Path | str, name: str, family: str = STUDIES) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
             raise UsageError(f"study name '{name}' must be letters, digits, '_', '-', '.'")
-        self.name = name
-        self.root = Path(results) / "studies" / name
+        self.name, self.family = name, family
+        self.root = Path(results) / family / name
         self.cells = self.root / "cells"
         self.rollouts = self.root / "rollouts"
         self.plan_path = self.root / "plan.yaml"
@@ -111,7 +116,7 @@ class StudyStore:
 
     def how_to_run(self) -> str:
         """The command that runs this study, for messages."""
-        return f"run `kerv sweep study={self.name}`"
+        return f"run `kerv sweep study={self.name}`" if self.family == STUDIES else f"run `kerv runs rerun {self.name}`"
 
     def has_cell(self, name: str) -> bool:
         """Whether the cell is complete; its files are compared with their hashes.

@@ -72,6 +72,9 @@ class TargetDescription(Description):
 
 T = TypeVar("T", bound=Description)
 
+_TRAINED_BY = {"target": "train target", "drafter": "train drafter", "early": "train drafter drafter=early"}
+"""Kind of a description -> the command that makes one."""
+
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Writes a safetensors file atomically. Raises StorageError: writing failed."""
@@ -119,7 +122,7 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
     """
     path, weights = folder / f"{kind}.json", folder / WEIGHTS
     if not path.is_file():
-        raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
+        raise CheckpointError(f"no {kind} in {folder}: run 'kerv {_TRAINED_BY[kind]}', or name a folder that holds one")
     value = read_json(path)
     if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
