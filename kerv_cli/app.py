@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from typing import Annotated
 
 import typer
 
-from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, sweep, train, view
+from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, runs, sweep, train, view
 
 # Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,8 +28,27 @@ app.command("calibrate")(calibrate.calibrate)
 app.command("rollout")(rollout.rollout)
 app.command("sweep")(sweep.sweep)
 app.command("report")(report.report)
+app.add_typer(runs.app, name="runs")
 app.command("view")(view.view)
 app.command("doctor")(doctor.doctor)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from kerv_cli.provenance import git_commit, versions
+
+        names = ", ".join(f"{name} {number}" for name, number in versions().items())
+        typer.echo(f"{names}, commit {git_commit()}")
+        raise typer.Exit(0)
+
+
+@app.callback()
+def kerv(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print versions and stop.")
+    ] = False,
+) -> None:
+    """Options of kerv itself."""
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ def target(
     settings = common.composed("train_target", overrides, TrainTargetSettings, cfg)
     from kerv_cli.training.runs import TargetRun
 
-    _run(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
+    run_training(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
 
 
 @app.command("drafter")
@@ -42,10 +42,10 @@ def drafter(
     settings = common.composed("train_drafter", overrides, TrainDrafterSettings, cfg)
     from kerv_cli.training.runs import drafter_run
 
-    _run(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
+    run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
 
 
-def _run(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
+def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     if plan:
         common.print_plan(run.plan())
     with progress_bar(loading) as advance:
