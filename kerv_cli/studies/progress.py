@@ -69,7 +69,10 @@ class ProgressDisplay:
         self._bar.update(self._task, completed=self._finished + sum(self._parts.values()), description=now)
 
     def _start(self, event: events.SweepStarted) -> None:
-        self._total = event.total
+        self._total, self._finished = event.total, 0
+        self._parts.clear()
+        if self._bar is not None:
+            self._bar.stop()
         if event.reused:
             self.console.print(f"{event.reused} cells are complete already")
         if not self.console.is_terminal or not event.total:
