@@ -124,6 +124,7 @@ class StudySettings:
 
     name: str = "threshold"
     title: str = ""
+    note: str = ""  # a sentence that says what to see, printed below the table
     baseline: str = "ar"  # label of the setting that the others are compared with
     common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid

@@ -39,11 +39,13 @@ def report(
     # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
     words = [f"only={_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
     settings = composed("report", words, ReportSettings, cfg)
+    from kerv_cli.commands.sweep import tell_note
     from kerv_cli.places import results_dir
     from kerv_cli.reporting.agreement import agreement_summary
     from kerv_cli.reporting.report import report as write_report
     from kerv_cli.reporting.summary import summary_table
     from kerv_cli.reporting.tables import rows_of
+    from kerv_cli.studies.store import StudyStore
 
     if choose:
         _choose(settings, as_json)
@@ -53,8 +55,9 @@ def report(
         tables = {name: rows_of(table) for name, table in written.tables.items()}
         print_json({"files": written.files, "studies": tables})
         return
-    for table in written.tables.values():
+    for name, table in written.tables.items():
         console().print(summary_table(table))
+        tell_note(StudyStore(results_dir(settings.results), name).read_plan().note)
     if written.agreement is not None:
         console().print(agreement_summary(written.agreement))
     for path in written.files:

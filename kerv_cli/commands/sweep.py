@@ -58,7 +58,7 @@ def sweep(
         _print_plan(cells, store, first.runtime.workers)
         return
     outcome = _run(resolved, cells, store, words)
-    _tell(outcome, cells, store, words, as_json)
+    _tell(outcome, resolved, cells, store, words, as_json)
 
 
 def _cells(resolved: ResolvedStudy) -> tuple[list[Cell], StudyStore]:
@@ -167,7 +167,15 @@ def _until_decided(
     return total
 
 
-def _tell(outcome: Outcome, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool) -> None:
+def tell_note(note: str) -> None:
+    """Prints what a study says is to be seen in its table."""
+    if note:
+        typer.echo(f"\n{note}\n")
+
+
+def _tell(
+    outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
+) -> None:
     from kerv_cli.reporting.summary import summary_table
     from kerv_cli.reporting.tables import load_study, rows_of, study_table
 
@@ -183,6 +191,7 @@ def _tell(outcome: Outcome, cells: list[Cell], store: StudyStore, words: list[st
     else:
         if table is not None:
             console().print(summary_table(table))
+            tell_note(resolved.study.note)
         typer.echo(
             f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed; "
             f"tables and plots: {called()} report study={store.name}{in_same(words)}"

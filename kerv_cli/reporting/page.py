@@ -66,6 +66,7 @@ def render(
         title=data.plan.title or store.name,
         verdict=verdict(data, whole, per_task),
         caution=caution(whole),
+        note=data.plan.note,
         about=_about(whole),
         baseline=data.plan.baseline,
         absent=[f"{cell.label} on {cell.task}" for cell in data.absent],

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.rollouts.policy import artifacts_of
 from kerv_cli.rollouts.run import Runner, is_recorded
-from kerv_cli.settings import settings_from
+from kerv_cli.settings import RolloutSettings, settings_from
 
 _TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
 
@@ -78,10 +79,25 @@ class CellRunner:
                 from kerv_cli.viewing.rerun_log import save_episode  # only a recording needs rerun
 
                 name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
-                save_episode(record, self.rollouts / name, method=cell.label)
-            return dataclasses.replace(record, frames={})
+                save_episode(record, self.rollouts / name, method=cell.label, limits=limits_of(settings, cell.task))
+            return dataclasses.replace(record, frames={}, places={})
 
         return episode
+
+
+def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
+    """Signal of a recording -> the limit that a decision compares it with: F* of the boundary, s_min of verify-skip."""
+    limits = {}
+    if hasattr(settings.boundary, "f_star"):
+        limits["metric"] = float(settings.boundary.f_star)
+    if hasattr(settings.skip, "s_min"):
+        given = settings.skip.s_min
+        if given is None:
+            levels = artifacts_of(settings).load("calibration").skip
+            given = levels.tasks[task].s_min if levels is not None and task in levels.tasks else None
+        if given is not None:
+            limits["similarity"] = float(given)
+    return limits
 
 
 @functools.lru_cache(maxsize=64)

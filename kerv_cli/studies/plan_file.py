@@ -19,6 +19,7 @@ class StudyPlan:
     baseline: str  # label that the others are compared with
     axis: str  # config key of the plots' x axis; empty where there is none
     cells: tuple[Cell, ...]
+    note: str = ""  # what to see
 
     @property
     def labels(self) -> list[str]:
@@ -32,7 +33,8 @@ def plan_text(plan: StudyPlan) -> str:
     for cell in plan.cells:
         settings = {key: value for key, value in cell.settings.items() if key != "task"}
         labels.setdefault(cell.label, {"overrides": cell.overrides, "identity": cell.identity, "settings": settings})
-    head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "labels": labels}
+    head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "note": plan.note}
+    head["labels"] = labels
     cells = [
         {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}
         for c in plan.cells
@@ -63,7 +65,7 @@ def plan_from_text(text: str) -> StudyPlan:
                 repeat=entry["repeat"],
             )
         )
-    return StudyPlan(loaded["study"], loaded["title"], loaded["baseline"], loaded["axis"], tuple(cells))
+    return StudyPlan(loaded["study"], loaded["title"], loaded["baseline"], loaded["axis"], tuple(cells), loaded.get("note", ""))
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:

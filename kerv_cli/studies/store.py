@@ -91,7 +91,7 @@ class StudyStore:
         Raises:
             StorageError: the disk refused.
         """
-        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells))
+        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
         with write_lock(self.plan_path):
             with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
                 new = merge_plans(self.read_plan(), new)
