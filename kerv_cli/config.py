@@ -201,7 +201,9 @@ def _check(command: str, overrides: Sequence[str]) -> None:
     known = groups()
     for word in overrides:
         if "=" not in word:
-            raise UsageError(f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys")
+            raise UsageError(
+                f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys"
+            )
         key, value = word.split("=", 1)
         if key.lstrip("+~") in known and value not in known[key.lstrip("+~")]:
             raise UnknownName(key.lstrip("+~"), value, known[key.lstrip("+~")])
@@ -232,7 +234,9 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
         if key not in keys and key not in groups():
             near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
             near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
-            hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {spoken(command)} --cfg' for the keys"
+            hint = (
+                f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {spoken(command)} --cfg' for the keys"
+            )
             return UsageError(f"unknown key '{key}': {hint}")
     return UsageError(_one_line(error.__cause__ or error))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import sys
 from collections.abc import Iterator
@@ -244,7 +245,7 @@ def test_token_lanes_and_modes(tmp_path: Path) -> None:
     names = record.space.names
     lanes = [column(path, f"/tokens/step_{i}/{name}", "state") for i in range(4) for name in names]
     shades = [row[0] for row in column(path, "/decodes", "state")]
-    assert all(a != b for a, b in zip(shades, shades[1:], strict=False)), "neighbouring decodes melt into one"
+    assert all(a != b for a, b in itertools.pairwise(shades)), "neighbouring decodes melt into one"
     for i, decode in enumerate(record.decodes):
         drawn = [lane[i][0] for lane in lanes]
         assert drawn == [f.kind for f in outcomes_of(decode, 16, DOFS)]

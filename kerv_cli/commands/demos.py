@@ -47,6 +47,8 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         with progress_bar("demonstrations") as advance:
             manifest = record(config, folder, advance)
     except KeyboardInterrupt:
-        raise Interrupted(f"interrupted: finished episodes are kept in {folder}, the same command goes on there") from None
+        raise Interrupted(
+            f"interrupted: finished episodes are kept in {folder}, the same command goes on there"
+        ) from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")

@@ -104,7 +104,11 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
             findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
-    return findings or [Finding("policies", False, "none here: install kerv from its wheel or run it in a checkout, both bring mt10-vision")]
+    return findings or [
+        Finding(
+            "policies", False, "none here: install kerv from its wheel or run it in a checkout, both bring mt10-vision"
+        )
+    ]
 
 
 def _disk(settings: DoctorSettings) -> Finding:

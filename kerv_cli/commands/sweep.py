@@ -197,7 +197,9 @@ def _tell(
             f"tables and plots: {called()} report study={store.name}{in_same(words)}"
         )
         if recordings:
-            typer.echo(f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}")
+            typer.echo(
+                f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}"
+            )
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

@@ -115,4 +115,3 @@ def summary(found: Sequence[Verdict]) -> str:
     told = [f"{v.label}: {v.verdict} after {v.pairs} pairs" for v in found if v.verdict != OPEN]
     waiting = sum(v.verdict == OPEN for v in found)
     return "; ".join([*told, f"{waiting} open"])
-

@@ -101,7 +101,9 @@ def caution(whole: pd.DataFrame) -> str:
     told = []
     if privileged:
         told.append(f"{', '.join(privileged)}: privileged, it is given object and goal positions")
-    unverified = [str(row["label"]) for row in rows if is_number(row["unverified_share"]) and row["unverified_share"] == 1]
+    unverified = [
+        str(row["label"]) for row in rows if is_number(row["unverified_share"]) and row["unverified_share"] == 1
+    ]
     if unverified:
         told.append(f"{', '.join(unverified)}: nothing is verified")
     return "; ".join(told)
@@ -174,4 +176,3 @@ def _href(path: Path, page: Path) -> str:
 def _commands(data: StudyData) -> list[tuple[str, str]]:
     """(setting, the overrides that make it)."""
     return [(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()]
-

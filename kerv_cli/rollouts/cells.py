@@ -69,7 +69,9 @@ class CellRunner:
     def __call__(self, cell: CellLike) -> Callable[[int], EpisodeRecord]:
         """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
         settings = settings_from(cell.settings)
-        runner = _kept(json.dumps(cell.settings, sort_keys=True), cell.task) if self.keep else Runner(settings, cell.task)
+        runner = (
+            _kept(json.dumps(cell.settings, sort_keys=True), cell.task) if self.keep else Runner(settings, cell.task)
+        )
 
         def episode(seed: int) -> EpisodeRecord:
             if self.on_step is not None:

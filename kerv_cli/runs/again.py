@@ -57,7 +57,9 @@ def _again(cell: Cell, results: str) -> Cell:
     for kind in cell.identity.keys() | identity.keys():
         was, now = cell.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and was != now:
-            raise CheckpointError(f"the {kind} of {cell.label} was {was[:12]} and is {now[:12]} now: it cannot run again")
+            raise CheckpointError(
+                f"the {kind} of {cell.label} was {was[:12]} and is {now[:12]} now: it cannot run again"
+            )
     stored = {**cell.settings, "results": results}
     return make_cell(cell.label, cell.overrides, stored, identity, cell.task, cell.seeds, cell.repeat)
 

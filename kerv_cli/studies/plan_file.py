@@ -65,7 +65,9 @@ def plan_from_text(text: str) -> StudyPlan:
                 repeat=entry["repeat"],
             )
         )
-    return StudyPlan(loaded["study"], loaded["title"], loaded["baseline"], loaded["axis"], tuple(cells), loaded.get("note", ""))
+    return StudyPlan(
+        loaded["study"], loaded["title"], loaded["baseline"], loaded["axis"], tuple(cells), loaded.get("note", "")
+    )
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:

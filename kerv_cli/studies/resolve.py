@@ -16,7 +16,6 @@ from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.manifests import read
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
 
-
 _OF_THE_SWEEP = ("study", "results", "until", "loss")
 
 

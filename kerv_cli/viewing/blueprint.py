@@ -105,7 +105,9 @@ def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
         views.append(_series("Acceptance threshold r, bins", "decode/threshold", top=_ROOM * meta.widest + 1))
         shares.append(1.2)
     for signal in meta.signals:
-        views.append(_series(SIGNALS[signal], f"signals/{signal}", legend=signal in meta.limited, corner=rrb.Corner2D.LeftBottom))
+        views.append(
+            _series(SIGNALS[signal], f"signals/{signal}", legend=signal in meta.limited, corner=rrb.Corner2D.LeftBottom)
+        )
         shares.append(1.1)
     if not meta.drafted:
         views += _always(meta)

@@ -60,9 +60,7 @@ class Entity:
     columns: Iterable[Any] = ()  # rerun columns of as many rows
 
 
-def save_episode(
-    record: EpisodeRecord, path: Path, *, method: str, limits: Mapping[str, float] | None = None
-) -> Path:
+def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapping[str, float] | None = None) -> Path:
     """Writes an episode as a recording that carries its own layout, atomically -> `path`.
 
     Args:
@@ -286,9 +284,7 @@ def _current_chunk(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[st
     ]
 
 
-def _cells(
-    centres: NDArray[np.float64], colors: Sequence[int] | None = None, width: float = 0.96
-) -> rr.LineStrips2D:
+def _cells(centres: NDArray[np.float64], colors: Sequence[int] | None = None, width: float = 0.96) -> rr.LineStrips2D:
     """Filled, rounded cells at (n, 2) centres: thick short lines, since boxes are outlines. width: in cells."""
     radius = 0.46 * _CELL[1]
     reach = np.array([0.5 * width * _CELL[0] - radius, 0.0])
@@ -310,9 +306,7 @@ def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) ->
     return Entity("decode/table", (), starts, rr.TextDocument.columns(text=texts, media_type=kinds))
 
 
-def _series_per_decode(
-    record: EpisodeRecord, starts: NDArray[np.int64], bounds: Mapping[str, float]
-) -> list[Entity]:
+def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds: Mapping[str, float]) -> list[Entity]:
     """Series of numbers per decode. A decode without a number has no row; a number that no decode has has no entity."""
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
