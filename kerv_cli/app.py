@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kerv_cli.commands import build, calibrate, demos, doctor, report, rollout, runs, sweep, train, view
+from kerv_cli.commands import build, calibrate, completion, demos, doctor, report, rollout, runs, sweep, train, view
 
 # Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -17,6 +17,7 @@ app = typer.Typer(
     help="Fast vision-language-action policies on Meta-World: train, sweep, report, look.",
     epilog="Settings follow the command as key=value, e.g. kerv rollout method=spec_vla task=drawer-open threshold.r=5",
     no_args_is_help=True,
+    add_completion=False,  # `kerv completion` installs a script for bash that knows of '='
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -31,6 +32,7 @@ app.command("report")(report.report)
 app.add_typer(runs.app, name="runs")
 app.command("view")(view.view)
 app.command("doctor")(doctor.doctor)
+app.command("completion")(completion.completion)
 
 
 def _version(asked: bool) -> None:
@@ -53,6 +55,12 @@ def kerv(
 
 def main() -> None:
     """Entry point of the `kerv` script."""
+    if (
+        "_KERV_COMPLETE" in os.environ
+    ):  # a shell asks for completions; typer registers its shells with add_completion only
+        from typer._completion_classes import completion_init
+
+        completion_init()
     app()
 
 

@@ -241,6 +241,17 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
     return UsageError(_one_line(error.__cause__ or error))
 
 
+def keys_of(command: str, choices: Sequence[str], schema: type) -> list[str]:
+    """Every key of the command's configuration with these group choices, dotted; those of the groups alone where the
+    choices do not compose."""
+    from hydra.errors import HydraException
+
+    try:
+        return _keys(command, choices, schema)
+    except HydraException:
+        return _keys(command, [], schema)
+
+
 def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:
     """Every key of the command's configuration with these group choices, dotted."""
     from omegaconf import DictConfig, OmegaConf

@@ -21,20 +21,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def complete_overrides(incomplete: str) -> list[str]:
-    """Completions of an override: `method=` -> every method; without `=`, the groups. Imports nothing heavy."""
-    from kerv_cli.config import groups
+def complete_overrides(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions of an override. Imports nothing heavy."""
+    from kerv_cli.commands.completing import complete_overrides as complete
 
-    known, (group, equals, _) = groups(), incomplete.partition("=")
-    if not equals:
-        words = [f"{name}=" for name in [*known, "task", "results"]]
-    elif group == "task":
-        from kerv_cli.environments import task_names
-
-        words = [f"task={name}" for name in task_names()]
-    else:
-        words = [f"{group}={name}" for name in known.get(group, [])]
-    return [word for word in words if word.startswith(incomplete)]
+    return complete(ctx, incomplete)
 
 
 Overrides = Annotated[
@@ -64,7 +55,8 @@ def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bo
         raise typer.Exit(0)
     if writes:
         check_writable(settings.results)
-    return settings  # type: ignore[no-any-return]
+    checked: T = settings
+    return checked
 
 
 def print_json(value: Any) -> None:

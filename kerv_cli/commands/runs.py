@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -105,9 +106,9 @@ def show(overrides: Words = None, as_json: AsJson = False) -> None:
     if as_json:
         print_json({**_plain(run), "bytes": size, "settings": [] if table is None else rows_of(table)})
         return
-    lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder,
-             "size": f"{size / 1e6:.1f} MB", "command": " ".join(["kerv", *run.command]) if run.command else "unknown"}  # fmt: skip
-    for name, value in lines.items():
+    typed = shlex.join(["kerv", *run.command]) if run.command else "unknown"
+    lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed}).items():
         typer.echo(f"{name:<8} {value}")
     if table is not None:
         console().print(summary_table(table))

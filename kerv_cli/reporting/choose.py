@@ -1,5 +1,5 @@
-"""Which setting to take: the Pareto front of speed and success, and the boldest setting of a study whose loss of success
-stays below a bound with 95 % confidence (docs/methods.md §7)."""
+"""Which setting to take: the Pareto front of speed and success, and the boldest setting of a study whose loss of
+success stays below a bound with 95 % confidence (docs/methods.md §7)."""
 
 from __future__ import annotations
 
@@ -50,9 +50,8 @@ def choices(study: pd.DataFrame, per_task: pd.DataFrame, axis: str, loss: float)
     """
     suite = rows_of(study, MICRO)
     found = [_choice("all tasks", suite, axis, loss)]
-    for task in sorted(set(per_task["task"])):
-        found.append(_choice(str(task), rows_of(per_task[per_task["task"] == task]), axis, loss))
-    return found
+    tasks = sorted(set(per_task["task"]))
+    return found + [_choice(str(task), rows_of(per_task[per_task["task"] == task]), axis, loss) for task in tasks]
 
 
 def _choice(where: str, rows: Sequence[dict[str, Any]], axis: str, loss: float) -> Choice:

@@ -35,17 +35,18 @@ def curves_figure(log: pd.DataFrame, title: str) -> Figure:
     """One panel per measure over steps; the best validation is marked."""
     names = [str(name) for name in log.columns if name != "step"]
     rows = -(-len(names) // _COLUMNS)
-    best = log["score"].idxmax() if "score" in log else log.index[-1]
+    score = log["score"] if "score" in log else log["step"]
+    best = float(log["step"].to_numpy()[int(score.to_numpy().argmax())])
     with mpl.rc_context(STYLE):
         figure = new_figure(11.0, 1.0 + 2.3 * rows)
         panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
         for panel, name in zip(panels, names, strict=False):
             panel.plot(log["step"], log[name], color=COLOURS[0], linewidth=1.8, marker="o", markersize=3)
-            panel.axvline(log["step"][best], color=MUTED, linewidth=1.0, linestyle=":")
+            panel.axvline(best, color=MUTED, linewidth=1.0, linestyle=":")
             panel.set(title=name, xlabel="step")
         for panel in panels[len(names) :]:
             panel.set_visible(False)
-        about = f"{len(log)} validations of the averaged weights; dotted: the saved ones, step {log['step'][best]:.0f}"
+        about = f"{len(log)} validations of the averaged weights; dotted: the saved ones, step {best:.0f}"
         entitle(figure, title, about)
     return figure
 

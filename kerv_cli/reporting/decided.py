@@ -1,8 +1,8 @@
 """`until=decided`: a sweep looks at its results after every block of seeds and stops the settings whose question is
 answered: does this setting lose less than so many points of success against the baseline?
 
-Group-sequential with Pocock's constant boundary (Biometrika 64, 1977): of K planned looks each uses the same confidence,
-so high that a setting that is exactly at the bound is misjudged at any of them with at most 5 %, both sides together.
+Group-sequential with Pocock's constant boundary (Biometrika 64, 1977): of K planned looks each uses the same
+confidence, so high that a setting that is exactly at the bound is misjudged at any of them with at most 5 %, both sides together.
 """
 
 from __future__ import annotations
@@ -105,8 +105,9 @@ def rule(loss: float, looks: int) -> str:
     """The stopping rule in one sentence."""
     confidence = 100 * confidence_of_a_look(looks)
     return (
-        f"until=decided: at most {looks} looks, one per block of seeds over all tasks, each at {confidence:.1f} % (Pocock's "
-        f"boundary, 95 % over all looks); a setting stops when its loss of success is shown to be below or above {loss:g} points"
+        f"until=decided: at most {looks} looks, one per block of seeds over all tasks, each at {confidence:.1f} % "
+        "(Pocock's boundary, 95 % over all looks); a setting stops when its loss of success is shown to be below or "
+        f"above {loss:g} points"
     )
 
 

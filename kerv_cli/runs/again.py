@@ -98,5 +98,5 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
     settings = read(TrainDrafterSettings, value, str(path))
-    place = {("drafter" if run.kind == "drafter" else "early"): name}
+    place: dict[str, Any] = {("drafter" if run.kind == "drafter" else "early"): name}
     return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, **place)))

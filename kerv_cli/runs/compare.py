@@ -104,8 +104,9 @@ def differences(first: Side, second: Side) -> list[Difference]:
 def _described(side: Side) -> dict[str, Any]:
     if side.run.kind in TRAINED:
         made = description_of(side.run)
-        kept = {key: made[key] for key in ("git_commit", "versions", "demos") if key in made}
-        return flatten({**made.get("settings", {}), **kept})
+        described: dict[str, Any] = dict(made.get("settings", {}))
+        described.update((key, made[key]) for key in ("git_commit", "versions", "demos") if key in made)
+        return flatten(described)
     store = store_of(side.run)
     cells = [cell for cell in store.read_plan().cells if cell.label == side.label]
     cell = cells[0]

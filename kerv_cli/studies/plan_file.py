@@ -33,7 +33,13 @@ def plan_text(plan: StudyPlan) -> str:
     for cell in plan.cells:
         settings = {key: value for key, value in cell.settings.items() if key != "task"}
         labels.setdefault(cell.label, {"overrides": cell.overrides, "identity": cell.identity, "settings": settings})
-    head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "note": plan.note}
+    head: dict[str, Any] = {
+        "study": plan.name,
+        "title": plan.title,
+        "baseline": plan.baseline,
+        "axis": plan.axis,
+        "note": plan.note,
+    }
     head["labels"] = labels
     cells = [
         {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}

@@ -47,7 +47,7 @@ def decode_figure(rounds: Sequence[Round], names: Sequence[str], size: int, titl
 def _row_name(played: Round, number: int) -> str:
     if not played.drafted:
         return f"forward {number + 1}: {'prefill' if played.mode == 'prefill' else 'one token'}"
-    return f"forward {number + 1}: {len(played.drafted)} drafted, {played.accepted} kept"
+    return f"forward {number + 1}: {len(played.drafted)} compared, {played.accepted} kept"
 
 
 def _draw_cell(panel: Axes, place: int, row: int, outcome: TokenOutcome) -> None:
@@ -58,4 +58,12 @@ def _draw_cell(panel: Axes, place: int, row: int, outcome: TokenOutcome) -> None
     panel.add_patch(box)
     dark = float(colour @ [0.3, 0.59, 0.11]) < 0.55
     text = outcome.short.replace(" → ", "→")
-    panel.text(place + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7, color="white" if dark else INK)
+    panel.text(
+        place + 0.5,
+        row + 0.5,
+        text,
+        ha="center",
+        va="center",
+        fontsize=6.2 if "→" in text else 7.5,
+        color="white" if dark else INK,
+    )
