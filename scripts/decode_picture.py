@@ -1,5 +1,5 @@
-"""Draws docs/decode.png: `scripts/decode_picture.py RUN_FOLDER LABEL OUT.png`, the first decode of that setting of a run that
-has two verifications and a draft off the target's token."""
+"""Draws docs/decode.png: `scripts/decode_picture.py RUN_FOLDER LABEL OUT.png`, the first decode of that setting of
+a run that has two verifications and drafts off the target's token."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Every command in README.md and docs/ runs: with --cfg where it has it, which composes and checks all of its settings and
-computes nothing."""
+"""Every command in README.md and docs/ runs: with --cfg where it has it, which composes and checks all of its settings
+and computes nothing."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`kerv rollout` and `kerv sweep` as runs: what they leave, and what `kerv runs` does with it. Real episodes of a nano policy
-in this process, recordings left out."""
+"""`kerv rollout` and `kerv sweep` as runs: what they leave, and what `kerv runs` does with it. Real episodes of a nano
+policy in this process, recordings left out."""
 
 from __future__ import annotations
 
