@@ -188,7 +188,7 @@ def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture
         ("report", "study=main"),
         ("view",),
         ("runs", "show", "last"),
-        ("train", "drafter", "trin.lr=3"),
+        ("train", "drafter", "zzz.qqq=3"),
     ],
 )
 def test_a_printed_command_runs_as_it_stands(arguments: tuple[str, ...], policies: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """`until=decided`: a sweep looks at its results after every block of seeds and stops the settings whose question is
 answered: does this setting lose less than so many points of success against the baseline?
 
-Group-sequential with Pocock's constant boundary (Biometrika 64, 1977): of K planned looks each uses the same confidence,
+Group-sequential with Pocock's constant boundary (Biometrika 64, 1977): of K planned looks each has the same confidence,
 so high that a setting exactly at the bound is misjudged at any of them with at most 5 %, both sides together.
 """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -20,7 +21,10 @@ from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, round_outcom
 def rounds_of(decodes: Path, number: int) -> tuple[Round, ...]:
     """The rounds of the `number`-th row of a cell's decodes.parquet."""
     row = pq.read_table(decodes, columns=["rounds"])["rounds"][number].as_py()
-    return tuple(Round(**{name: tuple(v) if isinstance(v, list) else v for name, v in r.items()}) for r in row)
+    stored: list[dict[str, Any]] = [
+        {name: tuple(v) if isinstance(v, list) else v for name, v in played.items()} for played in row
+    ]
+    return tuple(Round(**values) for values in stored)
 
 
 def decode_figure(rounds: Sequence[Round], names: Sequence[str], size: int, title: str) -> Figure:
