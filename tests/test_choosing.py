@@ -92,7 +92,7 @@ def test_the_boundary_misjudges_one_time_in_twenty_over_all_looks(looks: int) ->
 
 
 def test_more_looks_than_are_tabled_are_refused() -> None:
-    with pytest.raises(UsageError, match="set study.block higher"):
+    with pytest.raises(UsageError, match=r"set study\.block higher"):
         confidence_of_a_look(21)
 
 

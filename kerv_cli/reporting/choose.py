@@ -116,22 +116,22 @@ def sentence(choice: Choice, axis: str, loss: float, baseline: str) -> str:
     if choice.chosen:
         speed = f", {choice.speedup:.2f} times as fast as {baseline}" if is_number(choice.speedup) else ""
         return f"{boldest(axis)} that {bound}: {choice.chosen}{speed} ({choice.pairs} pairs)"
-    return f"no setting is shown to be one that {bound}: {_missing(choice)}"
+    return f"{choice.pairs} pairs do not yet show a setting that {bound}; {_missing(choice)}"
 
 
 def short(choice: Choice) -> str:
     """The choice for one task in a few words."""
     if choice.chosen:
         return f"{choice.where}: {choice.chosen}"
-    return f"{choice.where}: undecided, {_missing(choice)}"
+    return f"{choice.where}: undecided after {choice.pairs} pairs; {_missing(choice)}"
 
 
 def _missing(choice: Choice) -> str:
     if not choice.undecided:
-        return f"{choice.pairs} pairs, and more would not show one"
+        return "more would not show one"
     label, pairs = min(choice.undecided.items(), key=lambda item: item[1])
     more = max(1, math.ceil(pairs - choice.pairs))
-    return f"{choice.pairs} pairs; about {more} more would show it for {label} at the present rates"
+    return f"about {more} more would show it for {label} at the present rates"
 
 
 def choices_frame(found: Sequence[Choice]) -> pd.DataFrame:
