@@ -124,13 +124,13 @@ class StudySettings:
 
     name: str = "threshold"
     title: str = ""
-    note: str = ""  # a sentence that says what to see, printed below the table
     baseline: str = "ar"  # label of the setting that the others are compared with
     common: str = ""  # overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them
     settings: dict[str, str] = field(default_factory=dict)  # label -> overrides; comma lists expand into a grid
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
     block: int = 5  # seeds for which the settings take turns in one process, episode by episode
     repeats: int = 1  # how often every episode is measured
+    note: str = ""  # a sentence that says what to see, printed below the table
 
 
 @dataclass

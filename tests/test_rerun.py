@@ -22,7 +22,8 @@ from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.errors import KervError, StorageError, UsageError
 from kerv_cli.registry import parts
 from kerv_cli.viewing import rerun_log, viewer
-from kerv_cli.viewing.rerun_log import readable, save_episode
+from kerv_cli.viewing.facts import readable
+from kerv_cli.viewing.rerun_log import save_episode
 from kerv_cli.viewing.together import save_together
 from kerv_cli.viewing.token_outcomes import chunk_size, outcomes_of
 from kerv_cli.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary

@@ -383,7 +383,7 @@ def test_the_page_stands_alone(results: Path) -> None:
         "http://creativecommons.org", ""
     ).replace("https://matplotlib.org", "")
     assert "1 of 12 planned cells are not complete: spec_vla r=9 on door-open-v3" in page
-    assert "Run `kerv sweep study=threshold` to run them" in page
+    assert f"Run `kerv sweep study=threshold results={results}` to run them" in page
     assert "All tasks" in page
     assert "by difficulty" in page
     assert 'class="verdict"' in page

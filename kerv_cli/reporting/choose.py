@@ -15,6 +15,8 @@ from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.tables import is_number, rows_of
 
 POINTS = 100.0
+_STEP, _MOST_STEPS = 1.15, 60
+"""Numbers of pairs are tried in steps of this factor."""
 _BOLD: dict[str, tuple[int, str]] = {
     "threshold.r": (1, "the largest r"),
     "boundary.f_star": (-1, "the smallest F*"),
@@ -75,8 +77,18 @@ def _loss_at_most(row: Mapping[str, Any]) -> float:
 
 
 def _needed(row: Mapping[str, Any], loss: float) -> float:
-    counts = stats.PairedCounts(*(int(row[name]) for name in stats.PairedCounts._fields))
-    return stats.pairs_to_settle(counts, loss / POINTS)
+    """About how many pairs would show it if the four outcomes' rates stayed as they are; infinite where the difference
+    itself lies at the bound or below. From the same interval as the judgement, unlike `pairs_to_settle`, whose normal
+    interval is too narrow for few discordant pairs."""
+    counts = [int(row[name]) for name in stats.PairedCounts._fields]
+    pairs = sum(counts)
+    if POINTS * (counts[2] - counts[1]) / pairs <= -loss:
+        return math.inf
+    for steps in range(1, _MOST_STEPS):
+        more = stats.PairedCounts(*(round(count * _STEP**steps) for count in counts))
+        if -POINTS * stats.paired_difference(more).low < loss:
+            return float(sum(more))
+    return math.inf
 
 
 def boldness(row: Mapping[str, Any], axis: str) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,7 @@ def render(
         baseline=data.plan.baseline,
         absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
         planned=len({cell.id for cell in data.plan.cells}),
-        how_to_run=store.how_to_run().capitalize(),
+        how_to_run=_how_to_run(store),
         suite=_suite(whole),
         stopped=[] if stopped is None else rows_of(stopped),
         figures=figures,
@@ -89,7 +90,7 @@ def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str
         rows = rows_of(whole, MICRO)
         told = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
         return f"Success: {told}."
-    found = choices(whole, per_task, data.plan.axis, LOSS)[0]
+    found = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
     text = sentence(found, data.plan.axis, LOSS, data.plan.baseline)
     return text[:1].upper() + text[1:] + "."
 
@@ -140,6 +141,13 @@ def _suite(whole: pd.DataFrame) -> pd.DataFrame:
     frame.insert(len(frame.columns), "success %, by difficulty", success)
     frame.insert(len(frame.columns), "speedup, by difficulty", speed)
     return frame
+
+
+def _how_to_run(store: StudyStore) -> str:
+    """The command that completes the study, wherever its results lie."""
+    results = str(store.root.parent.parent)
+    where = "" if results == "results" else f" results={shlex.quote(results)}"
+    return f"Run `kerv sweep study={store.name}{where}`"
 
 
 def _number(value: float) -> str:

@@ -35,10 +35,10 @@ from kerv_cli.viewing.blueprint import (
     EpisodeMeta,
     blueprint,
 )
+from kerv_cli.viewing.facts import facts_of, readable, summary
 from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, acceptance, chunk_size, decode_table, outcomes_of
 
 JPEG_QUALITY = 85
-_SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in OUTCOMES.values()}
 _MODE_COLORS = {"ar": 0x6E7B8BFF, "skip": 0xF0E442FF, "expert": 0x4E79A7FF}  # other modes are names of proposers
 _OTHER_COLORS = (0x0072B2FF, 0xA0522DFF, 0x4C9F70FF, 0xB07AA1FF)
 _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
@@ -87,7 +87,7 @@ def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> 
     recording.set_log_tick_enabled(False)
     outcome = "success" if record.success else "failure"
     recording.send_recording_name(readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
-    recording.send_property("episode", rr.AnyValues(**_facts(record, method)))
+    recording.send_property("episode", rr.AnyValues(**facts_of(record, method)))
     size = chunk_size(record.decodes, record.space.dofs)
     chunks = [outcomes_of(d, size, record.space.dofs) for d in record.decodes]
     for entity in _entities(record, method, chunks, limits):
@@ -117,11 +117,6 @@ def meta_of(record: EpisodeRecord, chunks: Chunks, limits: Mapping[str, float]) 
         centre=(x, y, z),
         extent=float((high - low).max()),
     )
-
-
-def readable(text: str) -> str:
-    """`text` on one line, with `?` for characters that the viewer's font lacks: they crash the 0.41 viewer."""
-    return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
 
 
 def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
@@ -382,56 +377,3 @@ def _rows(values: NDArray[Any]) -> Iterable[Any]:
 
 def _markdown(text: str) -> rr.TextDocument:
     return rr.TextDocument(text, media_type="text/markdown")
-
-
-def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
-    """The episode's totals, stored as properties of the recording."""
-    rounds = [r for d in record.decodes for r in d.rounds if r.is_verification]
-    facts: dict[str, Any] = {
-        "environment": readable(record.environment),
-        "task": readable(record.task),
-        "instruction": readable(record.instruction),
-        "method": readable(method),
-        "seed": record.seed,
-        "success": record.success,
-        "steps": record.steps,
-        "decodes": len(record.decodes),
-        "forwards": record.forwards,
-        "forwards_per_step": record.forwards / record.steps,
-        "ms_per_step": 1000 * record.seconds / record.steps,
-        "inference_seconds": record.seconds,
-        "wall_seconds": record.wall_seconds,
-        "skipped_decodes": sum(d.skipped for d in record.decodes),
-        "compensated_tokens": sum(d.compensated for d in record.decodes),
-    }
-    if rounds:
-        facts["acceptance_length"] = sum(r.committed for r in rounds) / len(rounds)
-        facts["accepted_per_round"] = sum(r.accepted for r in rounds) / len(rounds)
-    return facts
-
-
-def summary(record: EpisodeRecord, method: str) -> str:
-    """The episode as Markdown, with the key to the tokens' colours."""
-    facts = _facts(record, method)
-    modes = [d.mode for d in record.decodes]
-    rows = {
-        "instruction": facts["instruction"],
-        "method, seed": f"{facts['method']}, {record.seed}",
-        "control steps": f"{record.steps} ({record.steps / record.space.control_hz:.2f} s)",
-        "decodes": ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes)),
-        "forwards per step": f"{facts['forwards_per_step']:.2f}",
-    }
-    if "acceptance_length" in facts:
-        rows["AL"] = f"{facts['acceptance_length']:.2f}"
-        rows["accepted per round"] = f"{facts['accepted_per_round']:.2f}"
-    rows["compensated tokens"] = facts["compensated_tokens"]
-    rows["decodes without verification"] = facts["skipped_decodes"]
-    rows["inference per step"] = f"{facts['ms_per_step']:.2f} ms"
-    key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
-    outcome = "SUCCESS" if record.success else "FAILURE"
-    lines = [f"| {facts['task']} | {outcome} |", "|:--|:--|", *_table_rows(rows)]
-    return "\n".join([*lines, "", "| token | outcome |", "|:--|:--|", *_table_rows(key)])
-
-
-def _table_rows(rows: Mapping[str, Any]) -> list[str]:
-    return [f"| {name} | {value} |" for name, value in rows.items()]
