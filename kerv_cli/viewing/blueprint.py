@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import rerun.blueprint as rrb
 
@@ -14,7 +14,7 @@ CELL_WIDTH, CELL_HEIGHT = 60.0, 26.0
 """A token's cell in the picture of the current chunk, in scene units."""
 KEY_ROWS = 4
 """Least number of rows of the picture's key."""
-KEY_WIDTH = 1.75
+KEY_WIDTH = 1.95
 """Width of an entry of the key, in cells: `~ compensated` fits."""
 
 SIGNALS = {
@@ -29,8 +29,11 @@ SIGNALS = {
 LIMITS = {"metric": "F*", "similarity": "s_min"}
 """Signal -> name of the limit that a decision compares it with."""
 
-_ROOM = 1.5
-"""An axis ends so far above its largest value that the legend in the corner hides no data."""
+COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")
+"""Names of the DoFs' colours, for titles: a legend would hide data in views as small as these."""
+
+
+_PHASES_TITLE = "Time per decode, ms: total white, vision red, prefill green, propose blue, verify olive"
 
 
 @dataclass(frozen=True)
@@ -97,17 +100,15 @@ def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
     lanes = "Decodes (shades alternate), mode, and what became of each token of the chunk"
     tokens = ["/tokens/**"] if meta.drafted else []
     views: list[rrb.View] = [_states(lanes if meta.drafted else "Decodes and mode", "/decodes", "/mode", *tokens)]
-    shares = [1.4 + (min(meta.chunk_steps * len(meta.dofs), 20) * 0.27 if meta.drafted else 0.0)]
+    shares = [1.4 + (min(meta.chunk_steps * len(meta.dofs), 20) * 0.34 if meta.drafted else 0.0)]
     counts = ("decode/forwards", "decode/acceptance")
-    views.append(_series("Forwards and acceptance per decode", *counts, top=_ROOM * meta.most + 0.5))
+    views.append(_series("Per decode: forwards white, AL blue, drafts accepted green", *counts, top=meta.most + 0.5))
     shares.append(1.6)
     if meta.threshold:
-        views.append(_series("Acceptance threshold r, bins", "decode/threshold", top=_ROOM * meta.widest + 1))
+        views.append(_series("Acceptance threshold r, bins", "decode/threshold", top=meta.widest + 1.0))
         shares.append(1.2)
     for signal in meta.signals:
-        views.append(
-            _series(SIGNALS[signal], f"signals/{signal}", legend=signal in meta.limited, corner=rrb.Corner2D.LeftBottom)
-        )
+        views.append(_series(_signal_title(signal, meta), f"signals/{signal}"))
         shares.append(1.1)
     if not meta.drafted:
         views += _always(meta)
@@ -136,8 +137,8 @@ def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
 def _always(meta: EpisodeMeta) -> list[rrb.View]:
     """Phases and actions, the series of every method; placed in the middle or right column."""
     return [
-        _series("Time by phase per decode, ms", "decode/phases", top=_ROOM * meta.slowest),
-        _series("Actions and gripper opening", "actions", "gripper", legend=True, corner=rrb.Corner2D.LeftBottom),
+        _series(_PHASES_TITLE, "decode/phases", top=1.1 * meta.slowest),
+        _series(f"Actions: {_coloured(meta.dofs)}; opening yellow", "actions", "gripper"),
     ]
 
 
@@ -146,16 +147,22 @@ def _states(name: str, *contents: str) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)
 
 
-def _series(
-    name: str, *entities: str, legend: bool = True, top: float | None = None, corner: Any = rrb.Corner2D.LeftTop
-) -> rrb.TimeSeriesView:
+def _signal_title(signal: str, meta: EpisodeMeta) -> str:
+    return f"{SIGNALS[signal]}; {LIMITS[signal]} orange" if signal in meta.limited else SIGNALS[signal]
+
+
+def _coloured(names: Sequence[str]) -> str:
+    return ", ".join(f"{name} {COLOUR_WORDS[i % len(COLOUR_WORDS)]}" for i, name in enumerate(names))
+
+
+def _series(name: str, *entities: str, top: float | None = None) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"/{entity}" for entity in entities],
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
-        plot_legend=rrb.PlotLegend(corner, visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 

@@ -232,7 +232,9 @@ def _mode_color(mode: str, place: int) -> int:
 def _boundaries(starts: NDArray[np.int64]) -> Entity:
     """Where decodes begin: a lane whose shade changes with every decode. Equal states would melt into one."""
     states = ["even", "odd"]
-    style = rr.StateConfiguration(values=states, labels=["", ""], colors=np.array([0x55606BFF, 0x8C99A6FF], np.uint32))
+    style = rr.StateConfiguration(
+        values=states, labels=["·", "·"], colors=np.array([0x55606BFF, 0x8C99A6FF], np.uint32)
+    )
     columns = rr.StateChange.columns(state=[states[i % 2] for i in range(len(starts))])
     return Entity("decodes", (style,), starts, columns)
 
