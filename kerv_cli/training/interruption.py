@@ -20,9 +20,10 @@ class Stop:
 @contextmanager
 def until_interrupted() -> Iterator[Stop]:
     """Yields a Stop that the first SIGINT sets; the second one raises KeyboardInterrupt at once. Outside the main
-    thread signals cannot be caught: there it stays unset."""
+    thread, and where SIGINT is ignored, it stays unset."""
     stop = Stop()
-    if threading.current_thread() is not threading.main_thread():
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # a job in the background of a shell, nohup
+    if ignored or threading.current_thread() is not threading.main_thread():
         yield stop
         return
 
