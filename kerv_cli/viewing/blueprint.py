@@ -33,7 +33,7 @@ COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")
 """Names of the DoFs' colours, for titles: a legend would hide data in views as small as these."""
 
 
-_PHASES_TITLE = "Time per decode, ms: total white, vision red, prefill green, propose blue, verify olive"
+_PHASES_TITLE = "Time per decode, ms: total grey, vision red, prefill green, propose blue, verify olive"
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
     views: list[rrb.View] = [_states(lanes if meta.drafted else "Decodes and mode", "/decodes", "/mode", *tokens)]
     shares = [1.4 + (min(meta.chunk_steps * len(meta.dofs), 20) * 0.34 if meta.drafted else 0.0)]
     counts = ("decode/forwards", "decode/acceptance")
-    views.append(_series("Per decode: forwards white, AL blue, drafts accepted green", *counts, top=meta.most + 0.5))
+    views.append(_series("Per decode: forwards grey, AL blue, drafts accepted green", *counts, top=meta.most + 0.5))
     shares.append(1.6)
     if meta.threshold:
         views.append(_series("Acceptance threshold r, bins", "decode/threshold", top=meta.widest + 1.0))

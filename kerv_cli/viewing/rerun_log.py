@@ -309,7 +309,7 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
     series = [
-        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0xE0E4E8FF]),
+        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0x8C99A6FF]),
         Series(
             "decode/acceptance",
             ["AL, tokens per verification", "drafts accepted per verification"],
@@ -321,7 +321,7 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
             "decode/phases",
             ["total", *phases],
             [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes],
-            [0xE0E4E8FF, *_DOF_COLORS, 0x6E7B8BFF],
+            [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF],
         ),
     ]
     for signal, name in SIGNALS.items():
