@@ -33,7 +33,7 @@ COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")
 """Names of the DoFs' colours, for titles: a legend would hide data in views as small as these."""
 
 
-_PHASES_TITLE = "Time per decode, ms: total grey, vision red, prefill green, propose blue, verify olive"
+_PHASES_TITLE = "ms per decode: total grey, vision red, prefill green, verify olive"
 
 
 @dataclass(frozen=True)
