@@ -1,23 +1,24 @@
 # Every rule runs from a fresh clone; `make` alone lists them.
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.kerv-installed
+# CUDA=1 installs the build of PyTorch for NVIDIA GPUs, CUDA=0 the CPU's; without, the machine decides
+STAMP := $(VENV)/.kerv-installed$(if $(filter-out 0,$(CUDA)),-cuda)
 CODE := kerv_cli tests scripts
 
 # One thread: the models are small, and results and timings must not depend on the number of cores.
 test: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test demo torture lint format pages clean
+.PHONY: help setup test demo torture lint format pages lock clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-setup: $(STAMP) ## install kerv and its tools into .venv, and the OpenGL libraries if MuJoCo cannot draw
+setup: $(STAMP) ## install kerv and its tools into .venv (CUDA=1: with PyTorch for NVIDIA GPUs), and the OpenGL libraries if MuJoCo cannot draw
 	@scripts/graphics.sh $(BIN)/python
 
-$(STAMP): pyproject.toml
-	@PYTHON="$(PYTHON)" scripts/install.sh $@
+$(STAMP): pyproject.toml requirements/cpu.txt requirements/cuda.txt
+	@PYTHON="$(PYTHON)" CUDA="$(CUDA)" scripts/install.sh $@
 
 test: lint ## check style and types, then run the tests
 	@$(BIN)/python -m pytest
@@ -40,8 +41,7 @@ format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
 
-pages: ## fill the figures of README.md and results/README.md from results/tables
-	@$(BIN)/python scripts/figures.py README.md results/README.md
+.PHONY: help setup test demo lint format pages lock clean
 
 clean: ## remove caches and built packages; keeps .venv and results
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis MUJOCO_LOG.TXT

@@ -80,6 +80,7 @@ class Composer(Generic[T]):
         from hydra.errors import HydraException
         from omegaconf.errors import OmegaConfBaseException
 
+        overrides, method = method_of_file(overrides)
         overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
         _check(self.command, overrides, self.known)
         words = [_task_list(word) for word in overrides]
@@ -90,6 +91,8 @@ class Composer(Generic[T]):
         except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
             raise UsageError(f"cannot read '{' '.join(overrides)[:200]}': {_one_line(error)}") from error
         _check_ranges(settings)
+        if method is not None:
+            settings.method = method  # type: ignore[attr-defined]
         return settings
 
     def _settings(self, overrides: Sequence[Any]) -> T:
@@ -207,6 +210,41 @@ def _store_part(group: str, name: str, settings: type) -> None:
     ConfigStore.instance().store(group=group, name=name, node=settings(kind=name))
 
 
+def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
+    """Overrides with a `method=FILE.yaml` replaced by what the file chooses, and the method's name: the file's. The
+    command line's own choices outrank it. Such a file looks like those of conf/method.
+
+    Raises:
+        UsageError: the file cannot be read, or is no method.
+    """
+    import yaml
+
+    files = [word for word in overrides if word.startswith("method=") and word.endswith((".yaml", ".yml"))]
+    if not files:
+        return list(overrides), None
+    path = Path(files[-1].split("=", 1)[1]).expanduser()
+    try:
+        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+        chosen = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
+        parts = {key.removeprefix("override /"): name for choice in chosen for key, name in choice.items()}
+        words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
+    except OSError as error:
+        raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, AttributeError, TypeError) as error:
+        raise UsageError(f"method={path} is no method: see conf/method/kerv.yaml for one") from error
+    rest = [word for word in overrides if word not in files]
+    given = {word.split("=", 1)[0] for word in rest}
+    return [*(word for word in words if word.split("=", 1)[0] not in given), *rest], path.stem
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif value is not None:
+            yield f"{prefix}{key}={str(value).lower() if isinstance(value, bool) else value}"
+
+
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
     """Hydra's grid grammar -> one override list per point: `threshold.r=0,3` or `threshold.r=range(0,4)`.
 
@@ -295,7 +333,9 @@ def _check(command: str, overrides: Sequence[str], known: Mapping[str, Sequence[
     for word in overrides:
         key, equals, value = word.partition("=")
         if not equals or not key or key[0] == "~":  # nothing is taken away from settings
-            raise UsageError(f"'{word}' is not an override: write key=value, see 'kerv {command} --cfg' for the keys")
+            raise UsageError(
+                f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys"
+            )
         if key not in known or value in known[key]:
             continue
         several = [name.strip() for name in value.split(",")]
@@ -303,6 +343,11 @@ def _check(command: str, overrides: Sequence[str], known: Mapping[str, Sequence[
             hint = "run each in turn with 'kerv rollout -m', or" if command == "rollout" else "this command takes one:"
             raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
         raise UnknownName(key, value, known[key])
+
+
+def spoken(command: str) -> str:
+    """A command's name as it is typed: `train_drafter` -> `train drafter`."""
+    return command.replace("_", " ")
 
 
 def _task_list(word: str) -> str:
@@ -325,9 +370,22 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
         if key not in keys and key not in groups():
             near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
             near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
-            hint = f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {command} --cfg' for the keys"
+            hint = (
+                f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {spoken(command)} --cfg' for the keys"
+            )
             return UsageError(f"unknown key '{key}': {hint}")
     return UsageError(_one_line(error.__cause__ or error))
+
+
+def keys_of(command: str, choices: Sequence[str], schema: type) -> list[str]:
+    """Every key of the command's configuration with these group choices, dotted; those of the groups alone where the
+    choices do not compose."""
+    from hydra.errors import HydraException
+
+    try:
+        return _keys(command, choices, schema)
+    except HydraException:
+        return _keys(command, [], schema)
 
 
 def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:

@@ -32,6 +32,12 @@ class UnknownName(UsageError):
         return UnknownName, self._arguments  # pickled by these: worker processes hand it on
 
 
+class Interrupted(KervError):
+    """Ctrl-C. The message says what is kept and from where the same command goes on."""
+
+    exit_code = 130
+
+
 class RenderingUnavailable(KervError):
     """No OpenGL backend can draw a frame here."""
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import secrets
 from pathlib import Path
 
-from kerv_cli.errors import UsageError
+from kerv_cli.errors import StorageError, UsageError
+from kerv_cli.files import storage_errors
 from kerv_cli.limits import check_name
 
 
@@ -18,6 +21,28 @@ def results_dir(results: str) -> Path:
     if path.exists() and not path.is_dir():
         raise UsageError(f"results={results} is a file: name a folder")
     return path
+
+
+def check_writable(results: str) -> None:
+    """Refuses a results folder that nothing could be stored in, before anything is computed for it. Leaves no trace.
+
+    Raises:
+        UsageError: it is a file, or lies below one.
+        StorageError: the disk is full or read-only, or permission is missing.
+    """
+    folder = results_dir(results)
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise UsageError(f"results={results}: {there} is a file, name a folder")
+    probe = there / f".kerv-{secrets.token_hex(6)}.tmp"
+    try:
+        with storage_errors(folder):
+            probe.touch(exist_ok=False)
+    except OSError as error:
+        raise StorageError(f"cannot write {folder}: {error.strerror}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
@@ -39,8 +64,11 @@ def as_path(text: str) -> Path:
 
 
 def shipped_dir() -> Path:
-    """`results/pretrained` of the checkout that the package runs from."""
-    return Path(__file__).resolve().parent.parent / "results" / "pretrained"
+    """`results/pretrained` of the checkout that the package runs from, else the `pretrained` inside the installed
+    package (`mt10-vision` alone)."""
+    package = Path(__file__).resolve().parent
+    checkout = package.parent / "results" / "pretrained"
+    return checkout if checkout.is_dir() else package / "pretrained"
 
 
 def find_target(results: str, name: str) -> Path:

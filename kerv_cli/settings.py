@@ -162,6 +162,7 @@ class StudySettings:
     axis: str = ""  # config key on the plot's x axis, e.g. threshold.r
     block: int = number(5, 1, 10_000)  # seeds for which the settings take turns in one process, episode by episode
     repeats: int = number(1, 1, 1_000)  # how often every episode is measured
+    note: str = ""  # a sentence that says what to see, printed below the table
 
 
 @dataclass
@@ -169,6 +170,10 @@ class SweepSettings(CommandSettings):
     """`kerv sweep`: a study. Everything else on the command line goes to each of its settings."""
 
     study: StudySettings = field(default_factory=StudySettings)
+    # done: every planned episode; decided: settings stop when their question is answered
+    until: str = choice("done", "done", "decided")
+    # until=decided: is the loss of success against the baseline below so many points?
+    loss: float = number(3.0, above=0, most=99.9)
 
 
 @dataclass
@@ -337,6 +342,7 @@ class ReportSettings(CommandSettings):
 
     only: str | None = None  # name of one study (study=NAME on the command line); default: all that are there
     against: str | None = None  # results folder with another run of that study: how far the two agree
+    loss: float = number(3.0, above=0, most=99.9)  # --choose: bound on the loss of success against the baseline, points
 
 
 @dataclass

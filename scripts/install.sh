@@ -1,11 +1,14 @@
 #!/usr/bin/env bash
-# install.sh STAMP: make .venv and install kerv with its development tools into it. STAMP is written last, so that an
-# interrupted installation is never taken for a finished one. PYTHON=/path/to/python chooses the interpreter.
+# install.sh STAMP: make .venv and install kerv with its development tools into it, in the versions of requirements/.
+# STAMP is written last, so that an interrupted installation is never taken for a finished one.
+# PYTHON=/path/to/python chooses the interpreter; CUDA=1 or CUDA=0 the build of PyTorch, by default that for CUDA where an
+# NVIDIA driver is, else the CPU's.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 stamp=$1
 venv=.venv
+cpu_index=${KERV_TORCH_INDEX:-https://download.pytorch.org/whl/cpu} # CPU builds of PyTorch are not on the package index
 
 fail() {
     echo "setup: $1" >&2
@@ -31,14 +34,40 @@ choose_python() {
     fail "kerv needs Python 3.11, 3.12 or 3.13 and found none${PYTHON:+ in PYTHON=$PYTHON}; install one, or name it: make setup PYTHON=/path/to/python3.11"
 }
 
-rm -f "$stamp"
+choose_build() {
+    case "${CUDA:-}" in
+        0) echo cpu ;;
+        "") if [ "${OSTYPE#linux}" != "$OSTYPE" ] && [ ! -e "${KERV_NVIDIA:-/proc/driver/nvidia/version}" ]; then echo cpu; else echo cuda; fi ;;
+        *) echo cuda ;;
+    esac
+}
+
+rm -f "$stamp" "${stamp%-cuda}" "${stamp%-cuda}-cuda"
 if ! { suits "$venv/bin/python" && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }; then
     python=$(choose_python)
     "$python" -m venv --clear "$venv"
 fi
 
-quiet=--quiet
-if [ -t 1 ]; then quiet=; else echo "Installing kerv and its libraries into $venv (a minute or more)"; fi
-# shellcheck disable=SC2086  # empty means no argument
-"$venv/bin/python" -m pip install $quiet --disable-pip-version-check --editable '.[dev]'
+build=$(choose_build)
+versions=requirements/$build.txt
+if [ "$build" = cpu ]; then
+    what="the CPU build of PyTorch, together about 0.6 GB to fetch (make setup CUDA=1 takes the build for NVIDIA GPUs, 3 GB)"
+else
+    what="the CUDA build of PyTorch, together about 3 GB to fetch (make setup CUDA=0 takes the CPU's, 0.6 GB)"
+fi
+echo "Installing kerv into $venv with $what"
+
+pip() {
+    local quiet=--quiet
+    if [ -t 1 ]; then quiet=; fi
+    # shellcheck disable=SC2086  # empty means no argument
+    "$venv/bin/python" -m pip install $quiet --disable-pip-version-check "$@"
+}
+# By itself and without what it needs, so that the second index serves nothing else.
+if [ "$build" = cpu ]; then
+    torch=$(grep '^torch==' "$versions")
+    "$venv/bin/python" -m pip freeze --disable-pip-version-check 2>/dev/null | grep -qxF "$torch" ||
+        pip --no-deps --retries 1 --extra-index-url "$cpu_index" "$torch"
+fi
+pip --constraint "$versions" --editable '.[dev]'
 touch "$stamp"

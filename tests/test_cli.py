@@ -118,7 +118,7 @@ def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path:
     assert run.returncode == 0, run.stderr
     for word in ("success", "forwards/step", "AL", "ms/step", "time by phase", "kerv view"):
         assert word in run.stdout
-    recording = results / "rollouts/spec_vla/drawer-open-v3-100000.rrd"
+    (recording,) = results.glob("rollouts/*-spec_vla/rollouts/spec_vla-drawer-open-v3-100000-*.rrd")
     assert recording.stat().st_size > 10_000
     seen = kerv("view", "--summary", str(recording))
     assert seen.returncode == 0, seen.stderr
@@ -161,12 +161,37 @@ def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:
     assert "  r: 3" in run.stdout
 
 
-def test_completion_knows_groups_and_names() -> None:
-    from kerv_cli.commands.common import complete_overrides
+def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
+    from kerv_cli.commands.completing import completions
 
-    assert "method=spec_vla" in complete_overrides("method=s")
-    assert "method=" in complete_overrides("me")
-    assert "task=drawer-open-v3" in complete_overrides("task=drawer")
+    assert "method=spec_vla" in completions("rollout", [], "method=s")
+    assert completions("rollout", [], "me") == ["method="]
+    assert "task=drawer-open-v3" in completions("rollout", [], "task=drawer")
+    assert "threshold.r=" in completions("rollout", [], "threshold.")
+    assert "threshold.k_s=" in completions("sweep", ["threshold=kinematic"], "threshold.")
+    assert "threshold.r=" not in completions("rollout", ["threshold=kinematic"], "threshold.r")
+    assert "train.lr=" in completions("train_target", [], "train.l")
+    assert completions("train_target", [], "method") == []
+    assert completions("demos", [], "prop") == []
+    assert "study=demo" in completions("sweep", [], "study=d")
+    assert completions("runs_list", [], "me") == []
+
+
+def test_bash_completes_behind_an_equals_sign_without_a_start_up_file(tmp_path: Path) -> None:
+    from kerv_cli.commands.completing import script
+
+    (tmp_path / "kerv").write_text(f'#!/bin/sh\nexec {sys.executable} -W ignore -c "{BE_KERV}" "$@"\n')
+    (tmp_path / "kerv").chmod(0o755)
+    (tmp_path / "script").write_text(script("bash"))
+    typed = "kerv rollout method=spec"
+    body = f"source {tmp_path}/script; COMP_LINE='{typed}' COMP_POINT={len(typed)}; _kerv_completion kerv"
+    command = ["bash", "--norc", "-c", f'{body}; printf "%s\\n" "${{COMPREPLY[@]}}"']
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PATH": path}, check=False)
+    assert run.stdout.split() == ["spec_vla", "spec_vla_paper"], run.stderr
+
+
+BE_KERV = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.app import main; main()"
 
 
 def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.settings import EVALUATION_SEED
 from kerv_cli.spaces import Observation
 from kerv_cli.studies.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, parquet_bytes
-from kerv_cli.viewing.rerun_log import save_episode, summary
+from kerv_cli.viewing.facts import summary
+from kerv_cli.viewing.rerun_log import save_episode
 from kerv_cli.viewing.viewer import read_back
 
 NAME = "window-close-v3"

@@ -17,10 +17,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 STAMP = Path(".venv/.kerv-installed")
-TOOLS = ("awk", "bash", "cat", "chmod", "dirname", "env", "make", "mkdir", "rm", "sleep", "touch")
+TOOLS = ("awk", "bash", "cat", "chmod", "dirname", "env", "grep", "make", "mkdir", "rm", "sleep", "touch")
 
 # --- the wheel ---
 
@@ -73,6 +74,27 @@ def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadat
     assert any(line.startswith("metaworld") and ">=3.1.1" in line for line in requirements)
 
 
+def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    wheel.extractall(site)
+    sizes = [entry.file_size for entry in wheel.infolist() if entry.filename.startswith("kerv_cli/pretrained/")]
+    assert 10e6 < sum(sizes) < 20e6, "README and pyproject.toml state its size"
+    work = tmp_path / "work"
+    work.mkdir()
+    command = ["rollout", "method=one_pass", "task=drawer-open", "episodes=1", "world.horizon=8", "record=0"]
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *command],
+        cwd=work,
+        env={**os.environ, "PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "one_pass, observation vision" in run.stdout
+    assert list(work.glob("results/rollouts/*-one_pass/cells/*/episodes.parquet"))
+
+
 # --- make setup ---
 
 
@@ -91,6 +113,7 @@ case "$1 $2" in
     "-c import ensurepip"*) true ;;
     "-m venv") mkdir -p .venv/bin && cat "$0" > .venv/bin/python && chmod +x .venv/bin/python ;;
     "-m pip") [ "$3" = --version ] && exit 0
+              [ "$3" = freeze ] && { cat frozen 2>/dev/null || true; exit 0; }
               echo "pip ${@:3}" >> log; [ ! -e pip-hangs ] || sleep 60; [ ! -e pip-fails ] ;;
     "-I -S") [ -e drawable ] ;;
     *) echo "unexpected: $*" >&2; exit 97 ;;
@@ -105,6 +128,7 @@ class Checkout:
         self.root = root
         self.bin = root / "stand-ins"
         shutil.copytree(ROOT / "scripts", root / "scripts", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / "requirements", root / "requirements")
         shutil.copy(ROOT / "Makefile", root)
         (root / "pyproject.toml").touch()
         self.bin.mkdir()
@@ -122,7 +146,13 @@ class Checkout:
         executable(self.bin / "id", f"echo {uid}")
 
     def environment(self, **extra: str) -> dict[str, str]:
-        return {"PATH": str(self.bin), "HOME": str(self.root), "KERV_TEST_PYTHON": sys.executable, **extra}
+        return {
+            "PATH": str(self.bin),
+            "HOME": str(self.root),
+            "KERV_TEST_PYTHON": sys.executable,
+            "KERV_NVIDIA": str(self.root / "driver"),
+            **extra,
+        }
 
     def setup(self, **extra: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -151,17 +181,61 @@ def setup_lines(result: subprocess.CompletedProcess[str]) -> list[str]:
 
 def test_setup_installs_once(checkout: Checkout) -> None:
     assert checkout.setup().returncode == 0
-    assert checkout.log == ["pip install --quiet --disable-pip-version-check --editable .[dev]"]
+    pip = "pip install --quiet --disable-pip-version-check"
+    index = "https://download.pytorch.org/whl/cpu"
+    assert checkout.log == [
+        f"{pip} --no-deps --retries 1 --extra-index-url {index} {locked('cpu', 'torch')}",
+        f"{pip} --constraint requirements/cpu.txt --editable .[dev]",
+    ]
     second = checkout.setup()
     assert (second.returncode, second.stdout, second.stderr) == (0, "", "")
+    assert len(checkout.log) == 2
+
+
+def locked(build: str, package: str) -> str:
+    """The line of a package in a lock file."""
+    lines = (ROOT / "requirements" / f"{build}.txt").read_text().splitlines()
+    return next(line for line in lines if line.startswith(f"{package}=="))
+
+
+def test_pytorch_that_is_there_is_not_fetched_again(checkout: Checkout) -> None:
+    (checkout.root / "frozen").write_text(f"numpy==1\n{locked('cpu', 'torch')}\n")
+    checkout.setup()
     assert len(checkout.log) == 1
+
+
+def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_fetches(checkout: Checkout) -> None:
+    asked = checkout.setup(CUDA="1")
+    assert "CUDA build of PyTorch" in asked.stdout
+    assert "CUDA=0" in asked.stdout
+    assert checkout.log[-1].endswith("--constraint requirements/cuda.txt --editable .[dev]")
+    assert checkout.setup(CUDA="1").stdout == ""
+    back = checkout.setup()  # the other build is another installation
+    assert "CPU build of PyTorch" in back.stdout
+    (checkout.root / "driver").touch()
+    (checkout.root / STAMP).unlink()
+    assert "CUDA build of PyTorch" in checkout.setup().stdout
+    (checkout.root / STAMP).unlink()
+    assert "CPU build of PyTorch" in checkout.setup(CUDA="0").stdout
+
+
+def test_the_two_lock_files_differ_in_pytorch_alone_and_hold_every_requirement(metadata: Message) -> None:
+    cpu, cuda = ((ROOT / "requirements" / f"{build}.txt").read_text().splitlines()[1:] for build in ("cpu", "cuda"))
+    assert set(cpu) ^ set(cuda) == {locked("cpu", "torch"), locked("cuda", "torch")}
+    names = {line.split("==")[0].lower().replace("_", "-") for line in cpu}
+    wanted = [Requirement(line) for line in metadata.get_all("Requires-Dist") or []]
+    assert {r.name.lower() for r in wanted if r.marker is None} <= names
+    pinned = {line.split("==")[0].lower().replace("_", "-"): line.split("==")[1] for line in cpu}
+    for requirement in wanted:
+        if requirement.name.lower() in pinned:
+            assert requirement.specifier.contains(pinned[requirement.name.lower()]), requirement
 
 
 def test_setup_installs_again_when_the_requirements_change(checkout: Checkout) -> None:
     checkout.setup()
     os.utime(checkout.root / "pyproject.toml", (time.time() + 60, time.time() + 60))
     checkout.setup()
-    assert len(checkout.log) == 2
+    assert len(checkout.log) == 4
 
 
 def test_a_failed_installation_is_tried_again(checkout: Checkout) -> None:
@@ -216,7 +290,7 @@ def test_setup_prefers_python_3_11(checkout: Checkout) -> None:
 def test_root_gets_the_graphics_libraries_from_fresh_lists(checkout: Checkout) -> None:
     (checkout.root / "drawable").unlink()
     assert checkout.setup().returncode == 0
-    update, install = checkout.log[1:]
+    update, install = (line for line in checkout.log if line.startswith("apt-get"))
     assert update.startswith("apt-get update")
     assert {"libegl1", "libgl1", "libgl1-mesa-dri", "libosmesa6"} <= set(install.split())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import sys
 from collections.abc import Iterator
@@ -21,7 +22,9 @@ from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.errors import KervError, StorageError, UsageError
 from kerv_cli.registry import parts
 from kerv_cli.viewing import rerun_log, viewer
-from kerv_cli.viewing.rerun_log import readable, save_episode
+from kerv_cli.viewing.facts import readable
+from kerv_cli.viewing.rerun_log import save_episode
+from kerv_cli.viewing.together import save_together
 from kerv_cli.viewing.token_outcomes import chunk_size, outcomes_of
 from kerv_cli.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
 
@@ -78,7 +81,7 @@ def test_a_recording_holds_what_the_record_says(kind: str, tmp_path: Path) -> No
     rows = found["entities"]
     assert rows["/actions"] == record.steps
     assert rows["/camera"] == rows["/world/hand"] == record.steps + 1
-    decoded = ("decode/forwards", "decode/phases", "decode/table", "chunk/cells", "tokens/step_0", "tokens/step_3")
+    decoded = ("decode/forwards", "decode/phases", "decode/table", "chunk/cells", "decodes", "tokens/step_0/dx")
     assert {rows[f"/{name}"] for name in decoded} == {len(record.decodes)}
     changes = sum(a.mode != b.mode for a, b in zip(record.decodes, record.decodes[1:], strict=False)) + 1
     assert rows["/mode"] == changes
@@ -101,7 +104,8 @@ def test_seven_dofs_have_their_names_and_limits(tmp_path: Path) -> None:
     path = saved(record, tmp_path)
     assert named(path, "/actions") == list(INSERTION.actions.names)
     assert named(path, "/decode/threshold") == ["r dx dy dz", "r droll dpitch dyaw", "r gripper"]
-    assert column(path, "/tokens/step_0", "state")[0] == ["target", *["accepted"] * 6]
+    first = [column(path, f"/tokens/step_0/{name}", "state")[0][0] for name in INSERTION.actions.names]
+    assert first == ["target", *["accepted"] * 6]
     assert "| 7 | 1 | dx | 1 | 57 | 57 | 0 | 9 | 57 | ✓ accepted |" in column(path, "/decode/table", "text")[0][0]
     assert read_back(path)["timelines"]["time"] == (0, 100_000_000)
 
@@ -210,7 +214,7 @@ def test_a_chunk_of_which_nothing_was_executed_to_the_end_keeps_its_size(tmp_pat
     record = episode("drafter", horizon=1)
     cut = decode_of((50, 60), (prefill(50), verify(1, (60, 99), (60, 70), 1, (9, 9, 9, 0))), 1, compensated=2, size=16)
     path = saved(replace(record, decodes=(cut,), decode_steps=(0,)), tmp_path)
-    assert "/tokens/step_3" in read_back(path)["entities"]
+    assert "/tokens/step_3/gripper" in read_back(path)["entities"]
 
 
 def test_decodes_without_rounds_are_told_apart() -> None:
@@ -239,9 +243,12 @@ def test_drawn_tokens_add_up_with_the_records(kind: str) -> None:
 def test_token_lanes_and_modes(tmp_path: Path) -> None:
     record = episode("mixed")
     path = saved(record, tmp_path)
-    lanes = [column(path, f"/tokens/step_{i}", "state") for i in range(4)]
+    names = record.space.names
+    lanes = [column(path, f"/tokens/step_{i}/{name}", "state") for i in range(4) for name in names]
+    shades = [row[0] for row in column(path, "/decodes", "state")]
+    assert all(a != b for a, b in itertools.pairwise(shades)), "neighbouring decodes melt into one"
     for i, decode in enumerate(record.decodes):
-        drawn = [kind for lane in lanes for kind in lane[i]]
+        drawn = [lane[i][0] for lane in lanes]
         assert drawn == [f.kind for f in outcomes_of(decode, 16, DOFS)]
     changes = dict(zip(starts(path, "/mode"), (row[0] for row in column(path, "/mode", "state")), strict=True))
     shown = None
@@ -283,8 +290,8 @@ def test_one_threshold_is_one_series(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "frames", "present", "absent"),
     [
-        ("ar", 0, {"Decode mode"}, {"Camera", "Acceptance threshold r, bins"}),
-        ("drafter", 16, {"Camera", "Acceptance threshold r, bins", "K, kinematic variability"}, {"Decode mode"}),
+        ("ar", 0, {"Decodes and mode"}, {"Camera", "Acceptance threshold r, bins"}),
+        ("drafter", 16, {"Camera", "Acceptance threshold r, bins", "K, kinematic variability"}, {"Decodes and mode"}),
         ("mixed", 0, {"similarity of the best neighbour", "F, boundary metric"}, {"deviation from AR"}),
     ],
 )
@@ -441,3 +448,30 @@ def test_a_display_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not viewer.has_display()
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
     assert viewer.has_display()
+
+
+def test_limits_and_places_are_drawn(tmp_path: Path) -> None:
+    record = episode("mixed")
+    still = np.zeros_like(record.path) + np.float32(0.1)
+    record = replace(record, places={"object": still, "goal": still + np.float32(0.1)})
+    path = save_episode(record, tmp_path / "limits.rrd", method="heisd", limits={"metric": 0.3, "similarity": 0.975})
+    assert named(path, "/signals/metric") == ["F, boundary metric", "F*"]
+    assert {row[1] for row in column(path, "/signals/metric", "scalars")} == {0.3}
+    rows = read_back(path)["entities"]
+    assert rows["/world/object"] == rows["/world/goal"] == record.steps + 1
+
+
+def test_two_recordings_of_one_seed_stand_side_by_side(tmp_path: Path) -> None:
+    first = save_episode(episode("ar"), tmp_path / "a.rrd", method="ar")
+    second = save_episode(episode("drafter"), tmp_path / "b.rrd", method="spec_vla")
+    both = read_back(save_together([first, second], tmp_path / "out"))
+    assert both["blueprint"]
+    assert both["name"] == "drawer-open-v3 · seed 7 · ar and spec_vla"
+    for side, alone in (("left", first), ("right", second)):
+        rows = {name: count for name, count in read_back(alone)["entities"].items() if count}
+        assert {name: both["entities"][f"/{side}{name}"] for name in rows} == rows
+    other = save_episode(replace(episode("ar"), seed=8), tmp_path / "c.rrd", method="ar")
+    with pytest.raises(UsageError, match="the same seed on both sides, here 7 and 8"):
+        save_together([first, other], tmp_path)
+    with pytest.raises(UsageError, match="two recordings, not 1"):
+        save_together([first], tmp_path)

@@ -56,6 +56,7 @@ def boundaries(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
 
 def texts(figure: Figure) -> set[str]:
     shown = {text.get_text() for panel in figure.axes for text in [*panel.get_yticklabels(), *panel.texts]}
+    shown |= {text.get_text() for panel in figure.axes for text in panel.get_xticklabels() if text.get_rotation()}
     return shown | {text.get_text() for legend in figure.legends for text in legend.get_texts()}
 
 
@@ -71,10 +72,20 @@ def test_what_the_axis_does_not_touch_is_a_level(boundaries: pd.DataFrame) -> No
     }
     figure = study_figures(table, "boundary.f_star", "Title")[""]
     assert {"fused", "always drafter", "radius alone", "unused", "ar"} == texts(figure) - ticks(figure)
-    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    panel = figure.axes[0]
+    lines = {line.get_label(): line for line in panel.get_lines()}
     assert list(lines["fused"].get_xdata()) == [0.1, 0.3, 0.7]
+    beside = dict(zip((t.get_text() for t in panel.get_xticklabels()), panel.get_xticks(), strict=True))
     level = float(rows[rows["label"] == "always drafter"]["speedup"].iloc[0])
-    assert list(lines["always drafter"].get_ydata()) == [level, level]
+    points = {(line.get_xdata()[0], line.get_ydata()[0]) for line in panel.get_lines() if line.get_marker() == "D"}
+    assert (beside["always drafter"], level) in points
+    assert min(beside["always drafter"], beside["radius alone"], beside["unused"]) > 0.7
+
+
+def test_success_is_drawn_from_where_it_matters(boundaries: pd.DataFrame) -> None:
+    figure = study_figures(boundaries, "boundary.f_star", "Title")[""]
+    lowest = 100 * boundaries[boundaries["averaging"] == MICRO]["success_low"].min()
+    assert lowest - 10 <= figure.axes[1].get_ylim()[0] <= max(0.0, lowest)
 
 
 def ticks(figure: Figure) -> set[str]:

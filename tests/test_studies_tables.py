@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -382,9 +383,14 @@ def test_the_page_stands_alone(results: Path) -> None:
         "http://creativecommons.org", ""
     ).replace("https://matplotlib.org", "")
     assert "1 of 12 planned cells are not complete: spec_vla r=9 on door-open-v3" in page
-    assert "Run `kerv sweep study=threshold` to run them" in page
-    assert "Micro over tasks" in page
-    assert "Macro over difficulty groups" in page
+    assert f"Run `kerv sweep study=threshold results={results}` to run them" in page
+    assert "All tasks" in page
+    assert "by difficulty" in page
+    assert 'class="verdict"' in page
+    assert "prefers-color-scheme: dark" in page
+    assert 'href="../../report/tables/threshold_per_task.csv"' in page
+    tables = re.findall(r"<thead><tr>(.*?)</tr>", page)
+    assert len(tables) == len(set(tables)) == 2, "a table that repeats another"
     assert "Prediction of" not in page
     assert "Synthetic arcs" not in page
     ids = [part.split('"')[0] for part in page.split(' id="')[1:]]
@@ -407,7 +413,7 @@ def test_figures_show_the_axis_and_the_references(results: Path) -> None:
 
 
 def test_nothing_to_report_names_what_to_run(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="run `kerv sweep study=NAME`"):
+    with pytest.raises(UsageError, match="run `kerv sweep study=demo`"):
         report(tmp_path)
     with pytest.raises(UsageError, match="run `kerv sweep study=threshold`"):
         report(tmp_path, "threshold")

@@ -21,7 +21,7 @@ from kerv_cli import files
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.recording import DemoConfig, record
 from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import CheckpointError, Interrupted
 from kerv_cli.files import sha256_of
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainSettings
 from kerv_cli.targets.checkpoint import load_target, save_target, save_tensors
@@ -73,6 +73,25 @@ def test_an_interrupted_run_resumes_bit_for_bit(tmp_path: Path) -> None:
 
 def interrupt() -> None:
     raise KeyboardInterrupt
+
+
+def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(tmp_path: Path) -> None:
+    whole = quadratic(tmp_path / "whole")
+    whole.run()
+    cut = quadratic(tmp_path / "cut")
+    steps: list[int] = []
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
+    try:
+        with pytest.raises(Interrupted, match="step 7 is saved"):
+            cut.run(lambda step, metrics: os.kill(os.getpid(), signal.SIGINT) if step == 7 else None)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    resumed = quadratic(tmp_path / "cut")
+    resumed.run(lambda step, metrics: steps.append(step))
+    assert steps[0] == 8
+    for name, tensor in whole.job.module.state_dict().items():
+        assert torch.equal(tensor, resumed.job.module.state_dict()[name])
 
 
 def test_another_run_is_never_resumed(tmp_path: Path) -> None:

@@ -4,10 +4,13 @@ tables."""
 from __future__ import annotations
 
 import functools
+import math
 import os
+import re
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Annotated, Any, ParamSpec, TypeVar
 
 import typer
@@ -18,20 +21,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def complete_overrides(incomplete: str) -> list[str]:
-    """Completions of an override: `method=` -> every method; without `=`, the groups. Imports nothing heavy."""
-    from kerv_cli.config import groups
+def complete_overrides(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions of an override. Imports nothing heavy."""
+    from kerv_cli.commands.completing import complete_overrides as complete
 
-    known, (group, equals, _) = groups(), incomplete.partition("=")
-    if not equals:
-        words = [f"{name}=" for name in [*known, "task", "results"]]
-    elif group == "task":
-        from kerv_cli.environments import task_names
-
-        words = [f"task={name}" for name in task_names()]
-    else:
-        words = [f"{group}={name}" for name in known.get(group, [])]
-    return [word for word in words if word.startswith(incomplete)]
+    return complete(ctx, incomplete)
 
 
 Overrides = Annotated[
@@ -42,19 +36,46 @@ ShowConfig = Annotated[bool, typer.Option("--cfg", help="Print the resolved sett
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
 
-def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bool) -> T:
-    """The command's settings. With --cfg they are printed and the command ends.
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, nothing else.")]
+
+
+def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bool, writes: bool = True) -> T:
+    """The command's settings. With --cfg they are printed and the command ends. writes: the command stores results, so
+    that a folder that cannot be written is refused now.
 
     Raises:
-        UsageError: as `config.compose`.
+        UsageError: as `config.compose`. StorageError: as `places.check_writable`.
     """
     from kerv_cli.config import compose, to_yaml
+    from kerv_cli.places import check_writable
 
-    settings = compose(command, overrides or [], schema)
+    settings: Any = compose(command, overrides or [], schema)
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         raise typer.Exit(0)
-    return settings
+    if writes:
+        check_writable(settings.results)
+    checked: T = settings
+    return checked
+
+
+def print_json(value: Any) -> None:
+    """Prints a value as indented JSON; NaN and infinity, which JSON lacks, become null."""
+    import json
+
+    typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):  # of numpy
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def print_notes(idle: Mapping[str, str]) -> None:
@@ -71,18 +92,19 @@ def print_plan(text: str) -> None:
 
 def edge(command: Callable[P, None]) -> Callable[P, None]:
     """Decorates a command: every exception is printed as one line and becomes an exit code (a KervError's own; 1 for
-    others; 130 for Ctrl-C). KERV_TRACEBACK=1 raises it instead."""
+    others; 130 for Ctrl-C). Commands named in the line run as they stand. KERV_TRACEBACK=1 raises it instead."""
 
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+        words: Any = kwargs.get("overrides") or kwargs.get("arguments") or []
         try:
             command(*args, **kwargs)
         except typer.Exit:
             raise
         except KervError as error:
-            _refuse(str(error), error.exit_code, error)
+            _refuse(runnable(str(error), words), error.exit_code, error)
         except KeyboardInterrupt:
-            _refuse("interrupted; what was finished is kept, the same command goes on from there", 130, None)
+            _refuse("interrupted", 130, None)
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(1) from None
@@ -94,11 +116,51 @@ def edge(command: Callable[P, None]) -> Callable[P, None]:
     return wrapped
 
 
+_QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
+_CARRIED = {
+    "results": None,  # None: every command takes it
+    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter"),
+    "demos": ("train target", "train drafter", "calibrate", "build datastore"),
+}
+"""Settings of the present command that a command in its messages needs too -> the commands that take them."""
+
+
+def runnable(message: str, words: Iterable[str]) -> str:
+    """The message with every quoted command made complete: how kerv is called here, and those of the present command's
+    settings without which it would work on another folder or another policy."""
+
+    def completed(found: re.Match[str]) -> str:
+        quote, name, rest = found.groups()
+        given = {word.split("=", 1)[0] for word in shlex.split(rest)}
+        carried = [shlex.quote(word) for word in words if _carries(word, name) and word.split("=", 1)[0] not in given]
+        return f"{quote}{' '.join([called(), name, *rest.split(), *carried])}{quote}"
+
+    return _QUOTED.sub(completed, message)
+
+
+def _carries(word: str, command: str) -> bool:
+    key = word.split("=", 1)[0].split(".", 1)[0]
+    takers = _CARRIED.get(key, ())
+    return takers is None or command in takers
+
+
+def in_same(place: Iterable[str]) -> str:
+    """` results=DIR` where these words name one, for commands to type next; else nothing."""
+    return "".join(f" {shlex.quote(word)}" for word in place if word.startswith("results="))
+
+
 def _refuse(message: str, code: int, error: BaseException | None) -> None:
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
     typer.echo(f"kerv: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
+
+
+@contextmanager
+def at_work(what: str) -> Iterator[None]:
+    """A spinner on a terminal while something takes seconds and has no count: libraries and weights that load."""
+    with console(stderr=True).status(what) if sys.stderr.isatty() else nullcontext():
+        yield
 
 
 @contextmanager
@@ -153,16 +215,19 @@ def console(stderr: bool = False) -> Any:
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
-    """Prints a table; columns: its header."""
+    """Prints a table below its title; columns: its header. A title is never wrapped: it may hold a path to copy."""
     from rich.table import Table
 
-    table = Table(*columns, title=title)
+    table = Table(*columns)
     for row in rows:
         table.add_row(*map(str, row))
+    if title:
+        typer.echo(title)
     console().print(table)
 
 
 def print_figures(what: str, figures: dict[str, float], folder: object) -> None:
     """Prints named numbers, four digits of each, and the folder of what they belong to."""
     rows = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in figures.items())
-    print_table((what, str(folder)), rows)
+    print_table((what, ""), rows)
+    typer.echo(str(folder))

@@ -22,6 +22,7 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
     if overrides and overrides[0] in OTHERS:
         OTHERS[overrides[0]](overrides[1:], cfg)
         return
+    from kerv_cli.errors import Interrupted
     from kerv_cli.settings import DemosSettings, as_plain
 
     settings = composed("demos", overrides, DemosSettings, cfg)
@@ -47,8 +48,13 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         workers=settings.runtime.workers,
         horizon=settings.world.horizon,
     )
-    with progress_bar("demonstrations") as advance:
-        manifest = record(config, folder, advance)
+    try:
+        with progress_bar("demonstrations") as advance:
+            manifest = record(config, folder, advance)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            f"interrupted: finished episodes are kept in {folder}, the same command goes on there"
+        ) from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, composed, edge, print_table
+from kerv_cli.commands.common import AsJson, Overrides, ShowConfig, composed, edge, print_json, print_table
 from kerv_cli.errors import StorageError
 from kerv_cli.findings import Finding
 
@@ -21,14 +22,16 @@ Repair = Annotated[bool, typer.Option("--repair", help="List and remove what kil
 
 
 @edge
-def doctor(overrides: Overrides = None, cfg: ShowConfig = False, repair: Repair = False) -> None:
+def doctor(
+    overrides: Overrides = None, cfg: ShowConfig = False, repair: Repair = False, as_json: AsJson = False
+) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
     target=NAME or environment=NAME: whether that keeps its protocol."""
     from kerv_cli.settings import DoctorSettings
 
     # here target=NAME is a policy's folder; to Hydra it would be a choice among the files of conf/target
     words = [f"policy.{o}" if o.startswith("target=") else o for o in overrides or []]
-    settings = composed("doctor", words, DoctorSettings, cfg)
+    settings = composed("doctor", words, DoctorSettings, cfg, writes=False)
     if repair:
         _repair(settings)
         return
@@ -36,7 +39,10 @@ def doctor(overrides: Overrides = None, cfg: ShowConfig = False, repair: Repair 
         findings = [*_target(settings), *_environment(settings)]
     else:
         findings = _machine(settings)
-    print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
     if not all(finding.ok for finding in findings):
         raise typer.Exit(1)
 
@@ -115,7 +121,7 @@ def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Findin
         return Finding(what, False, str(error))
     size = settings.world.camera.size
     if spread == 0:
-        return Finding(what, False, f"{backend} draws empty frames: try MUJOCO_GL=osmesa kerv doctor")
+        return Finding(what, False, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
     return Finding(what, milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
 
 
@@ -147,7 +153,11 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
             findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
-    return findings or [Finding("policies", True, "none shipped here: 'kerv train target' trains one")]
+    return findings or [
+        Finding(
+            "policies", False, "none here: install kerv from its wheel or run it in a checkout, both bring mt10-vision"
+        )
+    ]
 
 
 def _disk(settings: DoctorSettings) -> Finding:

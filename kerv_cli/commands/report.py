@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, composed, console, edge
+from kerv_cli.commands.common import AsJson, Overrides, ShowConfig, composed, console, edge, print_json
+
+if TYPE_CHECKING:
+    from kerv_cli.settings import ReportSettings
 
 Publish = Annotated[
     bool,
@@ -16,23 +20,76 @@ Publish = Annotated[
 ]
 
 
+Choose = Annotated[
+    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the boldest safe one.")
+]
+
+
 @edge
-def report(overrides: Overrides = None, cfg: ShowConfig = False, publish: Publish = False) -> None:
+def report(
+    overrides: Overrides = None,
+    cfg: ShowConfig = False,
+    publish: Publish = False,
+    choose: Choose = False,
+    as_json: AsJson = False,
+) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
     from kerv_cli.settings import ReportSettings
 
     # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
-    words = [f"only={o[6:]}" if o.startswith("study=") else o for o in overrides or []]
+    words = [f"only={_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
     settings = composed("report", words, ReportSettings, cfg)
+    from kerv_cli.commands.sweep import tell_note
     from kerv_cli.places import results_dir
     from kerv_cli.reporting.agreement import agreement_summary
     from kerv_cli.reporting.report import report as write_report
     from kerv_cli.reporting.summary import summary_table
+    from kerv_cli.reporting.tables import rows_of
+    from kerv_cli.studies.store import StudyStore
 
+    if choose:
+        _choose(settings, as_json)
+        return
     written = write_report(results_dir(settings.results), settings.only, publish, settings.against)
-    for table in written.tables.values():
+    if as_json:
+        tables = {name: rows_of(table) for name, table in written.tables.items()}
+        print_json({"files": written.files, "studies": tables})
+        return
+    for name, table in written.tables.items():
         console().print(summary_table(table))
+        tell_note(StudyStore(results_dir(settings.results), name).read_plan().note)
     if written.agreement is not None:
         console().print(agreement_summary(written.agreement))
     for path in written.files:
         typer.echo(str(path))
+
+
+def _name(study: str) -> str:
+    """The study's name: of a file its stem, as `kerv sweep study=FILE.yaml` stores it."""
+    return Path(study).stem if study.endswith((".yaml", ".yml")) else study
+
+
+def _choose(settings: ReportSettings, as_json: bool) -> None:
+    """Prints the choice of one study, or of every study that has results."""
+    from kerv_cli.errors import UsageError
+    from kerv_cli.places import results_dir
+    from kerv_cli.reporting.choose import choices, choices_frame, sentence, short
+    from kerv_cli.reporting.tables import load_study, per_task_table, rows_of, study_table
+    from kerv_cli.studies.store import StudyStore, begun_studies
+
+    results = results_dir(settings.results)
+    names = [settings.only] if settings.only else begun_studies(results)
+    if not names:
+        raise UsageError(f"no study in {results / 'studies'} has a complete cell: run `kerv sweep study=demo`")
+    answers = {}
+    for name in names:
+        data = load_study(StudyStore(results, name))
+        found = choices(study_table(data), per_task_table(data), data.plan.axis, settings.loss)
+        answers[name] = rows_of(choices_frame(found))
+        if not as_json:
+            typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(found[0].front)}")
+            typer.echo(f"  {sentence(found[0], data.plan.axis, settings.loss, data.plan.baseline)}")
+            for choice in found[1:]:
+                typer.echo(f"  {short(choice)}")
+    if as_json:
+        print_json(answers)

@@ -1,4 +1,4 @@
-"""`kerv rollout`: episodes of one method, their figures and their Rerun files."""
+"""`kerv rollout`: episodes of one method or of a grid, their figures and their Rerun files."""
 
 from __future__ import annotations
 
@@ -7,110 +7,211 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kerv_cli.commands.common import (
+    AsJson,
     Overrides,
     ShowConfig,
     ShowPlan,
+    at_work,
     called,
+    console,
     edge,
+    in_same,
+    print_json,
     print_notes,
     print_table,
-    progress_bar,
 )
+from kerv_cli.errors import KervError
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable
+
+    import pandas as pd
 
     from kerv_cli.decoding.record import EpisodeRecord
-    from kerv_cli.settings import RolloutSettings
+    from kerv_cli.reporting.tables import StudyData
+    from kerv_cli.rollouts.cells import CellRunner
+    from kerv_cli.studies.plan import Cell
+    from kerv_cli.studies.resolve import ResolvedStudy
+    from kerv_cli.studies.store import StudyStore
 
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
 
 @edge
 def rollout(
-    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, multirun: Many = False
+    overrides: Overrides = None,
+    cfg: ShowConfig = False,
+    plan: ShowPlan = False,
+    multirun: Many = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per episode."""
-    from kerv_cli.config import compose, expand, to_yaml
+    """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
+    from kerv_cli.config import to_yaml
     from kerv_cli.effects import without_effect
-    from kerv_cli.settings import RolloutSettings
+    from kerv_cli.environments import resolve_tasks
+    from kerv_cli.places import check_writable
+    from kerv_cli.studies.rollout_runs import resolve_rollout
 
-    points = expand(overrides or []) if multirun else [list(overrides or [])]
-    for point in points:
-        settings = compose("rollout", point, RolloutSettings)
-        if cfg:
-            typer.echo(to_yaml(settings), nl=False)
-            continue
-        if multirun:
-            typer.echo(" ".join(point))
-        print_notes(without_effect(settings, point))
-        _run(settings, plan)
-
-
-def _run(settings: RolloutSettings, plan: bool) -> None:
-    from kerv_cli.environments import resolve_tasks, settled, spec_of
-
-    tasks = resolve_tasks(settings.task)
-    settings.world = settled(settings.world, spec_of(tasks[0]))
-    from kerv_cli.rollouts.policy import check
-    from kerv_cli.rollouts.run import close_worlds, run_task
-
-    check(settings)
-    total = len(tasks) * settings.episodes
-    if plan:
-        typer.echo(
-            f"{settings.method}: {len(tasks)} tasks x {settings.episodes} episodes, about {3 * total} s (a guess)"
-        )
+    words = list(overrides or [])
+    resolved = resolve_rollout(words, multirun)
+    if cfg:
+        typer.echo("---\n".join(to_yaml(settings) for settings in resolved.settings.values()), nl=False)
         return
-    from kerv_cli.places import results_dir
-
-    folder = results_dir(settings.results) / "rollouts" / settings.method
-    seeds = range(settings.seed, settings.seed + settings.episodes)
-    records: list[EpisodeRecord] = []
-    files: list[Path] = []
-    with progress_bar(settings.method) as advance:
-        for name in tasks:
-            for record in run_task(settings, name, seeds):
-                if record.frames:
-                    from kerv_cli.viewing.rerun_log import save_episode  # only a recording needs rerun
-
-                    path = folder / f"{record.task}-{record.seed}.rrd"
-                    files.append(save_episode(record, path, method=settings.method))
-                records.append(record)
-                advance(len(records), total, f"{name} {'success' if record.success else 'failure'}")
-    close_worlds()
-    _summary(settings, tasks, records)
-    if files:
-        typer.echo(f"{len(files)} rollouts in {folder}; open one with: {called()} view {files[0]}")
+    for label, settings in resolved.settings.items():
+        print_notes(without_effect(settings, resolved.overrides[label].split()))
+    first = next(iter(resolved.settings.values()))
+    check_writable(first.results)
+    cells = _cells(resolved, resolve_tasks(first.task))
+    if plan:
+        total = sum(len(cell.seeds) for cell in cells)
+        names = ", ".join(resolved.settings)
+        typer.echo(f"{names}: {len(resolve_tasks(first.task))} tasks, {total} episodes, about {3 * total} s (a guess)")
+        return
+    arguments = ["rollout", *(["-m"] if multirun else []), *words]
+    store = run_cells(resolved, cells, first.results, arguments)
+    _tell(store, cells, as_json, in_same(words))
 
 
-def _summary(settings: RolloutSettings, tasks: tuple[str, ...], records: list[EpisodeRecord]) -> None:
-    from kerv_cli.rollouts.policy import identity_of
+def _cells(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> list[Cell]:
+    """The run's cells, after everything that can be refused without running was."""
+    with at_work("loading the policy"):
+        from kerv_cli.rollouts.policy import check, identity_of
+        from kerv_cli.runtime import set_up
+        from kerv_cli.studies.plan import plan as plan_cells
+        from kerv_cli.studies.rollout_runs import EPISODES_PER_CELL
 
-    seen = identity_of(settings)["observation"]
-    last = settings.seed + settings.episodes - 1
+        for settings in resolved.settings.values():
+            check(settings)
+            settings.runtime.device, _ = set_up(settings.runtime)
+    warn_unseen(resolved, tasks)
+    return plan_cells(
+        resolved.settings,
+        tasks,
+        identity_of,
+        baseline=resolved.study.baseline,
+        overrides=resolved.overrides,
+        block=EPISODES_PER_CELL,
+    )
+
+
+def warn_unseen(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> None:
+    """Says on standard error which of these tasks a policy was not trained on."""
+    from kerv_cli.rollouts.policy import unseen_tasks
+
+    told: set[str] = set()
+    for settings in resolved.settings.values():
+        missing = unseen_tasks(settings, tasks)
+        line = f"kerv: warning: policy {settings.policy.target} was never trained on {', '.join(missing)}"
+        if missing and line not in told:
+            told.add(line)
+            typer.echo(line, err=True)
+
+
+def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, arguments: list[str]) -> StudyStore:
+    """Runs the cells, going on where the same command was interrupted -> where they are stored.
+
+    Raises:
+        Interrupted: Ctrl-C. KervError: an episode failed.
+    """
+    from kerv_cli.errors import Interrupted
+    from kerv_cli.rollouts.cells import CellRunner, reference_decode
+    from kerv_cli.rollouts.run import close_worlds
+    from kerv_cli.studies import events
+    from kerv_cli.studies.execute import execute
+    from kerv_cli.studies.progress import ProgressDisplay
+    from kerv_cli.studies.rollout_runs import begin
+    from kerv_cli.studies.run_file import note_invocation
+
+    store, done = begin(results, cells)
+    if done:
+        typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
+    store.write_plan(resolved.study, cells)
+    note_invocation(store, arguments)
+    runtime = next(iter(resolved.settings.values())).runtime
+    with ProgressDisplay(console(stderr=True)) as display:
+
+        def on_event(event: events.Event) -> None:
+            if isinstance(event, events.CellFailed):
+                raise failure.error or KervError(event.reason)
+            display(event)
+
+        here = runtime.workers == 1
+        failure = _Remembering(CellRunner(store.rollouts, keep=True, on_step=display.on_step if here else None))
+        try:
+            execute(cells, failure if here else failure.runner, store, runtime, on_event, reference_decode)
+        except KeyboardInterrupt:
+            kept = sum(store.has_cell(cell.id) for cell in cells)
+            raise Interrupted(
+                f"interrupted: {kept} of {len(cells)} episodes are kept in {store.root}, the same command goes on there"
+            ) from None
+        finally:
+            close_worlds()
+    return store
+
+
+class _Remembering:
+    """A CellRunner of this process that keeps the error of a setting that cannot be built, with its exit code."""
+
+    def __init__(self, runner: CellRunner) -> None:
+        self.runner = runner
+        self.error: KervError | None = None
+
+    def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
+        try:
+            return self.runner(cell)
+        except KervError as error:
+            self.error = error
+            raise
+
+
+def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+    from kerv_cli.reporting.summary import summary_table
+    from kerv_cli.reporting.tables import load_study, per_task_table, rows_of, study_table
+
+    data = load_study(store)
+    recordings = sorted(store.rollouts.glob("*.rrd"))
+    table = study_table(data)
+    if as_json:
+        per_task = rows_of(per_task_table(data))
+        settings = rows_of(table[table["averaging"] == table["averaging"].iloc[0]])
+        print_json({"run": store.name, "folder": store.root, "settings": settings, "tasks": per_task,
+                    "recordings": recordings})  # fmt: skip
+        return
+    if len(data.plan.labels) > 1:
+        console().print(summary_table(table))
+    else:
+        _single(data)
+    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
+    if recordings:
+        typer.echo(f"{len(recordings)} recordings; open one with: {called()} view {recordings[0]}")
+
+
+def _single(data: StudyData) -> None:
+    """Figures of a run with one setting: by task, and time by phase."""
+    from kerv_cli.decoding.record import PHASES
+
+    episodes = data.episodes
+    cell = data.plan.cells[0]
+    tasks = list(dict.fromkeys(episodes["task"]))
     names = (*tasks, "all") if len(tasks) > 1 else tasks
-    rows = [(name, *_figures([r for r in records if name in ("all", r.task)])) for name in names]
+    rows = [(name, *_figures(episodes[(episodes["task"] == name) | (name == "all")])) for name in names]
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
-    print_table(headers, rows, f"{settings.method}, observation {seen}, seeds {settings.seed}…{last}")
-    decodes = [d for r in records for d in r.decodes]
-    total = sum(d.seconds for d in decodes)
-    seconds = {phase: sum(d.phases[phase] for d in decodes) for phase in decodes[0].phases}
-    rows = [(phase, f"{1000 * s / len(decodes):.2f}", f"{s / total:.0%}") for phase, s in seconds.items()]
+    seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
+    seen = cell.identity.get("observation", "")
+    print_table(headers, rows, f"{cell.label}, observation {seen}, seeds {seeds}")
+    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
+    seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+    rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
     print_table(("phase", "ms per decode", "share"), rows, "time by phase")
 
 
-def _figures(records: list[EpisodeRecord]) -> list[str]:
-    steps = sum(r.steps for r in records)
-    rounds = [x for r in records for d in r.decodes for x in d.rounds if x.is_verification]
-    per_round = [
-        f"{sum(getattr(x, field) for x in rounds) / len(rounds):.2f}" if rounds else "–"
-        for field in ("committed", "accepted")
-    ]
+def _figures(episodes: pd.DataFrame) -> list[str]:
+    steps, rounds = episodes["steps"].sum(), episodes["verifications"].sum()
+    per_round = [f"{episodes[name].sum() / rounds:.2f}" if rounds else "–" for name in ("committed", "accepted")]
     return [
-        f"{sum(r.success for r in records)}/{len(records)}",
-        f"{steps / len(records):.0f}",
-        f"{sum(r.forwards for r in records) / steps:.2f}",
+        f"{episodes['success'].sum()}/{len(episodes)}",
+        f"{steps / len(episodes):.0f}",
+        f"{episodes['forwards'].sum() / steps:.2f}",
         *per_round,
-        f"{1000 * sum(r.seconds / r.steps for r in records) / len(records):.2f}",
+        f"{1000 * (episodes['seconds'] / episodes['steps']).mean():.2f}",
     ]

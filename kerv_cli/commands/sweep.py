@@ -6,10 +6,27 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, called, console, edge, print_notes, print_table
+from kerv_cli.commands.common import (
+    AsJson,
+    Overrides,
+    ShowConfig,
+    ShowPlan,
+    at_work,
+    called,
+    console,
+    edge,
+    in_same,
+    print_json,
+    print_notes,
+    print_table,
+    runnable,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from kerv_cli.settings import RuntimeSettings
+    from kerv_cli.studies.events import Outcome
     from kerv_cli.studies.plan import Cell
     from kerv_cli.studies.resolve import ResolvedStudy
     from kerv_cli.studies.store import StudyStore
@@ -18,16 +35,18 @@ SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core take
 
 
 @edge
-def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+def sweep(
+    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
+) -> None:
     """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused."""
     from kerv_cli.config import to_yaml
-    from kerv_cli.environments import resolve_tasks
+    from kerv_cli.places import check_writable
     from kerv_cli.studies.executors import check_executor
     from kerv_cli.studies.resolve import idle_overrides, resolve
 
-    resolved = resolve(overrides or [])
+    words = list(overrides or [])
+    resolved = resolve(words)
     first = next(iter(resolved.settings.values()))
-    tasks = resolve_tasks(first.task)
     if cfg:
         typer.echo(to_yaml(resolved.study), nl=False)
         for label, settings in resolved.settings.items():
@@ -35,13 +54,32 @@ def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         return
     print_notes(idle_overrides(resolved))
     check_executor(first.runtime)
-    from kerv_cli.rollouts.policy import check, identity_of
-    from kerv_cli.studies.plan import plan as plan_cells
-    from kerv_cli.studies.store import StudyStore
+    check_writable(first.results)
+    cells, store = _cells(resolved)
+    if plan:
+        _print_plan(cells, store, first.runtime.workers)
+        return
+    outcome = _run(resolved, cells, store, words)
+    _tell(outcome, resolved, cells, store, words, as_json)
 
-    study = resolved.study
-    for settings in resolved.settings.values():
-        check(settings)
+
+def _cells(resolved: ResolvedStudy) -> tuple[list[Cell], StudyStore]:
+    """The study's cells and where they are stored, after everything that can be refused without running was."""
+    from kerv_cli.commands.rollout import warn_unseen
+    from kerv_cli.environments import resolve_tasks
+
+    first, study = next(iter(resolved.settings.values())), resolved.study
+    tasks = resolve_tasks(first.task)
+    with at_work("loading the policy"):
+        from kerv_cli.rollouts.policy import check, identity_of
+        from kerv_cli.runtime import set_up
+        from kerv_cli.studies.plan import plan as plan_cells
+        from kerv_cli.studies.store import StudyStore
+
+        for settings in resolved.settings.values():
+            check(settings)
+            settings.runtime.device, _ = set_up(settings.runtime)
+    warn_unseen(resolved, tasks)
     cells = plan_cells(
         resolved.settings,
         tasks,
@@ -51,11 +89,7 @@ def sweep(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         block=study.block,
         repeats=study.repeats,
     )
-    store = StudyStore(first.results, study.name)
-    if plan:
-        _print_plan(cells, store, first.runtime.workers)
-        return
-    _run(resolved, cells, store, first.runtime)
+    return cells, StudyStore(first.results, study.name)
 
 
 def _print_plan(cells: list[Cell], store: StudyStore, workers: int) -> None:
@@ -76,30 +110,104 @@ def _print_plan(cells: list[Cell], store: StudyStore, workers: int) -> None:
     typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
 
 
-def _run(resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, runtime: RuntimeSettings) -> None:
-    from kerv_cli.reporting.summary import summary_table
-    from kerv_cli.reporting.tables import load_study, study_table
+def _run(resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str]) -> Outcome:
+    """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
+    from kerv_cli.errors import Interrupted
     from kerv_cli.rollouts.cells import CellRunner, reference_decode
     from kerv_cli.studies.execute import execute
     from kerv_cli.studies.progress import ProgressDisplay
+    from kerv_cli.studies.run_file import note_invocation
 
-    store.write_plan(resolved.study, cells)
+    runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
+    if resolved.until == "done":
+        store.write_plan(resolved.study, cells)
+    note_invocation(store, ["sweep", *words])
+    here = runtime.executor == "local" and runtime.workers == 1
     with ProgressDisplay(console(stderr=True)) as display:
-        outcome = execute(cells, CellRunner(store.rollouts), store, runtime, display, reference_decode)
-    if outcome.done or outcome.reused:
-        console().print(summary_table(study_table(load_study(store, cells))))
-    episodes = sum(len(cell.seeds) for cell in outcome.done)
-    if episodes:
-        minutes = outcome.seconds / 60
-        typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
-    typer.echo(
-        f"{len(outcome.done)} cells run, {len(outcome.reused)} reused, {len(outcome.failed)} failed; "
-        f"tables and plots: {called()} report study={store.name}"
-    )
+        runner = CellRunner(store.rollouts, on_step=display.on_step if here else None)
+        try:
+            if resolved.until == "decided":
+                return _until_decided(resolved, cells, store, lambda own: execute(
+                    own, runner, store, runtime, display, reference_decode))  # fmt: skip
+            return execute(cells, runner, store, runtime, display, reference_decode)
+        except KeyboardInterrupt:
+            kept = sum(store.has_cell(cell.id) for cell in cells)
+            raise Interrupted(
+                f"interrupted: {kept} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
+            ) from None
+
+
+def _until_decided(
+    resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, run: Callable[[list[Cell]], Outcome]
+) -> Outcome:
+    """Runs block after block of seeds, without the settings whose question is answered; the plan holds what was run."""
+    from kerv_cli.reporting import decided
+    from kerv_cli.reporting.tables import load_study
+    from kerv_cli.studies.events import Outcome
+
+    study, margin = resolved.study, resolved.loss / 100
+    blocks = decided.looks_of(cells)
+    typer.echo(decided.rule(resolved.loss, len(blocks)), err=True)
+    known: dict[str, decided.Verdict] = {}
+    asked: list[Cell] = []
+    total = Outcome()
+    left = [label for label in resolved.settings if label != study.baseline]
+    for look, block in enumerate(blocks, 1):
+        asked += [cell for cell in block if cell.label in (study.baseline, *left)]
+        store.write_plan(study, asked)
+        found = run([cell for cell in block if cell.label in (study.baseline, *left)])
+        lists = total.done + found.done, total.reused + found.reused, total.failed + found.failed
+        total = Outcome(*lists, total.seconds + found.seconds)
+        if found.failed:
+            return total
+        told = decided.verdicts(load_study(store, asked), left, margin, look, len(blocks))
+        typer.echo(f"look {look} of {len(blocks)}: {decided.summary(told)}", err=True)
+        known |= {verdict.label: verdict for verdict in told}
+        decided.write_verdicts(store.root, known, resolved.loss, len(blocks))
+        left = [verdict.label for verdict in told if verdict.verdict == decided.OPEN]
+        if not left:
+            break
+    return total
+
+
+def tell_note(note: str) -> None:
+    """Prints what a study says is to be seen in its table."""
+    if note:
+        typer.echo(f"\n{note}\n")
+
+
+def _tell(
+    outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
+) -> None:
+    from kerv_cli.reporting.summary import summary_table
+    from kerv_cli.reporting.tables import load_study, rows_of, study_table
+
+    there = bool(outcome.done or outcome.reused)
+    ran = {cell.id for cell in [*outcome.done, *outcome.reused]}
+    table = study_table(load_study(store, [cell for cell in cells if cell.id in ran])) if there else None
     recordings = sorted(store.rollouts.glob("*.rrd"))
-    if recordings:
-        typer.echo(f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}")
+    counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
+    if as_json:
+        rows = [] if table is None else rows_of(table)
+        print_json({"study": store.name, "folder": store.root, "cells": counts, "settings": rows,
+                    "recordings": recordings})  # fmt: skip
+    else:
+        if table is not None:
+            console().print(summary_table(table))
+            tell_note(resolved.study.note)
+        episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
+        if episodes and minutes:
+            typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
+        typer.echo(
+            f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed; "
+            f"tables and plots: {called()} report study={store.name}{in_same(words)}"
+        )
+        if recordings:
+            typer.echo(
+                f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}"
+            )
     for failure in outcome.failed:
-        typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {failure.reason}", err=True)
+        reason = runnable(failure.reason, words)
+        typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)
     if outcome.failed:
         raise typer.Exit(1)

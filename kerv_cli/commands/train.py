@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.commands import common
-from kerv_cli.commands.common import Overrides, ShowConfig, ShowPlan, edge, progress_bar
+from kerv_cli.commands.common import AsJson, Overrides, ShowConfig, ShowPlan, edge, progress_bar
 
 if TYPE_CHECKING:
     from kerv_cli.training.runs import DrafterRun, TargetRun
@@ -19,36 +19,56 @@ app = typer.Typer(
 
 @app.command("target")
 @edge
-def target(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+def target(
+    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
+) -> None:
     """Behaviour-clone the target on demonstrations."""
     from kerv_cli.settings import TrainTargetSettings
 
     settings = common.composed("train_target", overrides, TrainTargetSettings, cfg)
     from kerv_cli.training.runs import TargetRun
 
-    _run(TargetRun(settings), plan, "reading demonstrations", "training the target")
+    run_training(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
 
 
 @app.command("drafter")
 @edge
-def drafter(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+def drafter(
+    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
+) -> None:
     """Train a drafter, or with drafter=early the early one, on the target's own greedy decodes."""
     from kerv_cli.settings import TrainDrafterSettings
 
     settings = common.composed("train_drafter", overrides, TrainDrafterSettings, cfg)
     from kerv_cli.training.runs import drafter_run
 
-    _run(drafter_run(settings), plan, "the target's greedy decodes", "training the drafter")
+    run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
 
 
-def _run(run: TargetRun | DrafterRun, plan: bool, loading: str, training: str) -> None:
+def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     if plan:
         common.print_plan(run.plan())
     with progress_bar(loading) as advance:
         run.load(advance)
+    begun = False
+
+    def on_step(step: int, now: dict[str, float]) -> None:
+        nonlocal begun
+        if not begun and step > 1:
+            typer.echo(f"resuming at step {step - 1}", err=True)
+        begun = True
+        advance(step, run.settings.train.steps, _line(now))
+
     with progress_bar(training) as advance:
-        metrics = run.train(lambda step, now: advance(step, run.settings.train.steps, _line(now)))
+        metrics = run.train(on_step)
+    from kerv_cli.reporting.curves import save_curves
+
+    plot = save_curves(run.folder)
+    if as_json:
+        common.print_json({"folder": run.folder, "best": metrics, "curves": plot})
+        return
     common.print_figures("best checkpoint", metrics, run.folder)
+    typer.echo(f"curves in {run.folder / 'log.csv'} and {plot}")
 
 
 def _line(metrics: dict[str, float]) -> str:

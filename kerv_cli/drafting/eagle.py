@@ -184,9 +184,9 @@ def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> Draf
         CheckpointError: none there, a damaged one, one of another target or action space.
     """
     description = read_description(folder, "drafter", DrafterDescription)
-    made_for, again = MadeFor(description.target, description.actions), "'kerv train drafter policy.target=…'"
+    made_for, again = MadeFor(description.target, description.actions), "run 'kerv train drafter'"
     own = MadeFor(target_sha256, actions)
-    made_for.check_same(own, f"the drafter in {folder}", "trained", f"train one with {again}")
+    made_for.check_same(own, f"the drafter in {folder}", "trained", again)
     return description
 
 

@@ -170,7 +170,7 @@ def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:
     Raises:
         CheckpointError: none there, a damaged one, one of another target, chunk or action space.
     """
-    again = "run 'kerv train drafter drafter=early policy.target=…'"
+    again = "run 'kerv train drafter drafter=early'"
     if not (folder / "early.json").is_file():
         raise CheckpointError(f"no early drafter in {folder}: {again}")
     own = read_description(folder, "early", EarlyDescription)

@@ -62,6 +62,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
         **_columns("speedup", _speedup(pairs, "time", macro) if decodes else stats.NO_ESTIMATE),
         **_columns("episode_speedup", _speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
+        **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
         "pairs": sum(counts),
         **counts._asdict(),
         "mcnemar_p": stats.mcnemar(counts) if len(pairs) else math.nan,
@@ -75,6 +76,18 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
         "decodes": int(episodes["decodes"].sum()),
         "deviation_samples": int(episodes["deviation_count"].sum()),
     }
+
+
+def _acceptance_interval(episodes: pd.DataFrame, macro: bool) -> stats.Interval:
+    """Of AL; in the macro average from the groups' errors, which are independent."""
+    groups = [group for _, group in episodes.groupby("difficulty", sort=True)] if macro else [episodes]
+    known = [group for group in groups if group["verifications"].sum()]
+    found = [stats.ratio(group["committed"].to_numpy(), group["verifications"].to_numpy()) for group in known]
+    if not found:
+        return stats.Interval(math.nan, math.nan)
+    mean = sum(ratio.value for ratio in found) / len(found)
+    reach = math.sqrt(sum((ratio.high - ratio.value) ** 2 for ratio in found)) / len(found)
+    return stats.Interval(mean - reach, mean + reach)
 
 
 def _columns(name: str, estimate: Estimate) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -13,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.decoding.record import PHASES
-from kerv_cli.reporting.drawing import COLOURS, DASHES, INK, MUTED, STYLE, entitle, new_figure, setting_colours
+from kerv_cli.reporting.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours
 from kerv_cli.reporting.measures import MICRO
-from kerv_cli.reporting.scatter import tradeoff_figure
+from kerv_cli.reporting.scatter import success_floor, tradeoff_figure
 from kerv_cli.reporting.tables import is_number, rows_of
 
 _PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
@@ -24,6 +25,10 @@ _PANELS = (
     ("success", "Success", "episodes, % and 95 % interval", 100.0),
     ("AL", "Acceptance length", "tokens committed per verification", 1.0),
 )
+
+
+_CONTINUES = "… "
+"""In front of a label that adds something to the one above it."""
 
 
 def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
@@ -51,7 +56,8 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
 def _about(rows: pd.DataFrame, averaging: str) -> str:
     first = rows.iloc[0]
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
-    return f"{counts} · {averaging} · {first['device_name']}, {first['dtype']}"
+    names = ", ".join(dict.fromkeys(str(name) for name in rows["target"]))
+    return f"{names} · {counts} · {averaging} · {first['device_name']}, {first['dtype']}"
 
 
 def _is_baseline(rows: pd.DataFrame) -> pd.Series:
@@ -101,40 +107,64 @@ def _stem(label: str, axis: str) -> str:
 
 def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
     series = series_of(rows, axis)
-    names = [*series, str(rows["baseline"].iloc[0])]
+    names = [*(name for name, group in series.items() if len(group) > 1), str(rows["baseline"].iloc[0])]
     columns = max(1, min(6, int(12.0 / (0.7 + 0.08 * max(map(len, names))))))
-    figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns))
+    longest = max((len(name) for name, group in series.items() if len(group) == 1), default=0)
+    figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns) + min(1.6, 0.075 * longest))
     axes = figure.subplots(1, len(_PANELS))
     ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
+    beside = _places_beside(ticks, [label for label, group in series.items() if len(group) == 1])
     others = [group[~_is_baseline(group)].iloc[0] for group in series.values()]
     shades = setting_colours(rows_of(pd.DataFrame(others)))
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
         for place, (label, group) in enumerate(series.items()):
-            _draw_series(panel, group, measure, scale, shades[place], DASHES[place % len(DASHES)], label)
+            if len(group) > 1:
+                _draw_series(panel, group, measure, scale, shades[place], label)
+            else:
+                _draw_beside(panel, beside[label], rows_of(group)[0], measure, scale, shades[place])
         _draw_baseline(panel, rows, measure, scale)
         panel.set(title=name, ylabel=unit, xlabel=axis)
-        if len(ticks) <= 9:
-            panel.set_xticks(ticks, [f"{value:g}" for value in ticks])
-        _limit(panel, measure)
+        _name_places(panel, ticks, beside)
+        _limit(panel, measure, rows)
     shown = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in shown}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
     return figure
 
 
-def _draw_series(
-    panel: Axes, group: pd.DataFrame, measure: str, scale: float, shade: str, dashes: Any, label: str
-) -> None:
-    if len(group) == 1:  # a setting without a number on the axis: a level
-        level = group[measure].iloc[0] * scale
-        if is_number(level):
-            panel.axhline(level, color=shade, linestyle=dashes, linewidth=1.4, label=label)
-        return
+def _places_beside(ticks: Sequence[float], names: Sequence[str]) -> dict[str, float]:
+    """Where settings without a number on the axis stand: to the right of its last tick, one after the other."""
+    span = (ticks[-1] - ticks[0]) or 1.0
+    gap = max(span / max(2, len(ticks) - 1), 0.09 * span)
+    return {name: ticks[-1] + gap * (0.8 + 0.55 * place) for place, name in enumerate(names)}
+
+
+def _name_places(panel: Axes, ticks: Sequence[float], beside: Mapping[str, float]) -> None:
+    """Ticks of the numbers, and upright names of the settings beside them, behind a thin line."""
+    numbers = list(ticks) if len(ticks) <= 9 else list(ticks[:: math.ceil(len(ticks) / 9)])
+    panel.set_xticks([*numbers, *beside.values()], [*(f"{value:g}" for value in numbers), *beside])
+    for label, place in zip(panel.get_xticklabels(), [*numbers, *beside.values()], strict=True):
+        if place in beside.values():
+            label.set(rotation=90, fontsize=8, color=INK)
+    if beside:
+        panel.axvline((ticks[-1] + min(beside.values())) / 2, color=MUTED, linewidth=0.8, alpha=0.5)
+
+
+def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, shade: str, label: str) -> None:
     x, y = group["x"].to_numpy(float), group[measure].to_numpy(float) * scale
     panel.plot(x, y, color=shade, marker="o", markersize=5, linewidth=1.8, label=label)
     if f"{measure}_low" in group:
         low, high = group[f"{measure}_low"].to_numpy(float) * scale, group[f"{measure}_high"].to_numpy(float) * scale
         panel.fill_between(x, low, high, color=shade, alpha=0.15, linewidth=0)
+
+
+def _draw_beside(panel: Axes, place: float, row: dict[str, Any], measure: str, scale: float, shade: str) -> None:
+    if not is_number(row[measure]):
+        return
+    low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
+    if is_number(low):
+        panel.plot([place, place], [low * scale, high * scale], color=shade, linewidth=2.2, alpha=0.45)
+    panel.plot(place, row[measure] * scale, "D", color=shade, markersize=6)
 
 
 def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) -> None:
@@ -148,10 +178,10 @@ def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) 
         panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=INK, alpha=0.06, linewidth=0)
 
 
-def _limit(panel: Axes, measure: str) -> None:
-    """Axis limits: success from 0 to 104 %, ratios by their values with a margin."""
+def _limit(panel: Axes, measure: str, rows: pd.DataFrame) -> None:
+    """Axis limits: success from where it matters to 102 %, ratios by their values with a margin."""
     if measure == "success":
-        panel.set_ylim(0, 104)
+        panel.set_ylim(success_floor(rows), 102)
     else:
         panel.margins(y=0.12)
 
@@ -170,9 +200,32 @@ def _by_setting(rows: pd.DataFrame) -> Figure:
         panel.grid(axis="y", visible=False)
         if measure == "speedup":
             _draw_ceilings(panel, rows)
-        panel.set_xlim(0, 104 if measure == "success" else 1.08 * panel.get_xlim()[1])
-    _name_rows(axes[0], rows["label"])
+        low, high = (success_floor(rows), 102) if measure == "success" else (0, 1.08 * panel.get_xlim()[1])
+        panel.set_xlim(low, high)
+        _separate(panel, rows)
+    _name_rows(axes[0], _grouped_names(rows))
     return figure
+
+
+def _grouped_names(rows: pd.DataFrame) -> pd.Series:
+    """Labels; one that continues the label above, as `kerv, fixed r = 9` does `kerv`, shows what it adds, indented."""
+    names: list[str] = []
+    stem = ""
+    for label in map(str, rows["label"]):
+        if stem and label.startswith(f"{stem}, "):
+            names.append(f"{_CONTINUES}{label.removeprefix(stem + ', ')}")
+        else:
+            stem = label
+            names.append(label)
+    return pd.Series(names)
+
+
+def _separate(panel: Axes, rows: pd.DataFrame) -> None:
+    """A thin line above every setting that begins a group, where some setting continues another."""
+    names = list(_grouped_names(rows))
+    starts = [place for place, name in enumerate(names) if not name.startswith(_CONTINUES)]
+    for place in starts[1:] if len(starts) < len(names) else ():
+        panel.axhline(place - 0.5, color=MUTED, linewidth=0.7, alpha=0.5)
 
 
 def _name_rows(panel: Axes, names: pd.Series) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from kerv_cli.errors import UsageError
@@ -17,11 +16,10 @@ from kerv_cli.reporting import prediction
 from kerv_cli.reporting.agreement import agreement_table
 from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
-from kerv_cli.reporting.measures import MACRO, MICRO
 from kerv_cli.reporting.own_actions import own_errors
+from kerv_cli.reporting.page import Section, render
 from kerv_cli.reporting.plots import study_figures
 from kerv_cli.reporting.publish import check_publishable
-from kerv_cli.reporting.summary import summary_frame
 from kerv_cli.reporting.tables import StudyData, load_study, per_task_table, study_table, write_csv
 from kerv_cli.studies.store import StudyStore, begun_studies
 
@@ -61,23 +59,13 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
     names = begun_studies(results)
     calibrated = prediction.calibrated_targets(Path(results))
     if not names and not calibrated:
-        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=NAME`")
+        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=demo`")
     for name in names:
         reporter.report_study(name)
     for target in calibrated:
         reporter.prediction_section(target)
     reporter.curvature_section()
     return reporter.report
-
-
-@dataclass(frozen=True)
-class Section:
-    """An extra section of the page: prediction errors, curvature."""
-
-    title: str
-    note: str
-    figure: str  # an HTML element
-    table: pd.DataFrame | None = None  # of text
 
 
 class _Reporter:
@@ -97,6 +85,7 @@ class _Reporter:
         if self.publish:
             check_publishable(data, whole)
         self.report.tables[name] = whole
+        before = len(self.report.files)
         self._save_table(whole, name)
         self._save_table(per_task, f"{name}_per_task")
         figures = study_figures(whole, data.plan.axis, data.plan.title or name)
@@ -108,9 +97,10 @@ class _Reporter:
         if _varies_boundary(settings):
             sections.append(self.curvature_section())
         page = store.root / "report.html"
+        written = self.report.files[before:]
         with atomic_path(page) as temporary:
             shown = [section for section in sections if section is not None]
-            temporary.write_text(_page(store, data, whole, per_task, drawn, shown), encoding="utf-8")
+            temporary.write_text(render(store, data, whole, per_task, drawn, shown, written), encoding="utf-8")
         self.report.files.append(page)
 
     def agreement(self, name: str, against: Path) -> pd.DataFrame:
@@ -193,50 +183,3 @@ def _prediction_note(predictions: prediction.Predictions, table: pd.DataFrame) -
 def _varies_boundary(settings: Sequence[Mapping[str, Any]]) -> bool:
     """Whether the study compares boundaries; `always` stands for none."""
     return len({str(s["boundary"]) for s in settings if s["boundary"]["kind"] != "always"}) > 1
-
-
-def _page(
-    store: StudyStore,
-    data: StudyData,
-    whole: pd.DataFrame,
-    per_task: pd.DataFrame,
-    figures: list[str],
-    sections: Sequence[Section],
-) -> str:
-    first = whole.iloc[0]
-    about = ", ".join(
-        [
-            f"{whole['tasks'].max()} tasks",
-            f"{whole['episodes'].max()} episodes per setting",
-            str(first["device_name"]),
-            f"{first['dtype']}, {first['threads']} threads, {first['workers']} processes",
-            f"torch {first['torch_version']}",
-            f"kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
-        ]
-    )
-    by_task = summary_frame(per_task, "one task")
-    by_task.insert(0, "task", list(per_task["task"]))
-    template = Environment(
-        loader=PackageLoader("kerv_cli.reporting", "."), autoescape=True, undefined=StrictUndefined
-    ).get_template("report.html.j2")
-    return template.render(
-        name=store.name,
-        title=data.plan.title or store.name,
-        about=about,
-        baseline=data.plan.baseline,
-        absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
-        planned=len({cell.id for cell in data.plan.cells}),
-        how_to_run=store.how_to_run().capitalize(),
-        summaries={averaging: summary_frame(whole, averaging) for averaging in (MICRO, MACRO)},
-        figures=figures,
-        sections=sections,
-        per_task=by_task,
-        everything=_as_texts(whole),
-    )
-
-
-def _as_texts(table: pd.DataFrame) -> pd.DataFrame:
-    """The table as text, with the digits of the CSV file."""
-    return pd.DataFrame(
-        {name: [f"{v:.6g}" if isinstance(v, float) else "" if v is None else v for v in table[name]] for name in table}
-    ).replace("nan", "")

@@ -42,13 +42,18 @@ def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
     panel.set(xlabel="speedup: time per step, baseline ÷ setting", ylabel="success, % of episodes")
     panel.margins(x=0.14)
     panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
-    low = min((100 * row["success_low"] for row in drawn if is_number(row["success_low"])), default=0.0)
-    panel.set_ylim(max(-2.0, min(low, 60.0) - 8.0), 106)
+    panel.set_ylim(success_floor(rows), 103)
     panel.set_title("Success against speedup")
     entitle(figure, title, about)  # before the labels: it moves the panel
     labels = [(row["speedup"], 100 * row["success"], str(row["label"])) for row in points]
     place_labels(figure, panel, labels, shades)
     return figure
+
+
+def success_floor(rows: pd.DataFrame) -> float:
+    """Where an axis of success begins, in percent: a little below the lowest interval, so that differences show."""
+    lows = [100 * value for value in rows["success_low"] if is_number(value)]
+    return max(0.0, 5.0 * math.floor((min(lows, default=0.0) - 3.0) / 5.0))
 
 
 def _draw_point(panel: Axes, row: dict[str, Any], shade: str) -> None:

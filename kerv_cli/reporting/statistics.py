@@ -101,6 +101,18 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
     return Estimate(difference, low, high)
 
 
+def ratio(numerators: np.ndarray, denominators: np.ndarray) -> Estimate:
+    """Sum over sum of two arrays (episodes,), with the 95 % interval of a ratio estimator: episodes are independent,
+    what happens within one is not (Cochran, Sampling Techniques, section 2.11). NaN bounds for one episode."""
+    a, b = np.asarray(numerators, dtype=np.float64), np.asarray(denominators, dtype=np.float64)
+    value = float(a.sum() / b.sum())
+    if a.size < 2:
+        return Estimate(value, math.nan, math.nan)
+    spread = float(((a - value * b) ** 2).sum() * a.size / (a.size - 1))
+    reach = 1.96 * math.sqrt(spread) / float(b.sum())
+    return Estimate(value, value - reach, value + reach)
+
+
 def pairs_to_settle(counts: PairedCounts, margin: float, z: float = 1.96) -> float:
     """About how many pairs would show non-inferiority at `margin`, if the four outcomes' rates stayed as they are: the
     lower bound of the normal interval of the difference then lies at -margin. Infinite where the difference itself lies

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 from rich import box
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -15,6 +17,8 @@ from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.tables import is_number, rows_of
 
 APART = "*"
+WIDE = 130
+"""Columns of a terminal that hold every measure."""
 
 _ALWAYS = {"AL": "AL", "AFEP": "AFEP", "forwards_per_step": "forwards / step"}
 _WHERE_USED = {
@@ -27,17 +31,28 @@ _WHERE_USED = {
 _PERCENT = frozenset({"skip_rate", "unverified_share", "compensation_rate", "retrieval_share"})
 
 
-def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
-    """The rows of one averaging of `study_table`, for the terminal: 80 columns hold labels of 16 characters."""
-    frame = _narrow(summary_frame(table, averaging))
-    title = Text(_title(table, averaging), style="bold")
-    caption = f"brackets: 95 % intervals; p: exact McNemar test against {table['baseline'].iloc[0]}"
-    if frame["speedup"].str.endswith(APART).any():
-        caption += f"\n{APART} not all of its pairs were measured in one run"
-    if "ceiling" in frame:
-        caption += "\nceiling: speedup if every chunk were accepted whole at once"
-    printed = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD)
-    printed.padding, printed.show_edge = 0, False
+@dataclass(frozen=True)
+class SummaryTable:
+    """The rows of one averaging of `study_table`, for the terminal. From `WIDE` columns on every measure is there;
+    80 columns hold labels of 16 characters and fewer measures."""
+
+    table: pd.DataFrame
+    averaging: str = MICRO
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+        full = summary_frame(self.table, self.averaging)
+        frame = full if options.max_width >= WIDE else _narrow(full)
+        yield Text(_title(self.table, self.averaging), style="bold", overflow="fold")
+        yield _printed(frame)
+        yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {self.table['baseline'].iloc[0]}")
+        if frame["speedup"].str.endswith(APART).any():
+            yield Text(f"{APART} not all of its pairs were measured in one run")
+        if "ceiling" in frame:
+            yield Text("ceiling: speedup if every chunk were accepted whole at once")
+
+
+def _printed(frame: pd.DataFrame) -> Table:
+    printed = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     for name in frame.columns:
         left = name == "setting"
         head = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
@@ -46,6 +61,11 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     for row in frame.itertuples(index=False):
         printed.add_row(*(escape(str(value)) for value in row))
     return printed
+
+
+def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
+    """What a command prints of a study's table."""
+    return SummaryTable(table, averaging)
 
 
 def _narrow(frame: pd.DataFrame) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,8 +19,9 @@ import torch
 from torch import Tensor
 
 from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.rollouts.policy import artifacts_of
 from kerv_cli.rollouts.run import Runner, is_recorded
-from kerv_cli.settings import settings_from
+from kerv_cli.settings import RolloutSettings, settings_from
 
 _TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
 
@@ -40,6 +42,10 @@ class CellLike(Protocol):
         """Full task name."""
 
     @property
+    def seeds(self) -> tuple[int, ...]:
+        """One episode each."""
+
+    @property
     def repeat(self) -> int:
         """Number of the study's repeat, from 0."""
 
@@ -48,27 +54,62 @@ class CellLike(Protocol):
         """RolloutSettings as plain values."""
 
 
+OnStep = Callable[[CellLike, int, int], None]
+"""Told the cell, the seed and the number of control steps executed, after each of them."""
+
+
 @dataclass(frozen=True)
 class CellRunner:
-    """Prepares cells for their episodes; picklable. rollouts: folder of the .rrd files, one per recorded episode."""
+    """Prepares cells for their episodes; picklable without `on_step`.
+
+    rollouts: folder of the .rrd files, one per recorded episode. keep: cells of one setting and task share a decoder,
+    so that what it learns and its warm-up carry over from cell to cell. on_step: shows progress within an episode.
+    """
 
     rollouts: Path
+    keep: bool = False
+    on_step: OnStep | None = None
 
     def __call__(self, cell: CellLike) -> Callable[[int], EpisodeRecord]:
         """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
         settings = settings_from(cell.settings)
-        runner = Runner(settings, cell.task)
+        runner = (
+            _kept(json.dumps(cell.settings, sort_keys=True), cell.task) if self.keep else Runner(settings, cell.task)
+        )
 
         def episode(seed: int) -> EpisodeRecord:
+            if self.on_step is not None:
+                runner.on_step = functools.partial(self.on_step, cell, seed)
             record = runner.episode(seed, cell.repeat == 0 and is_recorded(settings, seed))
             if record.frames:
                 from kerv_cli.viewing.rerun_log import save_episode  # only a recording needs rerun
 
                 name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
-                save_episode(record, self.rollouts / name, method=cell.label)
-            return dataclasses.replace(record, frames={})
+                save_episode(record, self.rollouts / name, method=cell.label, limits=limits_of(settings, cell.task))
+            return dataclasses.replace(record, frames={}, places={})
 
         return episode
+
+
+def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
+    """Signal of a recording -> the limit that a decision compares it with: F* of the boundary, s_min of verify-skip."""
+    limits = {}
+    if hasattr(settings.boundary, "f_star"):
+        limits["metric"] = float(settings.boundary.f_star)
+    if hasattr(settings.skip, "s_min"):
+        given = settings.skip.s_min
+        if given is None:
+            levels = artifacts_of(settings).load("calibration").skip
+            given = levels.tasks[task].s_min if levels is not None and task in levels.tasks else None
+        if given is not None:
+            limits["similarity"] = float(given)
+    return limits
+
+
+@functools.lru_cache(maxsize=64)
+def _kept(settings: str, task: str) -> Runner:
+    """The process's runner of these settings (JSON) on a task."""
+    return Runner(settings_from(json.loads(settings)), task)
 
 
 def reference_decode(device: str) -> float:

@@ -34,7 +34,7 @@ class ActionDecoder(Protocol):
 
 
 class _Trace:
-    """Collects executed actions, end-effector positions, gripper openings and frames, step by step."""
+    """Collects executed actions, end-effector positions, gripper openings, frames and places, step by step."""
 
     def __init__(self, world: World, camera: CameraConfig | None) -> None:
         self.world, self.camera = world, camera
@@ -42,6 +42,7 @@ class _Trace:
         self.path: list[np.ndarray] = []
         self.gripper: list[float] = []
         self.frames: dict[int, np.ndarray] = {}
+        self.places: dict[str, list[np.ndarray]] = {}
         self._look()
 
     def add(self, action: np.ndarray) -> None:
@@ -56,6 +57,9 @@ class _Trace:
         self.gripper.append(self.world.gripper)
         if self.camera:
             self.frames[len(self.actions)] = self.world.frame(self.camera)
+            state = np.asarray(self.world.observe(()).state)
+            for place in self.world.spec.observation.places:
+                self.places.setdefault(place.name, []).append(state[place.first : place.first + 3])
 
 
 def run_episode(world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None) -> EpisodeRecord:
@@ -94,5 +98,6 @@ def run_episode(world: World, decoder: ActionDecoder, seed: int, camera: CameraC
         gripper=np.asarray(trace.gripper, dtype=np.float32),
         initial_state=world.initial_state,
         frames=trace.frames,
+        places={name: np.asarray(path, dtype=np.float32) for name, path in trace.places.items()},
         wall_seconds=time.perf_counter() - began,
     )

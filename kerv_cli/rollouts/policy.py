@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -55,6 +55,18 @@ def shown_to(target: Mapping[str, object]) -> str:
     privileged policy is recognised."""
     kind = str(target.get(OBSERVATION, "vision"))
     return "state (privileged)" if kind == "state" else kind
+
+
+def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
+    """Those of the tasks that the policy's target was not trained on; none where it does not say what it was."""
+    if is_expert(settings):
+        return []
+    made = artifacts_of(settings).description.provenance
+    trained = made.get("settings", {}).get("task")
+    if not trained:
+        return []
+    known = set(resolve_tasks(list(trained)))
+    return [task for task in tasks if task not in known]
 
 
 def check(settings: RolloutSettings) -> None:

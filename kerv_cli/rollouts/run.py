@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from kerv_cli.decoding.verify_skip import ParallelPass
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
-from kerv_cli.rollouts.episode import run_episode
+from kerv_cli.rollouts.episode import ActionDecoder, run_episode
 from kerv_cli.rollouts.policy import decoder_for
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
 
@@ -61,11 +61,41 @@ class Runner:
         self.decoder = decoder_for(settings, task)
         camera = camera_config(settings.world.camera)
         self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
+        self.on_step: Callable[[int], None] | None = None  # told the number of executed control steps, for progress
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
         """Runs the episode of a seed; its record has frames where it is recorded."""
         world = open_world(self.task, self.settings.world)  # another runner may have closed it since
-        return run_episode(world, self.decoder, seed, self._recording if recorded else None)
+        decoder = self.decoder if self.on_step is None else Watched(self.decoder, self.on_step)
+        return run_episode(world, decoder, seed, self._recording if recorded else None)
+
+
+class Watched:
+    """A decoder whose executed control steps are counted, outside the timing. on_step: told the number so far."""
+
+    def __init__(self, decoder: ActionDecoder, on_step: Callable[[int], None]) -> None:
+        self.decoder, self.on_step, self.steps = decoder, on_step, 0
+        self.decode = decoder.decode
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those of the decoder."""
+        return self.decoder.cameras
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode."""
+        self.steps = 0
+        self.decoder.reset(task, seed, end_effector)
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Tells the decoder, then counts."""
+        self.decoder.observe(action, end_effector)
+        self.steps += 1
+        self.on_step(self.steps)
+
+    def finish(self, success: bool) -> None:
+        """Tells the decoder."""
+        self.decoder.finish(success)
 
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:

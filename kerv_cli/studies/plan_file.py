@@ -22,6 +22,7 @@ class StudyPlan:
     baseline: str  # label that the others are compared with
     axis: str  # config key of the plots' x axis; empty where there is none
     cells: tuple[Cell, ...]
+    note: str = ""  # what to see
 
     @property
     def labels(self) -> list[str]:
@@ -57,6 +58,7 @@ class _File:
     axis: str
     labels: dict[str, _Label]
     cells: tuple[_Line, ...]
+    note: str = ""
 
 
 def plan_text(plan: StudyPlan) -> str:
@@ -66,7 +68,14 @@ def plan_text(plan: StudyPlan) -> str:
         if cell.label not in labels:
             settings = {key: value for key, value in cell.settings.items() if key != "task"}
             labels[cell.label] = {"overrides": cell.overrides, "identity": cell.identity, "settings": settings}
-    head = {"study": plan.name, "title": plan.title, "baseline": plan.baseline, "axis": plan.axis, "labels": labels}
+    head: dict[str, Any] = {
+        "study": plan.name,
+        "title": plan.title,
+        "baseline": plan.baseline,
+        "axis": plan.axis,
+        "note": plan.note,
+        "labels": labels,
+    }
     cells = [
         {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}
         for c in plan.cells
@@ -88,7 +97,7 @@ def plan_from_text(text: str) -> StudyPlan:
     unknown = {line.label for line in found.cells} - set(found.labels)
     if unknown or found.baseline not in found.labels:
         raise ValueError(f"it has no label {', '.join(sorted(unknown)) or found.baseline}")
-    return StudyPlan(found.study, found.title, found.baseline, found.axis, tuple(_cells(found)))
+    return StudyPlan(found.study, found.title, found.baseline, found.axis, tuple(_cells(found)), found.note)
 
 
 def _cells(found: _File) -> Iterator[Cell]:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
 
 from kerv_cli.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
 from kerv_cli.effects import without_effect
 from kerv_cli.environments import resolve_tasks, settled, spec_of
-from kerv_cli.errors import UsageError
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.manifests import read
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
+
+_OF_THE_SWEEP = ("study", "results", "until", "loss")
 
 
 @dataclass(frozen=True)
 class ResolvedStudy:
-    """A study whose settings are composed and checked."""
+    """A study whose settings are composed and checked. until, loss: as SweepSettings."""
 
     study: StudySettings
     settings: Mapping[str, RolloutSettings]  # by label, the study's order
     overrides: Mapping[str, str]  # by label, as written
+    until: str = "done"
+    loss: float = 3.0
     common: tuple[str, ...] = ()  # of the command line, for every setting
 
 
@@ -28,9 +37,14 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     Raises:
         UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
     """
-    mine = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in ("study", "results")]
+    overrides, by_path = _study_of_path(overrides)
+    mine = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in _OF_THE_SWEEP]
     theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
     sweep = compose("sweep", mine, SweepSettings)
+    if by_path is not None:
+        changed = {o.split("=", 1)[0].removeprefix("study.") for o in mine if o.startswith("study.")}
+        kept = {name: getattr(sweep.study, name) for name in changed & set(StudySettings.__dataclass_fields__)}
+        sweep.study = dataclasses.replace(by_path, **kept)
     given = {_key(o) for o in theirs}
     common = [o for o in split_words(sweep.study.common) if _key(o) not in given] + theirs
     written = _points(sweep.study)
@@ -45,7 +59,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     for setting in settings.values():
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
     texts = {label: " ".join(words) for label, words in written.items()}
-    return ResolvedStudy(sweep.study, settings, texts, tuple(theirs))
+    return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, tuple(theirs))
 
 
 def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
@@ -56,6 +70,30 @@ def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
         found |= {f"{label}: {word}": why for word, why in own.items()}
     of_all = [without_effect(settings, resolved.common, sweep=True) for settings in resolved.settings.values()]
     return found | {word: why for word, why in of_all[0].items() if all(word in idle for idle in of_all)}
+
+
+def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings | None]:
+    """The overrides without a `study=PATH.yaml`, and the study in that file.
+
+    Raises:
+        UsageError: no such file, or it is no study.
+    """
+    paths = [o.split("=", 1)[1] for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))]
+    if not paths:
+        return list(overrides), None
+    path = Path(paths[-1]).expanduser()
+    try:
+        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        why = getattr(error, "strerror", None) or "it is not YAML"
+        raise UsageError(f"study={path} cannot be read: {why}") from error
+    if not isinstance(value, dict):
+        raise UsageError(f"study={path} is no study: it needs the keys settings and baseline, see conf/study/demo.yaml")
+    try:
+        study = read(StudySettings, {"name": path.stem, **value}, str(path))
+    except CheckpointError as error:
+        raise UsageError(str(error).replace(" is damaged", " is no study")) from error
+    return [o for o in overrides if not o.startswith("study=")], study
 
 
 def _key(override: str) -> str:

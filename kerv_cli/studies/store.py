@@ -1,6 +1,7 @@
 """The results folder of a study. A cell is either complete or absent.
 
-results/studies/<name>/
+results/studies/<name>/, results/rollouts/<run>/
+    run.json                      the commands that ran it; see run_file.py
     plan.yaml                     what was asked for
     cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
     failures/<id>.txt             traceback of the last attempt, until one succeeds
@@ -53,16 +54,20 @@ class StoredCell:
     episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA, and decode_seconds: per episode (decodes,) seconds
 
 
+STUDIES, ROLLOUTS = "studies", "rollouts"
+"""Families of stores: what `kerv sweep` and what `kerv rollout` leaves, in the same files."""
+
+
 class StudyStore:
-    """`results/studies/<name>`. Only a path: picklable, and nothing is created before the first write.
+    """`results/<family>/<name>`. Only a path: picklable, and nothing is created before the first write.
 
     Raises:
         UsageError: a name that is no plain folder name.
     """
 
-    def __init__(self, results: Path | str, name: str) -> None:
-        self.name = check_name(name, "study name")
-        self.root = Path(results) / "studies" / name
+    def __init__(self, results: Path | str, name: str, family: str = STUDIES) -> None:
+        self.name, self.family = check_name(name, "study name"), family
+        self.root = Path(results) / family / name
         self.cells = self.root / "cells"
         self.rollouts = self.root / "rollouts"
         self.plan_path = self.root / "plan.yaml"
@@ -79,7 +84,7 @@ class StudyStore:
         Raises:
             StorageError: the disk refused.
         """
-        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells))
+        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
         with write_lock(self.plan_path):
             with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
                 new = merge_plans(self.read_plan(), new)
@@ -104,7 +109,7 @@ class StudyStore:
 
     def how_to_run(self) -> str:
         """The command that runs this study, for messages."""
-        return f"run `kerv sweep study={self.name}`"
+        return f"run `kerv sweep study={self.name}`" if self.family == STUDIES else f"run `kerv runs rerun {self.name}`"
 
     def has_cell(self, name: str) -> bool:
         """Whether the cell is complete; its files are compared with their hashes.

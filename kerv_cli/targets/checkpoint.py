@@ -75,6 +75,9 @@ class TargetDescription(Description):
 
 T = TypeVar("T", bound=Description)
 
+_TRAINED_BY = {"target": "train target", "drafter": "train drafter", "early": "train drafter drafter=early"}
+"""Kind of a description -> the command that makes one."""
+
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Writes a safetensors file atomically. Raises StorageError: writing failed."""
@@ -135,7 +138,7 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     """The JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
     path = folder / f"{kind}.json"
     if not path.is_file():
-        raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
+        raise CheckpointError(f"no {kind} in {folder}: run 'kerv {_TRAINED_BY[kind]}', or name a folder that holds one")
     found = os.stat(path)
     version = found.st_ino, found.st_size, found.st_mtime_ns
     description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]

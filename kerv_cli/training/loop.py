@@ -17,11 +17,12 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from kerv_cli.errors import CheckpointError, KervError
+from kerv_cli.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.files import atomic_path
 from kerv_cli.manifests import read
 from kerv_cli.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
+from kerv_cli.training.interruption import until_interrupted
 
 Metrics = dict[str, float]
 
@@ -68,17 +69,22 @@ class Loop:
         """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint.
 
         Raises:
-            CheckpointError: as `restore`. KervError: training diverged. StorageError: writing failed.
+            CheckpointError: as `restore`. KervError: training diverged. StorageError: writing failed. Interrupted:
+                Ctrl-C; the step that ran was finished and the run's state is stored.
         """
         self.restore()
         settings = self.settings
-        while self.step < settings.steps:
-            metrics = self.update()
-            self.step += 1
-            on_step(self.step, metrics)
-            if self.step % settings.validate_every == 0 or self.step == settings.steps:
-                self.check(metrics)
-                on_step(self.step, self.history[-1])
+        with until_interrupted() as stop:
+            while self.step < settings.steps:
+                metrics = self.update()
+                self.step += 1
+                on_step(self.step, metrics)
+                if self.step % settings.validate_every == 0 or self.step == settings.steps:
+                    self.check(metrics)
+                    on_step(self.step, self.history[-1])
+                if stop.requested and self.step < settings.steps:
+                    self.store()
+                    raise Interrupted(f"interrupted: step {self.step} is saved, the same command goes on from there")
         return max(self.history, key=lambda m: m["score"])
 
     def update(self) -> Metrics:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import rerun.blueprint as rrb
@@ -13,6 +14,8 @@ CELL_WIDTH, CELL_HEIGHT = 60.0, 26.0
 """A token's cell in the picture of the current chunk, in scene units."""
 KEY_ROWS = 4
 """Least number of rows of the picture's key."""
+KEY_WIDTH = 1.95
+"""Width of an entry of the key, in cells: `~ compensated` fits."""
 
 SIGNALS = {
     "variability": "K, kinematic variability",
@@ -21,6 +24,16 @@ SIGNALS = {
     "deviation": "deviation from AR",
 }
 """Optional fields of DecodeRecord -> titles of their views."""
+
+
+LIMITS = {"metric": "F*", "similarity": "s_min"}
+"""Signal -> name of the limit that a decision compares it with."""
+
+COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")
+"""Names of the DoFs' colours, for titles: a legend would hide data in views as small as these."""
+
+
+_PHASES_TITLE = "ms per decode: total grey, vision red, prefill green, verify olive"
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,9 @@ class EpisodeMeta:
     threshold: bool  # some acceptance rule had a threshold
     signals: tuple[str, ...]  # keys of SIGNALS that some decode has
     most: float  # the most forwards or the longest acceptance length of a decode
+    slowest: float  # milliseconds of the slowest decode
+    widest: int  # the largest threshold, bins
+    limited: tuple[str, ...]  # signals with a limit
     centre: tuple[float, float, float]  # middle of the end effector's path, metres
     extent: float  # longest side of the path's bounding box, metres
 
@@ -81,26 +97,27 @@ def _path(meta: EpisodeMeta) -> rrb.Spatial3DView:
 
 def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
     """A column of views that share the time axis; row shares are roughly hundreds of pixels."""
-    lanes = f"Decode mode, and tokens of each chunk; lanes of a step: {', '.join(meta.dofs)}"
-    views: list[rrb.View] = [_states(lanes, "/mode", "/tokens/**") if meta.drafted else _states("Decode mode", "/mode")]
-    shares = [1.1 + (min(meta.chunk_steps, 5) * (0.3 + 0.25 * len(meta.dofs)) if meta.drafted else 0.0)]
+    lanes = "Decodes (shades alternate), mode, and what became of each token of the chunk"
+    tokens = ["/tokens/**"] if meta.drafted else []
+    views: list[rrb.View] = [_states(lanes if meta.drafted else "Decodes and mode", "/decodes", "/mode", *tokens)]
+    shares = [1.4 + (min(meta.chunk_steps * len(meta.dofs), 20) * 0.34 if meta.drafted else 0.0)]
     counts = ("decode/forwards", "decode/acceptance")
-    views.append(_series("Forwards and acceptance per decode", *counts, top=meta.most + 0.5))
+    views.append(_series("Per decode: forwards grey, AL blue, drafts accepted green", *counts, top=meta.most + 0.5))
     shares.append(1.6)
     if meta.threshold:
-        views.append(_series("Acceptance threshold r, bins", "decode/threshold"))
+        views.append(_series("Acceptance threshold r, bins", "decode/threshold", top=meta.widest + 1.0))
         shares.append(1.2)
     for signal in meta.signals:
-        views.append(_series(SIGNALS[signal], f"signals/{signal}", legend=False))
+        views.append(_series(_signal_title(signal, meta), f"signals/{signal}"))
         shares.append(1.1)
     if not meta.drafted:
-        views += _always()
+        views += _always(meta)
         shares += [1.7, 1.7]
     return rrb.Vertical(*views, row_shares=shares)
 
 
 def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
-    wide = (len(meta.dofs) + 3.95) * CELL_WIDTH
+    wide = (len(meta.dofs) + 1.3 + 2 * KEY_WIDTH) * CELL_WIDTH
     left, above = -0.75 * CELL_WIDTH, -0.8 * CELL_HEIGHT
     high = (max(meta.chunk_steps, KEY_ROWS) + 0.9) * CELL_HEIGHT
     chunk = rrb.Spatial2DView(
@@ -112,16 +129,16 @@ def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
     views: list[rrb.View] = [chunk, _document("decode/table", "Current decode")]
     shares = [0.9 + 0.35 * max(meta.chunk_steps, KEY_ROWS), 5.2]
     if meta.drafted:
-        views += _always()
+        views += _always(meta)
         shares += [1.6, 1.6]
     return rrb.Vertical(*views, row_shares=shares)
 
 
-def _always() -> list[rrb.View]:
+def _always(meta: EpisodeMeta) -> list[rrb.View]:
     """Phases and actions, the series of every method; placed in the middle or right column."""
     return [
-        _series("Time by phase per decode, ms", "decode/phases"),
-        _series("Actions and gripper opening", "actions", "gripper"),
+        _series(_PHASES_TITLE, "decode/phases", top=1.1 * meta.slowest),
+        _series(f"Actions: {_coloured(meta.dofs)}; opening yellow", "actions", "gripper"),
     ]
 
 
@@ -130,14 +147,22 @@ def _states(name: str, *contents: str) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)
 
 
-def _series(name: str, *entities: str, legend: bool = True, top: float | None = None) -> rrb.TimeSeriesView:
+def _signal_title(signal: str, meta: EpisodeMeta) -> str:
+    return f"{SIGNALS[signal]}; {LIMITS[signal]} orange" if signal in meta.limited else SIGNALS[signal]
+
+
+def _coloured(names: Sequence[str]) -> str:
+    return ", ".join(f"{name} {COLOUR_WORDS[i % len(COLOUR_WORDS)]}" for i, name in enumerate(names))
+
+
+def _series(name: str, *entities: str, top: float | None = None) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"/{entity}" for entity in entities],
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 

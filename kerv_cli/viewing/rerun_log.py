@@ -23,14 +23,26 @@ from rerun.error_utils import catch_and_log_exceptions
 from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord
 from kerv_cli.files import atomic_path
 from kerv_cli.registry import parts
-from kerv_cli.viewing.blueprint import CELL_HEIGHT, CELL_WIDTH, KEY_ROWS, SIGNALS, STEP, TIME, EpisodeMeta, blueprint
+from kerv_cli.viewing.blueprint import (
+    CELL_HEIGHT,
+    CELL_WIDTH,
+    KEY_ROWS,
+    KEY_WIDTH,
+    LIMITS,
+    SIGNALS,
+    STEP,
+    TIME,
+    EpisodeMeta,
+    blueprint,
+)
+from kerv_cli.viewing.facts import facts_of, readable, summary
 from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, acceptance, chunk_size, decode_table, outcomes_of
 
 JPEG_QUALITY = 85
-_SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in OUTCOMES.values()}
 _MODE_COLORS = {"ar": 0x6E7B8BFF, "skip": 0xF0E442FF, "expert": 0x4E79A7FF}  # other modes are names of proposers
 _OTHER_COLORS = (0x0072B2FF, 0xA0522DFF, 0x4C9F70FF, 0xB07AA1FF)
 _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF, 0xB07AA1FF)
+_PLACE_COLORS = (0xE15759FF, 0x59A14FFF, 0xF0E442FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 _CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
 
@@ -48,25 +60,26 @@ class Entity:
     columns: Iterable[Any] = ()  # rerun columns of as many rows
 
 
-def save_episode(record: EpisodeRecord, path: Path, *, method: str) -> Path:
+def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapping[str, float] | None = None) -> Path:
     """Writes an episode as a recording that carries its own layout, atomically -> `path`.
 
     Args:
         record: without frames, the recording has no camera.
         path: the .rrd file; its folder is created.
         method: name of the method, for the summary; recordings of one method share their layout in the viewer.
+        limits: signal -> the limit that a decision compares it with, drawn as a line: F*, s_min.
 
     Raises:
         StorageError: the disk is full or read-only, or the folder may not be written to.
     """
     with catch_and_log_exceptions(strict=True):  # rerun would turn exceptions into warnings and missing views
-        content = _encode(record, method)
+        content = _encode(record, method, limits or {})
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
 
 
-def _encode(record: EpisodeRecord, method: str) -> bytes:
+def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:
     """The .rrd file's bytes."""
     recording = rr.RecordingStream("kerv_" + re.sub(r"\W+", "_", method, flags=re.ASCII))
     memory = recording.memory_recording()
@@ -74,19 +87,19 @@ def _encode(record: EpisodeRecord, method: str) -> bytes:
     recording.set_log_tick_enabled(False)
     outcome = "success" if record.success else "failure"
     recording.send_recording_name(readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
-    recording.send_property("episode", rr.AnyValues(**_facts(record, method)))
+    recording.send_property("episode", rr.AnyValues(**facts_of(record, method)))
     size = chunk_size(record.decodes, record.space.dofs)
     chunks = [outcomes_of(d, size, record.space.dofs) for d in record.decodes]
-    for entity in _entities(record, method, chunks):
+    for entity in _entities(record, method, chunks, limits):
         for archetype in entity.static:
             recording.log(entity.path, archetype, static=True)
         if entity.steps is not None and len(entity.steps):
             recording.send_columns(entity.path, _times(entity.steps, record.space.control_hz), entity.columns)
-    recording.send_blueprint(blueprint(meta_of(record, chunks)))
+    recording.send_blueprint(blueprint(meta_of(record, chunks, limits)))
     return bytes(memory.drain_as_bytes())
 
 
-def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
+def meta_of(record: EpisodeRecord, chunks: Chunks, limits: Mapping[str, float]) -> EpisodeMeta:
     """The properties of the episode that decide its layout."""
     low, high = record.path.min(axis=0), record.path.max(axis=0)
     x, y, z = ((low + high) / 2).tolist()
@@ -98,14 +111,12 @@ def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
         threshold=any(_threshold(d) for d in record.decodes),
         signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
         most=max(max(d.forwards, acceptance(d)[0] if d.verifications else 0) for d in record.decodes),
+        slowest=1000 * max(d.seconds for d in record.decodes),
+        widest=max((max(_threshold(d), default=0) for d in record.decodes), default=0),
+        limited=tuple(limits),
         centre=(x, y, z),
         extent=float((high - low).max()),
     )
-
-
-def readable(text: str) -> str:
-    """`text` on one line, with `?` for characters that the viewer's font lacks: they crash the 0.41 viewer."""
-    return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
 
 
 def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
@@ -113,7 +124,7 @@ def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
 
 
-def _entities(record: EpisodeRecord, method: str, chunks: Chunks) -> list[Entity]:
+def _entities(record: EpisodeRecord, method: str, chunks: Chunks, limits: Mapping[str, float]) -> list[Entity]:
     starts = np.asarray(record.decode_steps, dtype=np.int64)
     names = record.space.names
     return [
@@ -122,10 +133,11 @@ def _entities(record: EpisodeRecord, method: str, chunks: Chunks) -> list[Entity
         *_world(record),
         *_actions(record),
         _modes(record, starts),
-        *_token_lanes(chunks, starts, len(names)),
+        _boundaries(starts),
+        *_token_lanes(chunks, starts, names),
         *_current_chunk(chunks, starts, names),
         _tables(record, chunks, starts),
-        *_series_per_decode(record, starts),
+        *_series_per_decode(record, starts, limits),
     ]
 
 
@@ -171,7 +183,20 @@ def _world(record: EpisodeRecord) -> list[Entity]:
         Entity("world/ends", (ends,)),
         Entity("world/trail", (rr.Points3D.from_fields(radii=0.0025),), steps, moving),
         Entity("world/hand", (rr.Points3D.from_fields(radii=0.009),), steps, moving),
+        *_places(record),
     ]
+
+
+def _places(record: EpisodeRecord) -> list[Entity]:
+    """Object and goal, where the world knows them: a labelled point each, over time."""
+    entities = []
+    for number, (name, path) in enumerate(record.places.items()):
+        style = rr.Points3D.from_fields(
+            radii=0.014, colors=[_PLACE_COLORS[number % len(_PLACE_COLORS)]], labels=[readable(name)], show_labels=True
+        )
+        steps = np.arange(len(path), dtype=np.int64)
+        entities.append(Entity(f"world/{_part(name)}", (style,), steps, rr.Points3D.columns(positions=path)))
+    return entities
 
 
 def _actions(record: EpisodeRecord) -> list[Entity]:
@@ -204,19 +229,34 @@ def _mode_color(mode: str, place: int) -> int:
     return _MODE_COLORS.get(mode, _OTHER_COLORS[place % len(_OTHER_COLORS)])
 
 
-def _token_lanes(chunks: Chunks, starts: NDArray[np.int64], dofs: int) -> list[Entity]:
-    """One entity per control step of the chunk with a lane per DoF: a map of all tokens over time."""
+def _boundaries(starts: NDArray[np.int64]) -> Entity:
+    """Where decodes begin: a lane whose shade changes with every decode. Equal states would melt into one."""
+    states = ["even", "odd"]
+    style = rr.StateConfiguration(
+        values=states, labels=["·", "·"], colors=np.array([0x55606BFF, 0x8C99A6FF], np.uint32)
+    )
+    columns = rr.StateChange.columns(state=[states[i % 2] for i in range(len(starts))])
+    return Entity("decodes", (style,), starts, columns)
+
+
+def _token_lanes(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[str]) -> list[Entity]:
+    """A lane per token of the chunk, named by its control step and DoF: a map of all tokens over time."""
     style = rr.StateConfiguration(
         values=list(OUTCOMES),
         labels=[s.symbol for s in OUTCOMES.values()],
         colors=np.array([s.color for s in OUTCOMES.values()], dtype=np.uint32),
     )
     entities = []
-    for first in range(0, len(chunks[0]) if chunks else 0, dofs):
-        states = [outcome.kind for chunk in chunks for outcome in chunk[first : first + dofs]]
-        columns = rr.StateChange.columns(state=states).partition([dofs] * len(chunks))
-        entities.append(Entity(f"tokens/step_{first // dofs}", (style,), starts, columns))
+    for place in range(len(chunks[0]) if chunks else 0):
+        columns = rr.StateChange.columns(state=[chunk[place].kind for chunk in chunks])
+        step, name = divmod(place, len(names))
+        entities.append(Entity(f"tokens/step_{step}/{_part(names[name])}", (style,), starts, columns))
     return entities
+
+
+def _part(name: str) -> str:
+    """A name as a part of an entity's path."""
+    return re.sub(r"\W", "_", name, flags=re.ASCII)
 
 
 def _current_chunk(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[str]) -> list[Entity]:
@@ -229,22 +269,22 @@ def _current_chunk(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[st
     heads += [((-0.4, i + 0.5), f"step {i}") for i in range(size // dofs)]
     used = [kind for kind in OUTCOMES if any(o.kind == kind for chunk in chunks for o in chunk)]
     rows = max(size // dofs, KEY_ROWS)  # the key stands to the right, column by column
-    keys = np.array([[dofs + 1.0 + 1.1 * (i // rows), i % rows + 0.5] for i in range(len(used))]) * _CELL
+    keys = np.array([[dofs + 1.3 + KEY_WIDTH * (i // rows), i % rows + 0.5] for i in range(len(used))]) * _CELL
     cells = rr.LineStrips2D.columns(colors=colors).partition([size] * len(chunks))
     texts = rr.Points2D.columns(labels=labels).partition([size] * len(chunks))
     return [
         Entity("chunk/cells", (_cells(centres),), starts, cells),
         Entity("chunk/text", (_texts(centres),), starts, texts),
         Entity("chunk/names", (_texts(np.array([at for at, _ in heads]) * _CELL, [name for _, name in heads]),)),
-        Entity("chunk/legend", (_cells(keys, [OUTCOMES[kind].color for kind in used]),)),
+        Entity("chunk/legend", (_cells(keys, [OUTCOMES[kind].color for kind in used], KEY_WIDTH - 0.12),)),
         Entity("chunk/legend/text", (_texts(keys, [f"{OUTCOMES[kind].symbol} {kind}" for kind in used]),)),
     ]
 
 
-def _cells(centres: NDArray[np.float64], colors: Sequence[int] | None = None) -> rr.LineStrips2D:
-    """Filled, rounded cells at (n, 2) centres: thick short lines, since boxes are outlines."""
+def _cells(centres: NDArray[np.float64], colors: Sequence[int] | None = None, width: float = 0.96) -> rr.LineStrips2D:
+    """Filled, rounded cells at (n, 2) centres: thick short lines, since boxes are outlines. width: in cells."""
     radius = 0.46 * _CELL[1]
-    reach = np.array([0.48 * _CELL[0] - radius, 0.0])
+    reach = np.array([0.5 * width * _CELL[0] - radius, 0.0])
     strips = np.stack([centres - reach, centres + reach], axis=1)
     return rr.LineStrips2D(strips, radii=radius, colors=None if colors is None else np.array(colors, dtype=np.uint32))
 
@@ -263,13 +303,13 @@ def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) ->
     return Entity("decode/table", (), starts, rr.TextDocument.columns(text=texts, media_type=kinds))
 
 
-def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64]) -> list[Entity]:
+def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds: Mapping[str, float]) -> list[Entity]:
     """Series of numbers per decode. A decode without a number has no row; a number that no decode has has no entity."""
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
     series = [
-        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0xE0E4E8FF]),
+        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0x8C99A6FF]),
         Series(
             "decode/acceptance",
             ["AL, tokens per verification", "drafts accepted per verification"],
@@ -281,12 +321,16 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64]) -> list
             "decode/phases",
             ["total", *phases],
             [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes],
-            [0xE0E4E8FF, *_DOF_COLORS, 0x6E7B8BFF],
+            [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF],
         ),
     ]
     for signal, name in SIGNALS.items():
         found = [getattr(d, signal) for d in decodes]
-        series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in found]))
+        if signal in bounds:
+            both = [() if x is None else (x, bounds[signal]) for x in found]
+            series.append(Series(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF]))
+        else:
+            series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in found]))
     return [s.entity(starts) for s in series if any(s.values)]
 
 
@@ -335,56 +379,3 @@ def _rows(values: NDArray[Any]) -> Iterable[Any]:
 
 def _markdown(text: str) -> rr.TextDocument:
     return rr.TextDocument(text, media_type="text/markdown")
-
-
-def _facts(record: EpisodeRecord, method: str) -> dict[str, Any]:
-    """The episode's totals, stored as properties of the recording."""
-    rounds = [r for d in record.decodes for r in d.rounds if r.is_verification]
-    facts: dict[str, Any] = {
-        "environment": readable(record.environment),
-        "task": readable(record.task),
-        "instruction": readable(record.instruction),
-        "method": readable(method),
-        "seed": record.seed,
-        "success": record.success,
-        "steps": record.steps,
-        "decodes": len(record.decodes),
-        "forwards": record.forwards,
-        "forwards_per_step": record.forwards / record.steps,
-        "ms_per_step": 1000 * record.seconds / record.steps,
-        "inference_seconds": record.seconds,
-        "wall_seconds": record.wall_seconds,
-        "skipped_decodes": sum(d.skipped for d in record.decodes),
-        "compensated_tokens": sum(d.compensated for d in record.decodes),
-    }
-    if rounds:
-        facts["acceptance_length"] = sum(r.committed for r in rounds) / len(rounds)
-        facts["accepted_per_round"] = sum(r.accepted for r in rounds) / len(rounds)
-    return facts
-
-
-def summary(record: EpisodeRecord, method: str) -> str:
-    """The episode as Markdown, with the key to the tokens' colours."""
-    facts = _facts(record, method)
-    modes = [d.mode for d in record.decodes]
-    rows = {
-        "instruction": facts["instruction"],
-        "method, seed": f"{facts['method']}, {record.seed}",
-        "control steps": f"{record.steps} ({record.steps / record.space.control_hz:.2f} s)",
-        "decodes": ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes)),
-        "forwards per step": f"{facts['forwards_per_step']:.2f}",
-    }
-    if "acceptance_length" in facts:
-        rows["AL"] = f"{facts['acceptance_length']:.2f}"
-        rows["accepted per round"] = f"{facts['accepted_per_round']:.2f}"
-    rows["compensated tokens"] = facts["compensated_tokens"]
-    rows["decodes without verification"] = facts["skipped_decodes"]
-    rows["inference per step"] = f"{facts['ms_per_step']:.2f} ms"
-    key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
-    outcome = "SUCCESS" if record.success else "FAILURE"
-    lines = [f"| {facts['task']} | {outcome} |", "|:--|:--|", *_table_rows(rows)]
-    return "\n".join([*lines, "", "| token | outcome |", "|:--|:--|", *_table_rows(key)])
-
-
-def _table_rows(rows: Mapping[str, Any]) -> list[str]:
-    return [f"| {name} | {value} |" for name, value in rows.items()]

@@ -67,7 +67,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     """
     outcomes: list[TokenOutcome | None] = [None] * size
     for number, played in enumerate(decode.rounds):
-        for place, outcome in _outcomes_of_round(played, number):
+        for place, outcome in round_outcomes(played, number):
             before = outcomes[place]
             if before is None or before.kind != "rejected":
                 outcomes[place] = outcome
@@ -79,7 +79,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     return [_settled(outcome, decode, place, place < executed) for place, outcome in enumerate(outcomes)]
 
 
-def _outcomes_of_round(played: Round, number: int) -> list[tuple[int, TokenOutcome]]:
+def round_outcomes(played: Round, number: int) -> list[tuple[int, TokenOutcome]]:
     """(index in the chunk, outcome) of what one round judged."""
     found = []
     for i in range(max(len(played.drafted), len(played.target_tokens))):

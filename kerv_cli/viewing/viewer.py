@@ -199,6 +199,11 @@ def _checked(path: Path) -> RrdReader:
     return reader
 
 
+def chunks_of(path: Path) -> list[Any]:
+    """Every chunk of a recording. KervError: it is missing or damaged."""
+    return _chunks(_checked(path), path)
+
+
 def _chunks(reader: RrdReader, path: Path) -> list[Any]:
     try:
         return list(reader.stream())

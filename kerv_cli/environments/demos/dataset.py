@@ -124,8 +124,10 @@ class DemoDataset:
         path = Path(path)
         if not (path / "manifest.json").exists():
             if (path / "recording.json").exists():
-                raise CheckpointError(f"the demonstrations in {path} are unfinished: run 'kerv demos' again to go on")
-            raise CheckpointError(f"no demonstrations in {path}: record them with 'kerv demos'")
+                raise CheckpointError(
+                    f"the demonstrations in {path} are unfinished: run 'kerv demos name={path.name}' again to go on"
+                )
+            raise CheckpointError(f"no demonstrations in {path}: record them with 'kerv demos name={path.name}'")
         manifest = _read_manifest(path / "manifest.json")
         if manifest.instructions:
             camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)

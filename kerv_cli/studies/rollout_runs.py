@@ -1,0 +1,88 @@
+"""`kerv rollout` as a run: one folder below results/rollouts with the files of a study, one cell per episode."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import secrets
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from kerv_cli.config import compose, expand, swept_keys
+from kerv_cli.environments import resolve_tasks, settled, spec_of
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.settings import RolloutSettings, StudySettings
+from kerv_cli.studies.plan import Cell, unique_cells
+from kerv_cli.studies.resolve import ResolvedStudy
+from kerv_cli.studies.store import ROLLOUTS, StudyStore
+
+EPISODES_PER_CELL = 1
+"""Ctrl-C loses at most the episode that runs."""
+
+_MOST_NAME = 32  # letters of the methods in a run's name
+
+
+def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
+    """The settings of `kerv rollout`: one, or with -m every point of the grid that comma lists form. Tasks are no axis
+    of the grid: every point runs on all of them. The first point without a drafter is the baseline.
+
+    Raises:
+        UsageError: an unknown key or name, a value that cannot be, a grid over `results`.
+    """
+    shared = [word for word in overrides if word.startswith("task=")]
+    words = [word for word in overrides if word not in shared]
+    varied = [key for key in swept_keys(words) if key != "method"] if multirun else []
+    if "results" in varied:
+        raise UsageError("results= names one folder: a run lies in one place")
+    settings: dict[str, RolloutSettings] = {}
+    written: dict[str, str] = {}
+    for point in expand(words) if multirun else [words]:
+        composed = compose("rollout", [*shared, *point], RolloutSettings)
+        composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
+        values = [f"{key.rsplit('.', 1)[-1]}={_value(point, key)}" for key in varied]
+        label = " ".join([composed.method, *values])
+        settings[label], written[label] = composed, " ".join(point)
+    baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
+    return ResolvedStudy(StudySettings(name="rollout", title="", baseline=baseline), settings, written)
+
+
+def _value(point: Sequence[str], key: str) -> str:
+    return next(word.split("=", 1)[1] for word in point if word.split("=", 1)[0] == key)
+
+
+def _is_ar(settings: RolloutSettings) -> bool:
+    drafts = (settings.prefill_draft, settings.proposer, settings.skip)
+    return all(part.kind == "none" for part in drafts) and settings.method == "ar"
+
+
+def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, int]:
+    """Where the cells are stored, and how many of them are complete there: a new folder, or the newest run of the same
+    cells that was interrupted.
+
+    Raises:
+        CheckpointError: a cell of the interrupted run is damaged.
+    """
+    wanted = {cell.id for cell in cells}
+    for store in rollout_stores(results):
+        with contextlib.suppress(UsageError, CheckpointError):
+            if {cell.id for cell in store.read_plan().cells} != wanted:
+                continue
+            done = sum(store.has_cell(name) for name in wanted)
+            if done < len(wanted):
+                return store, done
+    return StudyStore(results, new_name(results, cells), ROLLOUTS), 0
+
+
+def rollout_stores(results: str | Path) -> list[StudyStore]:
+    """The runs of `kerv rollout` in a results folder, the newest first."""
+    found = [path.parent for path in (Path(results).expanduser() / ROLLOUTS).glob("*/plan.yaml")]
+    return [StudyStore(Path(results).expanduser(), folder.name, ROLLOUTS) for folder in sorted(found, reverse=True)]
+
+
+def new_name(results: str | Path, cells: Sequence[Cell]) -> str:
+    """A free name: date, time and methods, e.g. `20260301-142530-ar-spec_vla`."""
+    methods = "-".join(dict.fromkeys(str(cell.settings["method"]) for cell in unique_cells(cells)))
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
+    taken = (Path(results).expanduser() / ROLLOUTS / name).exists()
+    return f"{name}-{secrets.token_hex(2)}" if taken else name

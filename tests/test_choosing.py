@@ -1,0 +1,131 @@
+"""Which setting to take, and when a sweep has measured enough."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from studies_synthetic import IDENTITY, run_cell, settings_of
+
+from kerv_cli.errors import UsageError
+from kerv_cli.reporting import decided
+from kerv_cli.reporting.choose import choices, pareto, sentence, short
+from kerv_cli.reporting.decided import LARGER, OPEN, SMALLER, confidence_of_a_look, verdict_of
+from kerv_cli.reporting.measures import MICRO
+from kerv_cli.reporting.statistics import PairedCounts, paired_difference, ratio
+from kerv_cli.reporting.tables import load_study
+from kerv_cli.settings import StudySettings
+from kerv_cli.studies.plan import plan
+from kerv_cli.studies.store import StudyStore
+
+
+def row(label: str, speedup: float, counts: PairedCounts, r: float = math.nan, task: str = "all") -> dict[str, object]:
+    found = paired_difference(counts)
+    pairs = sum(counts)
+    return {
+        "averaging": MICRO,
+        "label": label,
+        "baseline": "ar",
+        "task": task,
+        "threshold.r": r,
+        "speedup": speedup,
+        "success": (counts.both + counts.only_method) / pairs,
+        "pairs": pairs,
+        "difference_low": found.low,
+        **counts._asdict(),
+    }
+
+
+@pytest.fixture
+def table() -> pd.DataFrame:
+    rows = [
+        row("ar", 1.0, PairedCounts(190, 0, 0, 10)),
+        row("r=3", 1.3, PairedCounts(189, 1, 1, 9), 3),
+        row("r=9", 1.5, PairedCounts(188, 2, 2, 8), 9),
+        row("r=20", 1.9, PairedCounts(170, 20, 1, 9), 20),
+        row("dominated", 1.2, PairedCounts(185, 5, 0, 10)),
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_the_boldest_safe_setting_is_chosen_and_the_front_is_not_beaten(table: pd.DataFrame) -> None:
+    found = choices(table, table.assign(task="reach"), "threshold.r", 4.0)
+    assert [choice.where for choice in found] == ["all tasks", "reach"]
+    assert found[0].chosen == "r=9"
+    assert found[0].front == ("r=20", "r=9", "ar")[: len(found[0].front)] or "dominated" not in found[0].front
+    assert "dominated" not in found[0].front
+    text = sentence(found[0], "threshold.r", 4.0, "ar")
+    assert text.startswith(
+        "the largest r that loses less than 4 points of success against ar, with 95 % confidence: r=9"
+    )
+    assert short(found[1]) == "reach: r=9"
+
+
+def test_what_is_not_shown_yet_says_how_many_episodes_more_would_do(table: pd.DataFrame) -> None:
+    found = choices(table, table.iloc[:0], "threshold.r", 2.0)[0]
+    assert found.chosen == ""
+    assert min(found.undecided.values()) > 200
+    assert "more would show it for r=3" in sentence(found, "threshold.r", 2.0, "ar")
+    assert "r=20" not in found.undecided, "a setting that loses more than the bound is never shown by more"
+
+
+def test_the_pareto_front_keeps_ties_and_drops_what_is_beaten_in_both() -> None:
+    rows = [
+        {"label": name, "baseline": "ar", "speedup": speed, "success": success}
+        for name, speed, success in (("ar", 1.0, 0.9), ("a", 2.0, 0.9), ("b", 2.0, 0.8), ("c", 3.0, 0.5))
+    ]
+    assert [r["label"] for r in pareto(rows)] == ["c", "a"]
+
+
+@pytest.mark.parametrize("looks", [2, 4, 10])
+def test_the_boundary_misjudges_one_time_in_twenty_over_all_looks(looks: int) -> None:
+    steps = np.random.default_rng(0).normal(size=(200_000, looks))
+    z = steps.cumsum(axis=1) / np.sqrt(np.arange(1, looks + 1))
+    from scipy.stats import norm
+
+    bound = norm.ppf(0.5 + confidence_of_a_look(looks) / 2)
+    assert (np.abs(z) > bound).any(axis=1).mean() == pytest.approx(0.05, abs=0.003)
+
+
+def test_more_looks_than_are_tabled_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"set study\.block higher"):
+        confidence_of_a_look(21)
+
+
+def test_a_setting_is_open_until_its_interval_leaves_the_bound() -> None:
+    assert verdict_of("a", PairedCounts(5, 0, 0, 0), 0.03, 1, 4).verdict == OPEN
+    assert verdict_of("a", PairedCounts(950, 5, 5, 40), 0.03, 1, 4).verdict == SMALLER
+    assert verdict_of("a", PairedCounts(500, 400, 0, 100), 0.03, 1, 4).verdict == LARGER
+
+
+def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path: Path) -> None:
+    settings = {"ar": settings_of("ar", episodes=4), "spec_vla": settings_of("spec_vla", 9, 4)}
+    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar", block=2)
+    store = StudyStore(tmp_path, "stopped")
+    for cell in cells:
+        store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
+    store.write_plan(StudySettings("stopped", ""), cells)
+    assert [len(look) for look in decided.looks_of(cells)] == [2, 2]
+    (found,) = decided.verdicts(load_study(store), ["spec_vla"], 0.5, 2, 2)
+    assert found.pairs == 4
+    decided.write_verdicts(store.root, {"spec_vla": found}, 50.0, 2)
+    assert json.loads((store.root / "decided.json").read_text())["loss_points"] == 50.0
+    again = decided.read_verdicts(store.root)
+    assert again is not None
+    assert list(again["label"]) == ["spec_vla"]
+
+
+def test_the_interval_of_a_ratio_covers_it() -> None:
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(400):
+        below = rng.integers(5, 30, size=60)
+        above = rng.binomial(below * 16, 0.5)
+        found = ratio(above, below)
+        hits += found.low <= 8.0 <= found.high
+    assert hits / 400 == pytest.approx(0.95, abs=0.03)
+    assert math.isnan(ratio(np.array([3]), np.array([2])).low)

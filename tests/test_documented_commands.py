@@ -1,0 +1,75 @@
+"""Every command in README.md and docs/ runs: with --cfg where it has it, which composes and checks all of its settings
+and computes nothing."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_FILE = re.compile(r"^```yaml\n# (\S+\.yaml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+_OPEN = {
+    "task=NAME": "task=reach",
+    "method=NAME": "method=ar",
+    "study=NAME": "study=demo",
+    "proposer=NAME": "proposer=hold",
+}
+
+
+def commands() -> list[str]:
+    """Those in blocks of shell text and those in running text, without comments, each once."""
+    found: list[str] = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        lines = [line.split("   #")[0].strip() for block in _BLOCK.findall(text) for line in block.splitlines()]
+        lines += re.findall(r"`((?:kerv|make) [^`\n…]+)`", text)
+        found += [line for line in lines if line.startswith(("kerv ", "make "))]
+    return list(dict.fromkeys(found))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The YAML files that the pages show, under their names."""
+    place = tmp_path_factory.mktemp("pages")
+    for page in PAGES:
+        for name, text in _FILE.findall(page.read_text(encoding="utf-8")):
+            (place / name).write_text(text)
+    return place
+
+
+def test_the_pages_show_commands() -> None:
+    assert len(commands()) > 40
+
+
+@pytest.mark.parametrize("command", [line for line in commands() if line.startswith("kerv ")])
+def test_a_documented_command_runs(command: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    words = shlex.split(command)[1:]
+    monkeypatch.setenv("HOME", str(folder))
+    words = [_OPEN.get(word, word) for word in words]  # what a page leaves to the reader
+    runner = CliRunner()
+    if words[0] in ("runs", "completion", "--version"):
+        result = runner.invoke(app, [*words[:2], "--help"] if words[0] == "runs" else words)
+        options = [word for word in words if word.startswith("--")]
+        assert all(option in result.output for option in options if words[0] == "runs"), command
+    else:
+        result = runner.invoke(app, [*words, "--cfg"])
+    assert result.exit_code == 0, f"{command}: {result.output}"
+
+
+def test_documented_rules_of_make_are_there() -> None:
+    rules = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    for command in commands():
+        words = command.split()
+        if words[0] == "make":
+            assert words[1] in rules, command

@@ -1,0 +1,281 @@
+"""`kerv rollout` and `kerv sweep` as runs: what they leave, and what `kerv runs` does with it. Real episodes of a nano
+policy in this process, recordings left out."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pandas as pd
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.rollouts.cells import CellRunner
+from kerv_cli.runs.catalogue import find_runs, matching
+from kerv_cli.runs.export import TRACKERS, export
+
+FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
+
+
+def kerv(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments))
+
+
+def works(*arguments: str) -> str:
+    result = kerv(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Read only: a rollout of two settings, one of a single one, and a training."""
+    folder = tmp_path_factory.mktemp("runs") / "results"
+    shutil.copytree(policies, folder)
+    works("rollout", "-m", "method=spec_vla", "threshold.r=5,9", "episodes=2", *FAST, f"results={folder}")
+    works("rollout", "method=ar", "episodes=2", *FAST, f"results={folder}")
+    trained = folder / "artifacts/target/nano-state"
+    log = pd.DataFrame({"step": [10, 20], "train_loss": [2.0, 1.0], "score": [0.1, 0.3]})
+    log.to_csv(trained / "log.csv", index=False)
+    return folder
+
+
+def listed(results: Path, *words: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(works("runs", "list", *words, f"results={results}", "--json"))
+    return found
+
+
+def test_a_grid_keeps_every_episode_and_prints_one_table(policies: Path, tmp_path: Path) -> None:
+    shutil.copytree(policies, tmp_path / "results")
+    told = works("rollout", "-m", "method=ar,spec_vla", "episodes=2", *FAST, f"results={tmp_path}/results")
+    assert told.count("success %") == 1
+    assert re.search(r"^ar +", told, re.MULTILINE)
+    (folder,) = (tmp_path / "results/rollouts").iterdir()
+    assert len(list((folder / "cells").iterdir())) == 4, "one cell per setting and episode"
+
+
+def test_recordings_of_a_grid_have_names_of_their_own(policies: Path, tmp_path: Path) -> None:
+    shutil.copytree(policies, tmp_path / "results")
+    words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
+    works("rollout", "-m", "method=spec_vla", "threshold.r=5,9", "episodes=1", *words, f"results={tmp_path}/results")
+    (folder,) = (tmp_path / "results/rollouts").iterdir()
+    assert len(list((folder / "rollouts").glob("*.rrd"))) == 2
+
+
+def test_runs_are_listed_and_filtered(results: Path) -> None:
+    runs = listed(results)
+    assert [run["kind"] for run in runs].count("rollout") == 2
+    assert {run["state"] for run in runs if run["kind"] == "rollout"} == {"complete"}
+    (single,) = listed(results, "method=ar")
+    assert single["episodes"] == 2
+    assert single["command"][:3] == ["kerv", "rollout", "method=ar"]
+    assert listed(results, "kind=target")[0]["id"] == "target/nano-state"
+    assert listed(results, "task=push") == []
+    refused = kerv("runs", "list", "methd=ar", f"results={results}")
+    assert (refused.exit_code, "did you mean method" in refused.stderr) == (2, True)
+    assert matching(find_runs(results), {"since": "2999"}) == []
+
+
+def test_a_run_is_shown_and_a_wrong_name_refused(results: Path) -> None:
+    told = works("runs", "show", "last", f"results={results}")
+    assert "command  kerv rollout" in told or "command  unknown" in told
+    missing = kerv("runs", "show", "nothing-like-it", f"results={results}")
+    assert missing.exit_code == 2
+    assert "unknown run 'nothing-like-it'" in missing.stderr
+    assert "kerv rollout" in kerv("runs", "show", "last", "results=/tmp/no-such-results").stderr
+
+
+def test_comparison_says_what_differs_in_settings_and_results(results: Path) -> None:
+    grid = next(run["id"] for run in listed(results, "method=spec_vla"))
+    (found,) = json.loads(
+        works("runs", "compare", f"{grid}:spec_vla r=5", f"{grid}:spec_vla r=9", f"results={results}", "--json")
+    )
+    assert found["settings"] == [{"key": "threshold.r", "first": 5, "second": 9}]
+    measures = {row["measure"]: row for row in found["results"]}
+    assert measures["pairs"]["change"] == 2
+    assert measures["success"]["low"] <= measures["success"]["change"] <= measures["success"]["high"]
+    single = next(run["id"] for run in listed(results, "method=ar"))
+    told = works("runs", "diff", single, f"{grid}:spec_vla r=5", f"results={results}")
+    assert "proposer.kind" in told
+    assert kerv("runs", "compare", single, "target/nano-state", f"results={results}").exit_code == 2
+
+
+def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    single = next(run["id"] for run in listed(copy, "method=ar"))
+    assert "2 cells, 2 episodes" in works("runs", "rerun", single, f"results={copy}", "--plan")
+    told = json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))
+    assert (told["episodes"], told["same_tokens"]) == (2, 2)
+    assert told["run"] != single
+    assert "removed" in works("runs", "rm", told["run"], single, "--yes", f"results={copy}")
+    assert listed(copy, "method=ar") == []
+    weights = copy / "artifacts/target/nano-state/target.json"
+    described = json.loads(weights.read_text())
+    shutil.copytree(copy / "artifacts/target/nano-vision", copy / "artifacts/target/other")
+    weights.write_text(json.dumps({**described, "sha256": "0" * 64}))
+    assert kerv("runs", "rerun", "spec_vla", f"results={copy}").exit_code == 1
+
+
+def test_an_interrupted_rollout_goes_on_where_it_was(
+    policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(policies, tmp_path / "results")
+    command = ["rollout", "method=ar", "episodes=3", *FAST, f"results={tmp_path}/results"]
+    original = CellRunner.__call__
+
+    def interrupted(self: CellRunner, cell: Any) -> Callable[[int], Any]:
+        if cell.seeds[0] == 100_001:
+            raise KeyboardInterrupt
+        return original(self, cell)
+
+    monkeypatch.setattr(CellRunner, "__call__", interrupted)
+    stopped = kerv(*command)
+    assert stopped.exit_code == 130
+    assert "1 of 3 episodes are kept" in stopped.stderr
+    monkeypatch.setattr(CellRunner, "__call__", original)
+    assert listed(tmp_path / "results")[0]["state"] == "1 of 3 cells"
+    again = kerv(*command)
+    assert again.exit_code == 0
+    assert "1 of 3 episodes are there" in again.stderr
+    assert len(listed(tmp_path / "results")) == 1
+    assert works(*command)  # complete: the same command is a new run
+    assert len(listed(tmp_path / "results")) == 2
+
+
+def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for command in (["rollout"], ["sweep", "study=demo"], ["demos"], ["train", "target"], ["calibrate"], ["report"]):
+        refused = kerv(*command, f"results={tmp_path}/file/below")
+        assert refused.exit_code == 2, command
+        assert "is a file" in refused.stderr
+    assert list(tmp_path.iterdir()) == [tmp_path / "file"]
+
+
+def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    from kerv_cli.commands.rollout import warn_unseen
+    from kerv_cli.studies.rollout_runs import resolve_rollout
+
+    resolved = resolve_rollout(["method=ar,spec_vla", "task=coffee-button,reach"], multirun=True)
+    warn_unseen(resolved, ("coffee-button-v3", "reach-v3"))
+    line = "kerv: warning: policy mt10-vision was never trained on coffee-button-v3\n"
+    assert capsys.readouterr().err == line
+
+
+# --- commands that are printed ---
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "target", "name=new"),
+        ("train", "drafter", "policy.target=nano-state"),
+        ("rollout", "method=one_pass", *FAST),
+        ("rollout", "method=heisd", *FAST),
+        ("rollout", "method=kerv", *FAST),
+        ("rollout", "policy.target=absent"),
+        ("report",),
+        ("report", "study=main"),
+        ("view",),
+        ("runs", "show", "last"),
+        ("train", "drafter", "zzz.qqq=3"),
+    ],
+)
+def test_a_printed_command_runs_as_it_stands(arguments: tuple[str, ...], policies: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    shutil.copytree(policies, results)
+    refused = kerv(*arguments, f"results={results}")
+    assert refused.exit_code in (1, 2), refused.output
+    printed = re.findall(r"['`](kerv [^'`]+)['`]", refused.stderr)
+    assert printed, refused.stderr
+    for command in printed:
+        words = shlex.split(command)[1:]
+        if "--cfg" not in words:
+            assert f"results={results}" in words, command
+            words += ["--cfg"]
+        told = kerv(*words)
+        assert told.exit_code == 0, f"{command}: {told.output}"
+
+
+def test_the_commands_behind_a_rollout_run_too(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    told = works("rollout", "method=ar", "episodes=1", *FAST, f"results={copy}")
+    (command,) = re.findall(r": (kerv runs show .*)$", told, re.MULTILINE)
+    assert "method=ar" in works(*shlex.split(command)[1:])
+
+
+# --- export ---
+
+
+class Calls(ModuleType):
+    """A stand-in for a tracker's package that notes what is called."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+        def called(*args: Any, **kwargs: Any) -> Any:
+            self.calls.append((name, args, kwargs))
+            return self
+
+        return called
+
+    def __enter__(self) -> Calls:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.calls.append(("end", (), {}))
+
+    @property
+    def summary(self) -> Calls:
+        return self
+
+
+@pytest.mark.parametrize("tracker", ["trackio", "wandb", "mlflow"])
+def test_a_tracker_gets_settings_every_episode_and_the_summary(
+    tracker: str, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = Calls(tracker)
+    monkeypatch.setitem(sys.modules, tracker, fake)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    grid = next(run for run in find_runs(results) if "spec_vla" in run.methods)
+    assert export(grid, tracker, tmp_path) == [f"{grid.id} spec_vla r=5", f"{grid.id} spec_vla r=9"]
+    steps = [kwargs["step"] for _, _, kwargs in fake.calls if "step" in kwargs]
+    assert steps == [0, 1, 0, 1]
+    text = repr(fake.calls)
+    assert "threshold.r" in text
+    assert "forwards_per_step" in text
+
+
+def test_csv_and_a_missing_package(results: Path, tmp_path: Path) -> None:
+    written = works("runs", "export", "target/nano-state", "--dir", str(tmp_path), f"results={results}")
+    assert list(pd.read_csv(written.splitlines()[0])["score"]) == [0.1, 0.3]
+    for name, (package, extra, _) in TRACKERS.items():
+        if package and importlib.util.find_spec(package) is None:
+            refused = kerv("runs", "export", "target/nano-state", "--to", name, f"results={results}")
+            assert refused.exit_code == 2
+            assert f"pip install 'kerv[{extra}]'" in refused.stderr
+
+
+def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
+    from kerv_cli.reporting.curves import save_curves
+
+    folder = tmp_path / "target" / "mine"
+    folder.mkdir(parents=True)
+    shutil.copy(results / "artifacts/target/nano-state/log.csv", folder)
+    assert save_curves(folder).read_bytes().startswith(b"\x89PNG")
