@@ -20,8 +20,9 @@ setup: $(STAMP) ## install kerv and its tools into .venv (CUDA=1: with PyTorch f
 $(STAMP): pyproject.toml requirements/cpu.txt requirements/cuda.txt
 	@PYTHON="$(PYTHON)" CUDA="$(CUDA)" scripts/install.sh $@
 
+# Files stay whole: their fixtures are shared. More than four processes wait for each other's rendering.
 test: lint ## check style and types, then run the tests
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n $$($(BIN)/python -c 'import os; print(min(4, os.cpu_count() or 1))') --dist loadfile
 
 demo: setup ## run the demo study and report it
 	@$(BIN)/kerv sweep study=demo

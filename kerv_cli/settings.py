@@ -128,9 +128,9 @@ class ServeSettings(RunSettings):
     """`kerv serve`: a policy and a method, as in `kerv rollout`, for a client over websockets (docs/serving.md)."""
 
     host: str = "127.0.0.1"  # nobody but this machine; there is no password
-    port: int = 8000  # 0: a free one
-    max_mb: int = 16  # largest message, MiB
-    log_every: int = 100  # answers between two lines of latencies; 0: only at the end of a connection
+    port: int = number(8000, 0, 65_535)  # 0: a free one
+    max_mb: int = number(16, 1, 4096)  # largest message, MiB
+    log_every: int = number(100, 0, 10**9)  # answers between two lines of latencies; 0: only at the end of a connection
     gripper: str = "as_is"  # as_is | signed | signed_inverted: how strict DoFs (0 closed to 1 open) are sent
     task_name: str = ""  # task=NAME: the task, for parts whose levels differ between tasks
     policy: PolicySettings = field(default_factory=PolicySettings)
@@ -142,7 +142,7 @@ class ServeSettings(RunSettings):
     rectifier: Any = field(default_factory=lambda: NoSettings("reinfer"))
     boundary: Any = field(default_factory=lambda: NoSettings("always"))
     skip: Any = field(default_factory=NoSettings)
-    chunk: int = 0
+    chunk: int = number(0, 0, 1024)
     datastore: Any = field(default_factory=lambda: NoSettings("exact"))
 
     def parts(self) -> dict[str, Any]:
@@ -267,10 +267,10 @@ class DemosImportSettings(CommandSettings):
     source: str = ""  # folder of the dataset
     name: str | None = None  # default: the folder's
     camera: str = ""  # which of its images; empty: the first
-    episodes: int = 0  # the first ones; 0: all
+    episodes: int = number(0, 0, 1_000_000)  # the first ones; 0: all
     dofs: str = "own"  # own | openvla: names of the DoFs
     strict: list[str] | None = None  # DoFs that are never relaxed; None: those with gripper in their name
-    tail: int = 8  # copies of the last action behind an episode, for chunks that begin near its end
+    tail: int = number(8, 0, 1024)  # copies of the last action behind an episode, for chunks that begin near its end
 
 
 @dataclass
@@ -316,9 +316,9 @@ class BenchSettings(RunSettings):
 
     model: str = "mt10-vision"  # target=: a policy, or a shape of conf/target with random weights
     dtype: str = "auto"  # of a shape: float32 | bfloat16 | auto, the faster one here; a policy has runtime.dtype
-    repeats: int = 30  # of every measurement; medians and 95th percentiles are over them
-    tokens: list[int] = field(default_factory=lambda: [7, 16])  # N, of a chunk
-    drafter_depth: int = 6  # tokens of the drafter's chain whose time counts in the ceilings
+    repeats: int = number(30, 1, 100_000)  # of every measurement; medians and 95th percentiles are over them
+    tokens: list[int] = field(default_factory=lambda: [7, 16], metadata=limits(1, 1024))  # N, of a chunk
+    drafter_depth: int = number(6, 1, 1024)  # tokens of the drafter's chain whose time counts in the ceilings
 
 
 @dataclass
@@ -326,7 +326,7 @@ class BenchReplaySettings(BenchSettings):
     """`kerv bench replay`: a study's recorded decodes, executed on another target."""
 
     recorded: str = "main"  # study=: whose decodes
-    decodes: int = 40  # of every setting, evenly over tasks and seeds
+    decodes: int = number(40, 1, 1_000_000)  # of every setting, evenly over tasks and seeds
     model: str = "vla-150m"
     profiles: dict[str, str] = field(
         default_factory=dict
@@ -359,12 +359,12 @@ class BuildTargetSettings(RunSettings):
     name: str = "openvla"
     statistics: str | None = None  # data set whose actions it emits; None: the only one
     environment: str | None = None  # whose DoFs, control rate and camera it has; None: OpenVLA's own
-    control_hz: float = 5.0  # control steps per second, without an environment
+    control_hz: float = number(5.0, above=0, most=10_000)  # control steps per second, without an environment
     camera: str = ""  # name of the image it is shown; empty: the environment's first camera, else primary
     prompt: str = "openvla"  # openvla | openvla_v01
     crop: bool = False  # show the central 90 %: for checkpoints fine-tuned with augmented images (LIBERO's)
     int8: bool = False  # the language model's layers with one byte per weight
-    prompt_tokens: int = 64  # longest prompt, without the vision tokens
+    prompt_tokens: int = number(64, 1, 65_536)  # longest prompt, without the vision tokens
 
 
 @dataclass

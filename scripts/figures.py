@@ -55,6 +55,10 @@ def _interval(row: Row, name: str, form: str, scale: float = 1.0, between: str =
     return f"{value} ({low}{between}{high})" if value and low else value
 
 
+def _ratio(row: Row, name: str) -> str:
+    return "1" if row["label"] == row.get("baseline") else _interval(row, name, ".2f")
+
+
 def _own(text: Callable[[Row], str]) -> Callable[[Row], str]:
     """Empty for the baseline, which is not compared with itself."""
     return lambda row: "" if row["label"] == row["baseline"] else text(row)
@@ -83,9 +87,9 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "lost/won": ("lost / won, p", _own(_lost_won)),
     "difference": ("difference, points", _own(lambda row: _interval(row, "difference", "+.1f", 100, " to "))),
     "non-inferior": ("non-inferior", _own(lambda row: {"True": "yes", "False": "no"}.get(row["non_inferior"], ""))),
-    "pairs": ("pairs to settle", _own(lambda row: _number(row, "pairs_to_settle", ".0f"))),
-    "speedup": ("speedup", lambda row: _interval(row, "speedup", ".2f")),
-    "per-episode": ("per episode", lambda row: _interval(row, "episode_speedup", ".2f")),
+    "pairs": ("pairs to settle", _own(lambda row: _number(row, "pairs_to_settle", ".0f").replace("inf", "∞"))),
+    "speedup": ("speedup", lambda row: _ratio(row, "speedup")),
+    "per-episode": ("per episode", lambda row: _ratio(row, "episode_speedup")),
     "ceiling": ("ceiling", lambda row: _number(row, "ceiling", ".1f")),
     "ms": ("ms per step", lambda row: _number(row, "time_per_step_ms", ".2f")),
     "ms-episode": ("ms per episode", lambda row: _number(row, "time_per_episode_ms", ".0f")),

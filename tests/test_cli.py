@@ -128,9 +128,14 @@ def test_rollout_prints_figures_and_writes_a_recording(policies: Path, tmp_path:
 def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     shutil.copytree(policies, results)
+    study = tmp_path / "small.yaml"
+    study.write_text(
+        "title: Small\nbaseline: ar\naxis: threshold.r\n"
+        "settings:\n  ar: method=ar\n  spec_vla: method=spec_vla threshold.r=0,3,5,9,15,20\n"
+    )
     command = [
         "sweep",
-        "study=demo",
+        f"study={study}",
         "task=reach-v3",
         *FAST,
         "policy=state",
@@ -143,15 +148,15 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
     assert first.returncode == 0, first.stderr
     assert "7 cells run, 0 reused, 0 failed" in first.stdout
     assert re.search(r"\d+ episodes in \d+\.\d min: \d+ per minute", first.stdout)
-    cells = sorted((results / "studies/demo/cells").iterdir())
+    cells = sorted((results / "studies/small/cells").iterdir())
     shutil.rmtree(cells[0])
     assert "1 cells run, 6 reused, 0 failed" in kerv(*command).stdout
-    told = kerv("report", "study=demo", f"results={results}")
+    told = kerv("report", "study=small", f"results={results}")
     assert told.returncode == 0, told.stderr
-    table = pd.read_csv(results / "report/tables/demo.csv")
+    table = pd.read_csv(results / "report/tables/small.csv")
     assert set(table["averaging"]) == {"micro over tasks", "macro over difficulty groups"}
     assert {"ar", "spec_vla r=0", "spec_vla r=20"} <= set(table["label"])
-    assert list((results / "report/plots").glob("demo*.png"))
+    assert list((results / "report/plots").glob("small*.png"))
 
 
 def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:

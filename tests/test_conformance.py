@@ -102,7 +102,7 @@ def test_doctor_checks_a_policy_on_disk(policies: Path) -> None:
     assert run.exit_code == 0, run.output
     assert "tree attention" in run.output
     run = CliRunner().invoke(app, ["doctor", "target=nothing", f"results={policies}"])
-    assert run.exit_code == 1
+    assert run.exit_code == 2
     assert "kerv: no target 'nothing'" in run.output
 
 

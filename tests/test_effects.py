@@ -37,5 +37,5 @@ def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
     written = {"a": "method=ar threshold.r=3", "b": "method=spec_vla"}
     settings = {label: compose("rollout", text.split(), RolloutSettings) for label, text in written.items()}
     common = ("acceptance=relaxed", "policy.early=mine", "runtime.workers=2")
-    found = idle_overrides(ResolvedStudy(StudySettings(), settings, written, common))
+    found = idle_overrides(ResolvedStudy(StudySettings(), settings, written, common=common))
     assert list(found) == ["a: threshold.r=3", "policy.early=mine"]

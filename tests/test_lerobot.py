@@ -114,7 +114,7 @@ def test_a_recording_cannot_be_rolled_out(results: Path) -> None:
     both(results)
     words = ["rollout", "task=BACK", "policy.target=rec", "method=ar", "episodes=1", "world.camera.size=56"]
     code, line = kerv(*words, f"results={results}")
-    assert code == 2
+    assert code == 2, line
     assert "back is a recording: nothing can be executed in it" in line
 
 

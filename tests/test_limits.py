@@ -27,6 +27,14 @@ SCHEMAS = {
     "doctor": s.DoctorSettings,
     "build_datastore": s.BuildDatastoreSettings,
     "calibrate": s.CalibrateSettings,
+    "demos_export": s.DemosExportSettings,
+    "demos_import": s.DemosImportSettings,
+    "build_target": s.BuildTargetSettings,
+    "build_drafter": s.BuildDrafterSettings,
+    "bench": s.BenchSettings,
+    "bench_replay": s.BenchReplaySettings,
+    "serve": s.ServeSettings,
+    "report": s.ReportSettings,
 }
 
 

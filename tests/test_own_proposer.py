@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from examples import own_proposer
 from examples.own_proposer_table import FollowProposer, FollowTable, save
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
@@ -180,7 +179,7 @@ def test_it_is_a_choice_like_any_other() -> None:
     with pytest.raises(KervError, match="did you mean follow"):
         compose("rollout", ["proposer=folow"], RolloutSettings)
     with pytest.raises(UsageError, match=r"proposer\.depth=-1"):
-        own_proposer.check(own_proposer.FollowSettings(depth=-1))
+        compose("rollout", ["proposer=follow", "proposer.depth=-1"], RolloutSettings)
 
 
 def test_the_command_knows_it_without_loading_anything_heavy() -> None:

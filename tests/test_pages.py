@@ -55,7 +55,7 @@ def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -
         "<!-- figure small macro one_pass speedup -->9<!-- /figure -->.\n"
     )
     filled = figures.filled(page)
-    assert "| ar | 9/10 |  | 1.00 |\n" in filled
+    assert "| ar | 9/10 |  | 1 |\n" in filled
     assert "| one pass | 8/10 | 2 / 1, 0.5 | 2.04 (1.97–2.11) |\n" in filled
     assert "-->2.04 (1.97–2.11)<!-- /figure -->×" in filled
     assert "-->3.00 (2.00–4.00)<!--" in filled

@@ -71,7 +71,7 @@ def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
         for label in episode.labels[episode.steps :]:
             assert expert(observation).astype(np.float32).tobytes() == label.tobytes()
             observation = world.step(expert(observation))
-    assert episode.frames.tobytes() == np.stack(frames).tobytes()
+    assert np.asarray(episode.frames).tobytes() == np.stack(frames).tobytes()
 
 
 def test_an_episodes_arrays_fit_together(recorded):

@@ -15,7 +15,7 @@ from kerv_cli.artifacts import Artifacts
 from kerv_cli.config import compose, groups
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.runtime import DTYPES, set_up
 from kerv_cli.settings import (
     BenchSettings,
@@ -126,7 +126,7 @@ def open_model(settings: BenchSettings) -> Model:
             settings.results, PolicySettings(target=settings.model), None, device, settings.runtime.dtype
         )
         target: Any = artifacts.target
-    except CheckpointError as error:
+    except UsageError as error:
         if "/" not in settings.model and "is damaged" not in str(error):
             raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
         raise

@@ -75,8 +75,6 @@ def check(settings: BenchSettings) -> None:
         raise UsageError(f"repeats={settings.repeats}: at least 3, medians are over them")
     if not settings.tokens or min(settings.tokens) < 3 or max(settings.tokens) > 256:
         raise UsageError(f"tokens={settings.tokens}: chunks of 3 to 256 tokens, e.g. tokens=[7,16]")
-    if settings.drafter_depth < 1:
-        raise UsageError(f"drafter_depth={settings.drafter_depth}: at least 1")
 
 
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:

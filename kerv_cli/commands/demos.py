@@ -90,6 +90,10 @@ def _import(words: list[str], cfg: bool) -> None:
     from kerv_cli.places import artifact
 
     _check_format(settings.format)
+    if not settings.source:
+        from kerv_cli.errors import UsageError
+
+        raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
     with progress_bar("import") as advance:
         manifest = import_lerobot(settings, folder, advance)

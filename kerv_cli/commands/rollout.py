@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from kerv_cli.studies.plan import Cell
     from kerv_cli.studies.resolve import ResolvedStudy
     from kerv_cli.studies.store import StudyStore
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
@@ -150,15 +153,20 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
 
 
 class _Remembering:
-    """A CellRunner of this process that keeps the error of a setting that cannot be built, with its exit code."""
+    """A CellRunner of this process that keeps the error of a setting that cannot be built or run, with its exit
+    code."""
 
     def __init__(self, runner: CellRunner) -> None:
         self.runner = runner
         self.error: KervError | None = None
 
     def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
+        run = self._kept(self.runner, cell)
+        return lambda seed: self._kept(run, seed)
+
+    def _kept(self, call: Callable[[A], B], argument: A) -> B:
         try:
-            return self.runner(cell)
+            return call(argument)
         except KervError as error:
             self.error = error
             raise

@@ -7,7 +7,7 @@ import numpy as np
 from kerv_cli.artifacts import Artifacts
 from kerv_cli.decoding.build import check, compose, needs
 from kerv_cli.decoding.decoder import Decoder
-from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.errors import UnknownName
 from kerv_cli.registry import find
 from kerv_cli.runtime import set_up
 from kerv_cli.serving.session import GRIPPERS, Interface, Session
@@ -25,9 +25,6 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
     """
     if settings.gripper not in GRIPPERS:
         raise UnknownName("gripper", settings.gripper, GRIPPERS)
-    if not 0 <= settings.port < 2**16 or settings.max_mb < 1 or settings.log_every < 0:
-        numbers = f"port={settings.port} max_mb={settings.max_mb} log_every={settings.log_every}"
-        raise UsageError(f"{numbers}: a port is 0 to 65535, max_mb at least 1, log_every 0 or more")
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
     described, method = artifacts.description, settings.parts()

@@ -92,8 +92,9 @@ def plan_from_text(text: str) -> StudyPlan:
     found = read(_File, read_yaml(text), "the plan")
     for label in found.labels.values():
         read(RolloutSettings, label.settings, "the plan")
-        if any(not isinstance(label.settings.get(kind), dict) for kind in METHOD_KINDS):
-            raise ValueError(f"a label has no {' or no '.join(METHOD_KINDS)}")
+        wrong = [kind for kind in METHOD_KINDS if not isinstance(label.settings.get(kind, {}), dict)]
+        if wrong or not label.settings.keys() & set(METHOD_KINDS):
+            raise ValueError(f"a label has no settings of {' or '.join(wrong or METHOD_KINDS)}")
     unknown = {line.label for line in found.cells} - set(found.labels)
     if unknown or found.baseline not in found.labels:
         raise ValueError(f"it has no label {', '.join(sorted(unknown)) or found.baseline}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kerv_cli.errors import UsageError
+from kerv_cli.limits import number
 from kerv_cli.parts import PREFILL
 from kerv_cli.registry import Part, register
 
@@ -20,13 +20,7 @@ class FollowSettings:
     """What most often followed an action, one control step later."""
 
     kind: str = "follow"
-    depth: int = 0  # tokens drafted at once; 0: all that are left
-
-
-def check(settings: FollowSettings) -> None:
-    """Raises UsageError for a number out of range."""
-    if settings.depth < 0:
-        raise UsageError(f"proposer.depth={settings.depth}: at least 0")
+    depth: int = number(0, 0, 1024)  # tokens drafted at once, with its range; 0: all that are left
 
 
 register(Part("artifact", "follow", "examples.own_proposer_table:ARTIFACT"))
@@ -37,7 +31,6 @@ register(
         "examples.own_proposer_table:build",
         FollowSettings,
         lambda settings: ("follow",),
-        check,
         colour=0x7A9E2F,
         traits={"when": PREFILL, "chains": True},
     )

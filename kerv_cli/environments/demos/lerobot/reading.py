@@ -112,10 +112,6 @@ def import_lerobot(
         UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
             episode is damaged. KervError: a video, and no package av.
     """
-    if not settings.source:
-        raise UsageError("source=DIR: name the folder of a LeRobot dataset")
-    if settings.tail < 0 or settings.episodes < 0:
-        raise UsageError(f"tail={settings.tail} episodes={settings.episodes}: from 0 on")
     if folder.exists() and any(folder.iterdir()):
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
     source = Source.open(Path(settings.source).expanduser(), settings.camera)
