@@ -256,6 +256,8 @@ def test_an_interrupted_installation_leaves_no_stamp(checkout: Checkout) -> None
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
+        # a test run in the background of a shell ignores interrupts, and so would its children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while not checkout.log and time.monotonic() < deadline:
