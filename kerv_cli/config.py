@@ -18,6 +18,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from kerv_cli import registry
 from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.files import read_yaml
 from kerv_cli.limits import check_settings
 from kerv_cli.parts import PART_GROUPS, PREFILL, part_of
 from kerv_cli.settings import DERIVED_FROM
@@ -217,20 +218,18 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
     Raises:
         UsageError: the file cannot be read, or is no method.
     """
-    import yaml
-
     files = [word for word in overrides if word.startswith("method=") and word.endswith((".yaml", ".yml"))]
     if not files:
         return list(overrides), None
     path = Path(files[-1].split("=", 1)[1]).expanduser()
     try:
-        value = yaml.safe_load(path.read_text(encoding="utf-8"))
+        value = read_yaml(path.read_text(encoding="utf-8"))
         chosen = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
         parts = {key.removeprefix("override /"): name for choice in chosen for key, name in choice.items()}
         words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
     except OSError as error:
         raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, AttributeError, TypeError) as error:
+    except (ValueError, AttributeError, TypeError) as error:
         raise UsageError(f"method={path} is no method: see conf/method/kerv.yaml for one") from error
     rest = [word for word in overrides if word not in files]
     given = {word.split("=", 1)[0] for word in rest}

@@ -9,6 +9,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -183,12 +184,28 @@ def read_yaml(text: str) -> Any:
     """
     import yaml
 
+    check_nesting(text)
     try:
         value = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError(f"not YAML: {error}") from error
     check_shape(value)
     return value
+
+
+def check_nesting(text: str, depth: int = 1000) -> None:
+    """Refuses a YAML text that is nested so deep that a parser would run out of its stack.
+
+    Raises:
+        ValueError: more than `depth` open brackets, or a line that begins with more indentation than that.
+    """
+    opened = 0
+    for bracket in re.findall(r"[\[\]{}]", text) if text.count("[") + text.count("{") > depth else ():
+        opened = opened + 1 if bracket in "[{" else max(0, opened - 1)
+        if opened > depth:
+            raise ValueError(f"nested more than {depth} deep")
+    if re.search(rf"^[ \t?:-]{{{depth}}}", text, re.MULTILINE):
+        raise ValueError(f"nested more than {depth} deep")
 
 
 def to_yaml(value: Any, **options: Any) -> str:

@@ -119,3 +119,11 @@ def test_deep_and_endless_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="more than"):
         read_yaml(BOMB)
     assert read_yaml("a: &x [1]\nb: *x") == {"a": [1], "b": [1]}
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000 + "]" * 100_000, "- " * 100_000 + "1", "\n".join(" " * i + "a:" for i in range(3000))]
+)
+def test_what_is_nested_without_end_is_refused_before_a_parser_sees_it(text: str) -> None:
+    with pytest.raises(ValueError, match="nested more than 1000 deep"):
+        read_yaml(text)

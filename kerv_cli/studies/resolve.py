@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from kerv_cli.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
 from kerv_cli.effects import without_effect
 from kerv_cli.environments import resolve_tasks, settled, spec_of
 from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.files import read_yaml
 from kerv_cli.manifests import read
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
 
@@ -83,8 +82,8 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
         return list(overrides), None
     path = Path(paths[-1]).expanduser()
     try:
-        value = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+        value = read_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or "it is not YAML"
         raise UsageError(f"study={path} cannot be read: {why}") from error
     if not isinstance(value, dict):
