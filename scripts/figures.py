@@ -5,6 +5,8 @@
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
     <!-- errors prediction_mt10-vision -->           becomes a table of the predictors' errors by steps ahead
     <!-- /errors -->
+    <!-- replay replay_main_vla-150m 16 -->         becomes a table of replayed decodes of N tokens
+    <!-- /replay -->
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
 instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space.
@@ -23,6 +25,7 @@ TABLES = Path(__file__).resolve().parent.parent / "results" / "tables"
 _TABLE = re.compile(r"(<!-- table (\S+)((?: \S+)*?): ([^>]*?) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 _FIGURE = re.compile(r"(<!-- figure (\S+)( macro)? (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
 _ERRORS = re.compile(r"(<!-- errors (\S+) -->\n)(.*?)(<!-- /errors -->)", re.DOTALL)
+_REPLAY = re.compile(r"(<!-- replay (\S+) (\d+) -->\n)(.*?)(<!-- /replay -->)", re.DOTALL)
 
 Row = Mapping[str, str]
 
@@ -158,6 +161,25 @@ def error_table(name: str) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
+def replay_table(name: str, tokens: str) -> str:
+    """Decodes of one N that `kerv bench replay` executed: a row per setting."""
+    lines = [["setting", "forwards", "ms per decode", "speedup", "cost model"], ["---"] * 5]
+    for row in (row for row in table_of(name, macro=False) if row["tokens"] == tokens):
+        speedup = f"{_number(row, 'speedup', '.2f')} ({_number(row, 'low', '.2f')}–{_number(row, 'high', '.2f')})"
+        lines.append(
+            [
+                row["label"],
+                _number(row, "forwards", ".2f"),
+                _number(row, "seconds", ".1f", 1000),
+                "1" if row["label"] == "ar" else speedup,
+                _number(row, "model", ".2f"),
+            ]
+        )
+    if len(lines) == 2:
+        raise BadReference(f"{name} has no decodes of {tokens} tokens")
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
 def filled(text: str) -> str:
     """A page with its tables and figures renewed.
 
@@ -166,6 +188,7 @@ def filled(text: str) -> str:
     """
     text = _TABLE.sub(lambda m: m[1] + markdown_table(m[2], m[3].split(), m[4].split()) + m[6], text)
     text = _ERRORS.sub(lambda m: m[1] + error_table(m[2]) + m[4], text)
+    text = _REPLAY.sub(lambda m: m[1] + replay_table(m[2], m[3]) + m[5], text)
     return _FIGURE.sub(lambda m: m[1] + figure(m[2], bool(m[3]), m[4], m[5]) + m[7], text)
 
 

@@ -74,6 +74,16 @@ def test_errors_are_averaged_over_the_dofs_that_differ(figures: Any, tmp_path: P
     assert "| hold | 0.3000 |\n| line | 0.1500 (50 %) |\n" in filled
 
 
+def test_replayed_decodes_of_one_length(figures: Any, tmp_path: Path) -> None:
+    rows = ("tokens,label,forwards,seconds,speedup,low,high,model", "7,ar,7,0.2,1,1,1,1", "16,sd,2,0.05,4,3.5,4.5,3.9")
+    (tmp_path / "replay.csv").write_text("\n".join(rows), encoding="utf-8")
+    filled = figures.filled("<!-- replay replay 16 -->\n<!-- /replay -->")
+    assert "| sd | 2.00 | 50.0 | 4.00 (3.50–4.50) | 3.90 |\n" in filled
+    assert "| ar |" not in filled
+    with pytest.raises(figures.BadReference, match="no decodes of 5 tokens"):
+        figures.filled("<!-- replay replay 5 -->\n<!-- /replay -->")
+
+
 def test_only_some_settings(figures: Any) -> None:
     filled = figures.filled("<!-- table small only=one_pass: setting -->\n<!-- /table -->")
     assert "one pass" in filled
