@@ -64,7 +64,7 @@ def rollout(
         print_notes(without_effect(settings, resolved.overrides[label].split()))
     first = next(iter(resolved.settings.values()))
     check_writable(first.results)
-    cells = _cells(resolved, resolve_tasks(first.task))
+    cells = planned_cells(resolved)
     if plan:
         total = sum(len(cell.seeds) for cell in cells)
         names = ", ".join(resolved.settings)
@@ -75,13 +75,16 @@ def rollout(
     _tell(store, cells, as_json, in_same(words))
 
 
-def _cells(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> list[Cell]:
-    """The run's cells, after everything that can be refused without running was."""
+def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
+    """The cells of a study, after everything that can be refused without running was."""
+    from kerv_cli.environments import resolve_tasks
+
+    study = resolved.study
+    tasks = resolve_tasks(next(iter(resolved.settings.values())).task)
     with at_work("loading the policy"):
         from kerv_cli.rollouts.policy import check, identity_of
         from kerv_cli.runtime import set_up
         from kerv_cli.studies.plan import plan as plan_cells
-        from kerv_cli.studies.rollout_runs import EPISODES_PER_CELL
 
         for settings in resolved.settings.values():
             check(settings)
@@ -91,9 +94,10 @@ def _cells(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> list[Cell]:
         resolved.settings,
         tasks,
         identity_of,
-        baseline=resolved.study.baseline,
+        baseline=study.baseline,
         overrides=resolved.overrides,
-        block=EPISODES_PER_CELL,
+        block=study.block,
+        repeats=study.repeats,
     )
 
 

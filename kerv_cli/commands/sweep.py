@@ -11,7 +11,6 @@ from kerv_cli.commands.common import (
     Overrides,
     ShowConfig,
     ShowPlan,
-    at_work,
     called,
     console,
     edge,
@@ -39,6 +38,7 @@ def sweep(
     overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
     """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused."""
+    from kerv_cli.commands.rollout import planned_cells
     from kerv_cli.config import to_yaml
     from kerv_cli.places import check_writable
     from kerv_cli.studies.executors import check_executor
@@ -55,41 +55,15 @@ def sweep(
     print_notes(idle_overrides(resolved))
     check_executor(first.runtime)
     check_writable(first.results)
-    cells, store = _cells(resolved)
+    cells = planned_cells(resolved)
+    from kerv_cli.studies.store import StudyStore
+
+    store = StudyStore(first.results, resolved.study.name)
     if plan:
         _print_plan(cells, store, first.runtime.workers)
         return
     outcome = _run(resolved, cells, store, words)
     _tell(outcome, resolved, cells, store, words, as_json)
-
-
-def _cells(resolved: ResolvedStudy) -> tuple[list[Cell], StudyStore]:
-    """The study's cells and where they are stored, after everything that can be refused without running was."""
-    from kerv_cli.commands.rollout import warn_unseen
-    from kerv_cli.environments import resolve_tasks
-
-    first, study = next(iter(resolved.settings.values())), resolved.study
-    tasks = resolve_tasks(first.task)
-    with at_work("loading the policy"):
-        from kerv_cli.rollouts.policy import check, identity_of
-        from kerv_cli.runtime import set_up
-        from kerv_cli.studies.plan import plan as plan_cells
-        from kerv_cli.studies.store import StudyStore
-
-        for settings in resolved.settings.values():
-            check(settings)
-            settings.runtime.device, _ = set_up(settings.runtime)
-    warn_unseen(resolved, tasks)
-    cells = plan_cells(
-        resolved.settings,
-        tasks,
-        identity_of,
-        baseline=study.baseline,
-        overrides=resolved.overrides,
-        block=study.block,
-        repeats=study.repeats,
-    )
-    return cells, StudyStore(first.results, study.name)
 
 
 def _print_plan(cells: list[Cell], store: StudyStore, workers: int) -> None:

@@ -44,7 +44,8 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
         label = " ".join([composed.method, *values])
         settings[label], written[label] = composed, " ".join(point)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
-    return ResolvedStudy(StudySettings(name="rollout", title="", baseline=baseline), settings, written)
+    study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
+    return ResolvedStudy(study, settings, written)
 
 
 def _value(point: Sequence[str], key: str) -> str:
