@@ -12,7 +12,7 @@ from rich.table import Table
 from kerv_cli.errors import UsageError
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.summary import number
-from kerv_cli.reporting.tables import is_number, rows_of
+from kerv_cli.reporting.tables import is_number, rows_of, values_of
 
 CLOSE = 0.03
 """Two runs agree on a ratio where it differs by at most this share."""
@@ -30,7 +30,7 @@ def agreement_table(own: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
     """
     if set(own["baseline"]) != set(other["baseline"]):
         raise UsageError(f"two runs with the baselines {own['baseline'].iloc[0]} and {other['baseline'].iloc[0]}")
-    if _runs(own) & _runs(other):
+    if values_of(own, "run") & values_of(other, "run"):
         raise UsageError(f"both hold episodes of run {own['run'].iloc[0]}: compare with another run's results folder")
     keys = ["averaging", "label", "baseline"]
     columns = [*keys, *_KEPT, *_FROM]
@@ -44,10 +44,6 @@ def agreement_table(own: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
     both.insert(3, "close", (ratio - 1).abs() <= CLOSE)
     both.insert(4, "overlap", overlap)
     return both
-
-
-def _runs(table: pd.DataFrame) -> set[str]:
-    return {run for text in table["run"].astype(str) for run in text.split(";")}
 
 
 def agreement_summary(table: pd.DataFrame, averaging: str = MICRO) -> Table:

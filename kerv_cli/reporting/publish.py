@@ -6,7 +6,7 @@ from __future__ import annotations
 import pandas as pd
 
 from kerv_cli.errors import KervError
-from kerv_cli.reporting.tables import StudyData
+from kerv_cli.reporting.tables import StudyData, values_of
 
 
 class Unpublishable(KervError):
@@ -19,13 +19,13 @@ def refusals(table: pd.DataFrame) -> list[str]:
     table: `study_table`, with labels in `label` and several values of a column joined by semicolons.
     """
     found = []
-    commits = {commit for text in table["git_commit"].astype(str) for commit in text.split(";")}
+    commits = values_of(table, "git_commit")
     if any(commit.endswith("+changes") or commit in ("none", "nan", "") for commit in commits):
         found.append("some cells were computed by code that is not committed")
     if len(commits) > 1:
         found.append(f"its cells are of {len(commits)} commits")
     for column, what in (("host", "machines"), ("device_name", "devices")):
-        names = {name for text in table[column].astype(str) for name in text.split(";")}
+        names = values_of(table, column)
         if len(names) > 1:
             found.append(f"its cells are of {len(names)} {what}")
     compared = table[(table["label"] != table["baseline"]) & (table["pairs"] > 0)]

@@ -211,6 +211,11 @@ def _joined(values: Iterable[Any]) -> str:
     return ";".join(dict.fromkeys(str(value) for value in values))
 
 
+def values_of(table: pd.DataFrame, column: str) -> set[str]:
+    """The values of a column whose rows join several by semicolons."""
+    return {value for text in table[column].astype(str) for value in text.split(";")}
+
+
 def csv_text(table: pd.DataFrame) -> str:
     """CSV with six significant digits; empty where a value does not exist."""
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
