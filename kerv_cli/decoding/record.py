@@ -105,9 +105,8 @@ class EpisodeRecord:
     initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that begin alike
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
     wall_seconds: float = 0.0  # whole episode, simulation and rendering included
-    places: dict[str, np.ndarray] = field(
-        default_factory=dict
-    )  # object, goal, … -> (T + 1, 3) metres, only where logged
+    # object, goal, … -> (T + 1, 3) metres, only where logged
+    places: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def seconds(self) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -32,25 +32,26 @@ class SkipLevels:
             raise UsageError(f"verify-skip: s_min {self.s_min} does not lie in {self.low}…{self.high}")
 
 
-class Skip(Protocol):
+class Skip(ABC):
     """Decides, before the target verifies anything, whether a chunk is executed as it is. phase: of its time."""
 
-    phase: str
+    phase = "propose"
 
-    def reset(self) -> None:
+    def reset(self) -> None:  # noqa: B027 - most rules keep nothing between decodes
         """A new episode begins."""
 
-    def finish(self, success: bool) -> None:
+    def finish(self, success: bool) -> None:  # noqa: B027
         """An episode ended."""
 
+    @abstractmethod
     def take(self, chunk: Chunk) -> bool:
         """Completes the chunk, if it may be executed unverified -> whether it did."""
 
-    def verified(self, chunk: Chunk) -> None:
+    def verified(self, chunk: Chunk) -> None:  # noqa: B027
         """Told when the prefill of a chunk that was not taken has judged the in-prefill draft."""
 
 
-class ParallelPass:
+class ParallelPass(Skip):
     """Decodes all tokens by one bidirectional pass of a parallel target, as OpenVLA-OFT does (§6): each is chosen
     without knowing the others, and none is verified."""
 
@@ -58,12 +59,6 @@ class ParallelPass:
 
     def __init__(self, target: ParallelTarget) -> None:
         self.target = target
-
-    def reset(self) -> None:
-        """Nothing is kept between decodes."""
-
-    def finish(self, success: bool) -> None:
-        """Nothing is kept between episodes."""
 
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`; always."""
@@ -73,24 +68,13 @@ class ParallelPass:
         chunk.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, chunk.size, 0, ()), tokens)
         return True
 
-    def verified(self, chunk: Chunk) -> None:
-        """Nothing is learnt from a verification."""
 
-
-class AlwaysSkip:
+class AlwaysSkip(Skip):
     """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
     whole chunk yet, the target decodes."""
 
-    phase = "propose"
-
     def __init__(self, source: DraftsChunks) -> None:
         self.source = source
-
-    def reset(self) -> None:
-        """Nothing is kept between decodes."""
-
-    def finish(self, success: bool) -> None:
-        """Nothing is kept between episodes."""
 
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`."""
@@ -100,16 +84,11 @@ class AlwaysSkip:
         chunk.skip(chains[0], self.source.name)
         return True
 
-    def verified(self, chunk: Chunk) -> None:
-        """Nothing is learnt from a verification."""
 
-
-class StreakSkip:
+class StreakSkip(Skip):
     """Executes drafts unverified for as long as verification keeps agreeing (§4.5): a chunk whose draft agrees with the
     target's tokens allows one unverified decode before the next verification, the next one in a row two, then four, up
     to `most`; a chunk that does not agree ends it. An episode begins with a verification."""
-
-    phase = "propose"
 
     def __init__(self, settings: StreakSkipSettings, source: DraftsChunks) -> None:
         self.settings, self.source = settings, source
@@ -119,9 +98,6 @@ class StreakSkip:
     def reset(self) -> None:
         """A new episode begins."""
         self.allowed = self.left = 0
-
-    def finish(self, success: bool) -> None:
-        """Nothing is kept between episodes."""
 
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`."""
@@ -155,7 +131,7 @@ class StreakSkip:
         return bool(off.mean() <= self.settings.tolerance)
 
 
-class VerifySkip:
+class VerifySkip(Skip):
     """Executes the best neighbour's chunk without verification where its similarity is at least s_min.
 
     At most `max_skips` decodes in a row; where a boundary decides, only on retrieval's side; and after a stored episode
@@ -163,8 +139,6 @@ class VerifySkip:
     0 s_min carries over between episodes: after a failure it rises by `up` times the calibrated range, after a success
     it falls by `down` times it. Results then depend on the order of episodes and on the evaluator's flag.
     """
-
-    phase = "propose"
 
     def __init__(self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:
         self.settings, self.retrieval, self.levels = settings, retrieval, levels
@@ -198,6 +172,3 @@ class VerifySkip:
             self.ended.add(seed)
         chunk.skip(found.chunks[0].tolist(), self.retrieval.name)
         return True
-
-    def verified(self, chunk: Chunk) -> None:
-        """Nothing is learnt from a verification."""
