@@ -10,17 +10,18 @@ from pathlib import Path
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import write_folder
 from kerv_cli.studies.plan import Block
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.studies.store import STUDIES, StudyStore
 
 
 def adopt(store: StudyStore, block: Block) -> bool:
     """Copies a block's cells from a study that measured all of them in one run -> whether there is one. A block is
-    taken over whole or not at all: with single cells of it the sides of a ratio would come from different runs.
+    taken over whole or not at all: with single cells of it the sides of a ratio would come from different runs. A
+    rollout takes over nothing: it was asked for in order to be run.
 
     Raises:
         StorageError: the disk refused.
     """
-    if all((store.cells / cell.id).exists() for cell in block.cells):
+    if store.family != STUDIES or all((store.cells / cell.id).exists() for cell in block.cells):
         return False
     here = _runs(store, block)
     for other in _others(store):
@@ -43,7 +44,7 @@ def _runs(store: StudyStore, block: Block) -> dict[str, str]:
     found = {}
     for cell in block.cells:
         try:
-            if store.has_cell(cell.id):
+            if (store.cells / cell.id).exists():
                 found[cell.id] = str(store.status_of(cell.id)["run"])
         except (CheckpointError, KeyError):
             continue
