@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.demos.frames import EncodedFrames, encode_png
+from kerv_cli.environments.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import atomic_path
 from kerv_cli.spaces import ActionSpace, ObservationSpace
@@ -20,7 +19,6 @@ from kerv_cli.spaces import ActionSpace, ObservationSpace
 FORMAT = 1
 """Format of episode files."""
 _INITIAL_STATE = "rand_vec"  # name of the tensor in format 1, taken from Meta-World
-_LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
 
 
 @dataclass(frozen=True)
@@ -90,12 +88,11 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
 def _with_sorted_metadata(data: bytes) -> bytes:
     """The same safetensors bytes with the metadata's keys in order. safetensors writes them in random order, so that
     the files of two recordings of one episode would have different hashes."""
-    start = _LENGTH.size + _LENGTH.unpack_from(data)[0]
-    header = json.loads(data[_LENGTH.size : start])
+    header, start = header_of(data)
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
-    return _LENGTH.pack(len(text)) + text + data[start:]
+    return LENGTH.pack(len(text)) + text + data[start:]
 
 
 def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace) -> DemoEpisode:

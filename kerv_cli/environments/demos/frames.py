@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kerv_cli.errors import CheckpointError
 
-_LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
+LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's length
 
 
 class EncodedFrames:
@@ -43,11 +43,11 @@ class EncodedFrames:
         """
         try:
             mapped = np.memmap(path, dtype=np.uint8, mode="r")
-            header = _LENGTH.unpack(bytes(mapped[: _LENGTH.size]))[0]
-            first, last = json.loads(bytes(mapped[_LENGTH.size : _LENGTH.size + header]))["png"]["data_offsets"]
+            header, begin = header_of(mapped)
+            first, last = header["png"]["data_offsets"]
         except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
             raise CheckpointError(f"{path} is missing or damaged: {error}") from error
-        places = offsets + _LENGTH.size + header + first
+        places = offsets + begin + first
         if len(offsets) < 1 or (np.diff(offsets) <= 0).any() or offsets[0] < 0 or offsets[-1] > last - first:
             raise CheckpointError(f"{path} is damaged: its frames lie outside their tensor")
         return cls([mapped], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size)
@@ -111,6 +111,16 @@ class EncodedFrames:
                 return np.array(image)  # a copy: torch warns of memory that may not be written to
         except (OSError, SyntaxError, ValueError) as error:
             raise CheckpointError(f"a frame of the demonstrations is damaged: {error}") from error
+
+
+def header_of(data: bytes | NDArray[np.uint8]) -> tuple[dict[str, Any], int]:
+    """The header of a safetensors file, and where its arrays begin; data: the file's bytes.
+
+    Raises:
+        struct.error, ValueError: it has none.
+    """
+    begin = LENGTH.size + LENGTH.unpack(bytes(data[: LENGTH.size]))[0]
+    return json.loads(bytes(data[LENGTH.size : begin])), begin
 
 
 def encode_png(frame: NDArray[np.uint8]) -> bytes:
