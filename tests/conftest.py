@@ -3,11 +3,28 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered_environments() -> Iterator[None]:
+    """Environments that a module's recordings register are gone when the module ends.
+
+    Opening a dataset of a recording registers its environment for the process, and which modules share
+    a process is decided anew in every parallel run.
+    """
+    from kerv_cli import registry
+
+    registry.load_plugins()
+    known = dict(registry.parts("environment"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(registry._PARTS, "environment", known)
+        yield
 
 
 def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> None:
