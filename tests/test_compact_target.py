@@ -26,12 +26,13 @@ from kerv_cli.errors import CheckpointError, UnknownName
 from kerv_cli.places import shipped_dir
 from kerv_cli.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.spaces import Observation, ObservationSpace, Place
+from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.targets.compact.trunk import Trunk, attention_mask
+from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.training import runs
 from kerv_cli.training.imitation import Imitation, imitation_job, load_samples, new_target
 from kerv_cli.training.loop import Loop

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from kerv_cli.decoding.acceptance import accept_by_distance
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge, visible_in_prefill, visible_in_verification
-from kerv_cli.targets.compact.trunk import Cache, Trunk, attention_mask
+from kerv_cli.targets.attention import attention_mask
+from kerv_cli.targets.compact.trunk import Cache, Trunk
 
 
 @st.composite

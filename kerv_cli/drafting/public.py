@@ -18,11 +18,12 @@ from torch import Tensor, nn
 from kerv_cli.errors import CheckpointError, UnknownName
 from kerv_cli.files import read_json, sha256_of
 from kerv_cli.manifests import read
+from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors, save_tensors
 from kerv_cli.targets.openvla.config import Language
 from kerv_cli.targets.openvla.layout import Sizes, layer_tensors
 from kerv_cli.targets.openvla.loading import SINGLE, check_layout, conversion, open_shards
-from kerv_cli.targets.openvla.trunk import KeyValueCache, LlamaLayer, additive_mask, run_layers
+from kerv_cli.targets.openvla.trunk import KeyValueCache, LlamaLayer, run_layers
 from kerv_cli.targets.protocol import ReadableTarget
 
 POSITIONS, MASKS = ("sequence", "text"), ("causal", "prompt")
@@ -93,7 +94,7 @@ class PublicDrafter(nn.Module):
         seen: np.ndarray | None = None,
     ) -> Tensor:
         """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
-        `additive_mask`. A call on an empty cache is the prompt's."""
+        `attention_mask`. A call on an empty cache is the prompt's."""
         if cache is not None and not cache.length:
             cache.prompt = hidden.shape[1]
         x = self.fc(torch.cat([following, hidden], -1))
@@ -103,7 +104,7 @@ class PublicDrafter(nn.Module):
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | None) -> Tensor:
         """Additive mask (T, S + T) in which no key behind the prompt's last but one is seen."""
         prompt = cache.prompt if cache is not None else x.shape[1]
-        mask = additive_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)
+        mask = attention_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)
         if mask is None:
             assert cache is not None
             mask = x.new_zeros(x.shape[1], cache.length + x.shape[1])

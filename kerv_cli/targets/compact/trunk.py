@@ -16,12 +16,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.targets.attention import Buffered, attention_mask, rotate
 from kerv_cli.targets.compact.captured import CapturedLayers
 from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradient
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 
 
-class Cache:
+class Cache(Buffered):
     """Keys and values of every layer in fixed buffers (layers, 2, B, A, slots, C) with slots ≥ capacity; the first
     `length` slots are valid.
 
@@ -39,13 +40,6 @@ class Cache:
         self.capacity = capacity
         self.length = 0
         self.captured: CapturedLayers | None = None
-
-    def compact(self, start: int, slots: Tensor) -> None:
-        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
-        sets the length behind them."""
-        n = slots.shape[0]
-        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
-        self.length = start + n
 
 
 class Slots:
@@ -77,26 +71,6 @@ class Slots:
         return (layer[0][:, :, : self.stop], layer[1][:, :, : self.stop]) if self.start else (k, v)
 
 
-def attention_mask(seen: np.ndarray | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
-    """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, slots) for a cache of fixed shapes.
-
-    seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to
-    all cached ones before those. None: the new tokens are causal. The mask is None where attention without one does the
-    same.
-    """
-    cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
-    stop = cached + tokens
-    plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
-    if plain and not fixed:
-        return None
-    if seen is None:
-        seen = np.tri(tokens, dtype=bool)
-    mask = np.zeros((tokens, cache.buffer.shape[-2] if cache is not None and fixed else stop), dtype=np.float32)
-    mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
-    mask[:, stop:] = -np.inf
-    return torch.from_numpy(mask).to(device=like.device, dtype=like.dtype)
-
-
 class Rotary(nn.Module):
     """Rotary position embedding, half-split layout; tables are computed once in float32."""
 
@@ -114,11 +88,6 @@ class Rotary(nn.Module):
     def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """positions (T,) -> cos and sin (T, 1, C) for all layers."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
-
-
-def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """x (B, T, heads, C) rotated by its positions' cos and sin (T, 1, C)."""
-    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
 class Layer(nn.Module):

@@ -12,10 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.targets.attention import Buffered, attention_mask, rotate
 from kerv_cli.targets.openvla.config import Language
 
 
-class KeyValueCache:
+class KeyValueCache(Buffered):
     """Keys and values of every layer (layers, 2, B, K, capacity, C); slots 0 … length − 1 are valid.
 
     fixed: every forward writes at a tensor of slots and attends to the whole capacity under a mask, so that its shapes
@@ -28,13 +29,6 @@ class KeyValueCache:
         self.capacity, self.fixed = capacity, fixed
         self.length = 0
 
-    def compact(self, start: int, slots: Tensor) -> None:
-        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
-        sets the length behind them."""
-        n = slots.shape[0]
-        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
-        self.length = start + n
-
     def write(self, layer: int, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """k, v (B, K, T, C) behind the valid slots -> the keys and values to attend to."""
         keys, values = self.buffer[layer]
@@ -46,25 +40,6 @@ class KeyValueCache:
         return keys[:, :, :stop], values[:, :, :stop]
 
 
-def additive_mask(seen: np.ndarray | None, tokens: int, cache: KeyValueCache | None, like: Tensor) -> Tensor | None:
-    """Additive mask of T = `tokens` new tokens behind a cache (T, S + T), over its whole capacity where it is fixed;
-    None where plain or causal attention does the same.
-
-    seen (T, M) bool: which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to all
-    before those. None: the new tokens are causal.
-    """
-    before, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
-    plain = (tokens == 1 or not before) if seen is None else (tokens == 1 and bool(seen.all()))
-    if plain and not fixed:
-        return None
-    seen = np.tri(tokens, dtype=bool) if seen is None else seen
-    stop = before + tokens
-    mask = np.zeros((tokens, cache.capacity if cache is not None and fixed else stop), dtype=np.float32)
-    mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
-    mask[:, stop:] = -np.inf
-    return torch.from_numpy(mask).to(device=like.device, dtype=like.dtype)
-
-
 def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """positions (T,) -> cos and sin (T, C) of the rotary embedding, half-split layout, computed in float32. The sign
     of the swapped half is part of the sine."""
@@ -72,11 +47,6 @@ def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype)
     angles = positions[:, None].float() * frequencies
     cos, sin = angles.cos(), angles.sin()
     return torch.cat([cos, cos], -1).to(dtype), torch.cat([-sin, sin], -1).to(dtype)
-
-
-def turned(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """x (B, heads, T, C) rotated by its positions' cos and sin (T, C)."""
-    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
 class LlamaAttention(nn.Module):
@@ -101,8 +71,8 @@ class LlamaAttention(nn.Module):
     ) -> Tensor:
         """x (B, T, E) -> (B, T, E); without a cache and a mask attention is causal."""
         batch, tokens, width = x.shape
-        q = turned(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
-        k = turned(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
+        q = rotate(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
+        k = rotate(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
         v = self.v_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2)
         if cache is not None:
             k, v = cache.write(layer, k, v)
@@ -165,9 +135,9 @@ def run_layers(
     mask: Tensor | None = None,
 ) -> Tensor:
     """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
-    `additive_mask`; mask: one that is given instead."""
+    `attention_mask`; mask: one that is given instead."""
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
-    mask = additive_mask(seen, x.shape[1], cache, x) if mask is None else mask
+    mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
     for number, layer in enumerate(layers):
         x = layer(x, rotary, mask, cache, number)
     if cache is not None:
