@@ -221,6 +221,20 @@ class StreakSkipSettings:
     tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
 
 
+@dataclass
+class RiskSkipSettings:
+    """A gate on a score, calibrated so that the risk of what it trusts is at most epsilon, and audited (§4.6). The
+    draft is the in-prefill one, of `merged` its first source's; without one, what the method retrieves."""
+
+    kind: str = "risk"
+    score: str = "odds"
+    epsilon: float = number(0.1, above=0, most=0.99)  # mean loss of unverified drafts
+    delta: float = number(0.1, above=0, most=0.5)  # probability that the calibration, or an alarm, errs
+    level: float | None = number(None, -1e9, 1e9)  # least score that is trusted; None: the certified one
+    audit: float = number(0.05, 0, 1)  # p_a, share of trusted drafts that are verified all the same
+    opening: int = number(1, 0, MOST_DECODES)  # first decodes of an episode that are verified
+
+
 # --- what searches the datastore (§4.1): every backend gives the same neighbours
 
 
@@ -270,6 +284,17 @@ def check_merged(settings: MergedProposerSettings) -> None:
     for name in (*settings.sources, *settings.fallback):
         if not find("proposer", name, "source of a merged draft").traits.get("chains"):
             raise UsageError(f"source '{name}' of a merged draft: it does not draft whole chunks from the prompt")
+
+
+def check_risk(settings: RiskSkipSettings) -> None:
+    """Raises UnknownName for a score that does not exist."""
+    find("score", settings.score, "skip.score")
+
+
+def needs_of_risk(settings: RiskSkipSettings) -> tuple[str, ...]:
+    """What the score reads, and the recording that certifies a level, unless one is given."""
+    certified = ("risk",) if settings.level is None else ()
+    return (*certified, *find("score", settings.score, "skip.score").needs(None))
 
 
 def check_radii(settings: KinematicThresholdSettings | ScheduleThresholdSettings) -> None:
@@ -335,6 +360,8 @@ _add(
 _add("artifact", "drafter", "drafting.eagle:ARTIFACT")
 _add("artifact", "early", "drafting.early:ARTIFACT")
 _add("artifact", "datastore", "drafting.datastore:ARTIFACT")
+_add("artifact", "risk", "decoding.risk_file:ARTIFACT")
+_add("artifact", "score", "drafting.learned_score:ARTIFACT")
 _add("artifact", "calibration", "decoding.calibration_file:ARTIFACT")
 _add("datastore", "exact", "drafting.search:exact_index")
 _add("datastore", "qdrant", "drafting.qdrant:qdrant_index", QdrantSearchSettings)
@@ -398,6 +425,19 @@ _add("boundary", "random", _BUILD + "boundary", RandomBoundarySettings, chooses=
 _add("skip", "none", _BUILD + "nothing")
 _add("skip", "parallel", _BUILD + "parallel_pass", colour=0x17BECF, parallel=True)  # a parallel target's own decoding
 _add("skip", "streak", _BUILD + "streak_skip", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
+_risk: dict[str, Any] = {"takes_draft": True, "merges": True, "retrieves": True}
+_add("skip", "risk", _BUILD + "risk_skip", RiskSkipSettings, needs_of_risk, check_risk, colour=0x3B6FB6, **_risk)
+for _name, _needed in (
+    ("odds", ("early",)),
+    ("entropy", ("early",)),
+    ("familiarity", ("early",)),
+    ("steadiness", ()),
+    ("agreement_hold", ()),
+    ("agreement_retrieval", ("datastore",)),
+    ("similarity", ("datastore",)),
+    ("learned", ("early", "score")),
+):
+    _add("score", _name, "decoding.scores:" + _name, needs=_needed)
 _add("skip", "always", _BUILD + "always_skip", takes_draft=True)  # what prefill_draft drafts is never verified
 _add(
     *("skip", "similarity", _BUILD + "similarity_skip", SimilaritySkipSettings),

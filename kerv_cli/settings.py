@@ -296,8 +296,23 @@ class TrainDrafterSettings(RunSettings):
 
     policy: PolicySettings = field(default_factory=PolicySettings)  # policy.drafter: name of the new drafter
     demos: str = "mt10"
+    task: list[str] = field(default_factory=list)  # tasks and suites whose demonstrations are used; empty: all
+    starts: str = choice("all", "all", "half")  # half: of every task, the episodes that begin on one side
     drafter: DrafterSettings = field(default_factory=DrafterSettings)
     train: TrainSettings = field(default_factory=TrainSettings)
+
+
+@dataclass
+class TrainScoreSettings(RunSettings):
+    """`kerv train score`: the learned score, on what `kerv calibrate risk features=true` recorded."""
+
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    inputs: list[str] = field(default_factory=lambda: ["odds", "entropy", "familiarity", "steadiness"])
+    steps: int = number(300, 1, 10**6)
+    lr: float = number(3e-3, 0, 10)
+    weight_decay: float = number(1.0, 0, 100)
+    held_out: float = number(0.25, above=0, most=0.9)  # share of the episodes that it is measured on
+    seed: int = number(0, 0, 2**31 - 1)
 
 
 @dataclass
@@ -385,6 +400,7 @@ class BuildDatastoreSettings(TaskSettings):
     name: str | None = None  # default: datastore/ beside the target
     demos: str = "mt10"
     episodes: int = number(0, 0, 100_000)  # per task, the first ones by seed; 0: all
+    starts: str = choice("all", "all", "half")  # half: of every task, the episodes that begin on one side
     stride: int = number(1, 1, 10_000)  # of an episode's observations every so many become entries
     half: bool = False  # keys on disk in float16: half the size, for shipping
     components: int = number(0, 0, 65_536)  # directions that keys are projected onto; 0: keys stay as they are
@@ -420,6 +436,30 @@ class CalibrateSettings(TaskSettings):
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
         if self.decodes and self.proposer.kind == "none":
             raise UsageError("proposer.kind=none drafts nothing to compare: choose a proposer, or decodes=0")
+
+
+@dataclass
+class CalibrateRiskSettings(TaskSettings):
+    """`kerv calibrate risk` (docs/methods.md §4.6): drafts, their scores and losses in closed loop, selection seeds."""
+
+    policy: PolicySettings = field(default_factory=PolicySettings)
+    name: str | None = None  # default: risk/ beside the target
+    episodes: int = number(20, 1, 100_000)  # per task
+    seed: int = number(50_100, 0, 2**31 - 1)  # first one, a selection seed
+    sources: list[str] = field(default_factory=lambda: ["early"])  # what drafts; the first one's drafts are executed
+    scores: list[str] = field(default_factory=lambda: ["odds", "entropy", "familiarity", "steadiness"])
+    unverified: float = number(0.8, 0, 1)  # share of the decodes in which the draft is executed, else verified first
+    scale: float = number(0.1, above=0, most=1e6)  # ε_a: mean abs difference that counts as a whole loss, normalised
+    epsilon: float = number(0.1, above=0, most=0.99)  # of the table that is printed
+    delta: float = number(0.1, above=0, most=0.5)
+    features: bool = False  # keep the pooled prompts, for `kerv train score`
+    world: WorldSettings = field(default_factory=WorldSettings)
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError without a source or a score."""
+        for name in ("sources", "scores"):
+            if not getattr(self, name):
+                raise UsageError(f"{prefix}{name}=[]: name at least one")
 
 
 def as_plain(settings: Any) -> dict[str, Any]:

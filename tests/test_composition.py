@@ -94,6 +94,12 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "acceptance": RELAXED,
         "skip": p.StreakSkipSettings(most=8, tolerance=0.05),
     },
+    "one_pass_risk": {
+        "prefill_draft": NoSettings("early"),
+        "proposer": CHAIN,
+        "acceptance": RELAXED,
+        "skip": p.RiskSkipSettings(score="odds", epsilon=0.1, delta=0.1, audit=0.05, opening=1),
+    },
     "parallel": {"skip": NoSettings("parallel")},
     "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": p.JacobiProposerSettings(depth=0)},
 }

@@ -19,6 +19,8 @@ SCHEMAS = {
     "train_target": s.TrainTargetSettings,
     "train_drafter": s.TrainDrafterSettings,
     "calibrate": s.CalibrateSettings,
+    "calibrate_risk": s.CalibrateRiskSettings,
+    "train_score": s.TrainScoreSettings,
     "build_datastore": s.BuildDatastoreSettings,
     "build_drafter": s.BuildDrafterSettings,
     "build_target": s.BuildTargetSettings,

@@ -99,7 +99,7 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
     prompt, history = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1)), np.full((5, 4), 0.5)
 
     def drafted(prompt: torch.Tensor, history: np.ndarray, radius: int = 0) -> list[int]:
-        return early.drafted(target.pooled(prompt), history, radius)[0]
+        return early.drafted(target.pooled(prompt), history, radius).tokens
 
     logits = early(target.pooled(prompt), torch.full((1, 2, 4), 0.5), torch.ones(1, 2))
     assert logits.shape == (1, 8, 255)
@@ -313,7 +313,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert own.provenance["settings"]["drafter"]["width"] == early.settings.width == 32
     assert early.scale.min() > 0
     assert not torch.equal(early.scale, torch.ones_like(early.scale))
-    drafted, _ = early.drafted(torch.randn(1, target.pooled_width), np.zeros((0, 4)), 0)
+    drafted = early.drafted(torch.randn(1, target.pooled_width), np.zeros((0, 4)), 0).tokens
     assert len(drafted) == target.chunk * 4
     assert all(0 <= token < 255 for token in drafted)
     other = load_target(results / "artifacts/target/nano-state")[1]
@@ -360,7 +360,7 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
     save_early(tmp_path, early, description.sha256, {})
     loaded, _ = load_early(tmp_path, target, description)
     features, history = torch.randn(1, target.pooled_width), np.zeros((1, 4))
-    assert loaded.drafted(features, history, 0)[0] == early.drafted(features, history, 0)[0]
+    assert loaded.drafted(features, history, 0).tokens == early.drafted(features, history, 0).tokens
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     with pytest.raises(CheckpointError, match="does not match"):

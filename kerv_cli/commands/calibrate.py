@@ -17,9 +17,16 @@ if TYPE_CHECKING:
     from kerv_cli.decoding.calibration_file import Calibration
 
 
+RISK = "risk"
+
+
 @edge
 def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
-    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels."""
+    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels. `kerv calibrate
+    risk …` records in closed loop what unverified drafts lose, for skip=risk."""
+    if overrides and overrides[0] == RISK:
+        _risk(overrides[1:], cfg, plan)
+        return
     from kerv_cli.settings import CalibrateSettings
 
     settings = common.composed("calibrate", overrides, CalibrateSettings, cfg)
@@ -113,3 +120,23 @@ def _skip(calibration: Calibration) -> None:
     columns = ("task", "s_min", "low", "high", "would be skipped", f"error ≤ {epsilon:g}", "mean error", "entries")
     title = f"verify-skip, best neighbour in another episode, {confidence:.0%} with an error of at most {epsilon:g}"
     print_table(columns, rows, title)
+
+
+def _risk(overrides: list[str], cfg: bool, plan: bool) -> None:
+    from kerv_cli.settings import CalibrateRiskSettings
+
+    settings = common.composed("calibrate_risk", overrides, CalibrateRiskSettings, cfg)
+    from kerv_cli.reporting.risk import coverage_table, plot_coverage
+    from kerv_cli.training.risk_recording import RiskRun
+
+    run = RiskRun(settings)
+    if plan:
+        common.print_plan(run.plan())
+    with progress_bar("episodes") as advance:
+        run.record(advance)
+    recording = run.finish()
+    title = f"levels with a risk of at most {settings.epsilon:g}, certified at 1 - {settings.delta:g}"
+    columns = ("source", "score", "level", "trusted", "risk", "p", "AUC", "episodes")
+    print_table(columns, coverage_table(recording, settings.epsilon, settings.delta), title)
+    plot = plot_coverage(recording, run.folder / "coverage.png")
+    typer.echo(f"{run.folder}\n{plot}")

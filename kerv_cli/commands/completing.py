@@ -17,6 +17,8 @@ _SCHEMAS = {
     "train_drafter": "TrainDrafterSettings",
     "build_datastore": "BuildDatastoreSettings",
     "calibrate": "CalibrateSettings",
+    "calibrate_risk": "CalibrateRiskSettings",
+    "train_score": "TrainScoreSettings",
     "report": "ReportSettings",
     "doctor": "DoctorSettings",
     "view": "ViewSettings",

@@ -45,6 +45,23 @@ def drafter(
     run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
 
 
+@app.command("score")
+@edge
+def score(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+    """Train a score that expects a draft's loss, on what 'kerv calibrate risk features=true' recorded."""
+    from kerv_cli.settings import TrainScoreSettings
+
+    settings = common.composed("train_score", overrides, TrainScoreSettings, cfg)
+    from kerv_cli.training.score_training import ScoreRun
+
+    run = ScoreRun(settings)
+    if plan:
+        common.print_plan(run.plan())
+    with progress_bar("training the score") as advance:
+        metrics = run.train(advance)
+    common.print_figures("held-out episodes", metrics, run.folder)
+
+
 def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     if plan:
         common.print_plan(run.plan())

@@ -25,13 +25,16 @@ from kerv_cli.decoding.proposers import (
     RetrievalProposer,
 )
 from kerv_cli.decoding.rectify import DRAFT, Compensation
+from kerv_cli.decoding.risk import RiskSkip
+from kerv_cli.decoding.risk_file import RiskRecording
 from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass, SkipLevels, StreakSkip, VerifySkip
 from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import METHOD_KINDS, PREFILL, RetrievalProposerSettings, part_of
-from kerv_cli.registry import Part, find
+from kerv_cli.registry import NoSettings, Part, find
 from kerv_cli.targets.protocol import Target
 
+SCALE = 0.1  # ε_a of `skip=risk` with a level of its own, normalised action units
 LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: kinematics.MINIMUM
 
 
@@ -81,7 +84,8 @@ def check(method: Mapping[str, Any], chunk: int, trained: int, parallel: bool = 
     check_parallel(chosen, parallel)
     skip = chosen["skip"].traits
     joined = bool(skip.get("merges")) and draft.name == "merged"
-    if skip.get("takes_draft") and not draft.traits.get("chains") and not joined:
+    retrieved = bool(skip.get("retrieves")) and draft.name == "none" and proposer.name in ("hybrid", "retrieval")
+    if skip.get("takes_draft") and not draft.traits.get("chains") and not joined and not retrieved:
         raise UsageError(
             f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before "
             "the prefill, e.g. prefill_draft=early"
@@ -254,16 +258,47 @@ def parallel_pass(settings: Any, context: Context) -> ParallelPass:
 
 def streak_skip(settings: Any, context: Context) -> StreakSkip:
     """skip=streak."""
-    draft = context.built["prefill_draft"]
-    return StreakSkip(settings, draft.sources[0] if isinstance(draft, MergedProposer) else draft)
+    return StreakSkip(settings, _drafts_chunks(context))
+
+
+def risk_skip(settings: Any, context: Context) -> RiskSkip:
+    """skip=risk.
+
+    Raises:
+        CheckpointError: the recording does not know the source or the score, or is too small to certify anything.
+    """
+    source = _drafts_chunks(context)
+    score = find("score", settings.score).built(NoSettings(settings.score), context)
+    if settings.level is not None:
+        return RiskSkip(settings, source, score, settings.level, SCALE)
+    recording: RiskRecording = context.artifact("risk")
+    recording.check_size(source.name, settings.epsilon, settings.delta)
+    level = recording.certified(source.name, settings.score, settings.epsilon, settings.delta).level
+    return RiskSkip(settings, source, score, level, recording.manifest.scale)
+
+
+def _drafts_chunks(context: Context) -> DraftsChunks:
+    """What drafts whole chunks before the prefill: the in-prefill draft, of a merged one its first source; without one,
+    what the proposer retrieves."""
+    draft: Any = context.built["prefill_draft"]
+    if draft is None:
+        return _retrieval_of(context)
+    first: DraftsChunks = draft.sources[0] if isinstance(draft, MergedProposer) else draft
+    return first
+
+
+def _retrieval_of(context: Context) -> RetrievalProposer:
+    """The retrieval of the method's proposer, where that retrieves; else one of its own."""
+    own: Proposer | None = context.built["proposer"]
+    found = own.sides["retrieval"] if isinstance(own, HybridProposer) else own
+    if isinstance(found, RetrievalProposer):
+        return found
+    return RetrievalProposer(context.artifact("datastore"), context.target, 1, 1)
 
 
 def similarity_skip(settings: Any, context: Context) -> VerifySkip:
     """skip=similarity; it shares the retrieval of the method's proposer, where that retrieves."""
-    own: Proposer | None = context.built["proposer"]
-    found = own.sides["retrieval"] if isinstance(own, HybridProposer) else own
-    if not isinstance(found, RetrievalProposer):
-        found = RetrievalProposer(context.artifact("datastore"), context.target, 1, 1)
+    found = _retrieval_of(context)
     if settings.s_min is not None:
         return VerifySkip(settings, found, SkipLevels(settings.s_min, settings.s_min, settings.s_min))
     levels = context.calibration.skip_levels(context.task, found.datastore.content)

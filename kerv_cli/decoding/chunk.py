@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.decoding.boundary import Choice
-from kerv_cli.decoding.record import PHASES, Round
+from kerv_cli.decoding.record import PHASES, Round, Trust
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.errors import UsageError
@@ -123,6 +123,7 @@ class Chunk:
         self.forwards = 0
         self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
         self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
+        self.trust: Trust | None = None  # why it was verified or not, where a gate with a score decides
         self.closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property

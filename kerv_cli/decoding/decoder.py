@@ -78,9 +78,10 @@ class Decoder:
         history = ActionHistory(self.target.actions.dofs)
         self.situation = Situation(task, history, [np.asarray(end_effector)], random)
         self.threshold.reset()
-        for part in (self.parts.rectifier, self.parts.skip):
-            if part is not None:
-                part.reset()
+        if self.parts.rectifier is not None:
+            self.parts.rectifier.reset()
+        if self.parts.skip is not None:
+            self.parts.skip.begin(task, seed)
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """An action (D,) was executed; the end effector is now at (3,) metres."""
@@ -118,6 +119,7 @@ class Decoder:
             skipped=any(r.mode == "skip" for r in chunk.rounds),
             similarity=chunk.similarity,
             metric=chunk.choice.metric if chunk.choice is not None else None,
+            trust=chunk.trust,
         )
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
@@ -149,6 +151,9 @@ class Decoder:
             clock.lap("propose")
         while chunk.left:
             self.round(chunk, clock)
+        if parts.skip is not None:
+            parts.skip.completed(chunk)
+            clock.lap("accept")
         return chunk
 
     def prefill(self, chunk: Chunk, clock: Clock) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
 from kerv_cli.drafting.eagle import DraftsStates, DraftState, grow_tree, observe
-from kerv_cli.drafting.early import EarlyDrafter
+from kerv_cli.drafting.early import EarlyDraft, EarlyDrafter
 from kerv_cli.drafting.kinematics import Predictor
 from kerv_cli.drafting.tree import TokenTree, merge
 from kerv_cli.targets.protocol import ReadableTarget, Target
@@ -78,22 +78,26 @@ class EarlyProposer(ChainProposer):
 
     def __init__(self, early: EarlyDrafter, target: ReadableTarget) -> None:
         self.early, self.target = early, target
-        self._drafted: tuple[Chunk, list[int], float] | None = None
+        self._drafted: tuple[Chunk, EarlyDraft] | None = None
 
-    def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
-        """The chunk's N tokens and the drafter's estimate (a product of probabilities) that all are accepted."""
+    def drafted(self, chunk: Chunk) -> EarlyDraft:
+        """The draft of the chunk's N tokens."""
         if self._drafted is None or self._drafted[0] is not chunk:
             history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
-            self._drafted = chunk, *self.early.drafted(self.target.pooled(chunk.prompt), history, radius)
-        return self._drafted[1], self._drafted[2]
+            self._drafted = chunk, self.early.drafted(self.target.pooled(chunk.prompt), history, radius)
+        return self._drafted[1]
+
+    def distance(self, chunk: Chunk) -> float:
+        """How far the observation is from those that the drafter was trained on; see `EarlyDrafter.distance`."""
+        return self.early.distance(self.target.pooled(chunk.prompt))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """The drafted tokens behind the committed ones."""
-        return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
+        return [self.drafted(chunk).tokens[len(chunk.tokens) : chunk.size][:depth]]
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether the estimate that the whole chunk is accepted reaches SURE."""
-        return self.drafted(chunk)[1] >= SURE
+        return self.drafted(chunk).odds >= SURE
 
 
 class RetrievalProposer(Stateless):

@@ -14,6 +14,11 @@ from kerv_cli.spaces import ActionSpace
 PARALLEL = "parallel"
 """Mode of a round, and of its decode, in which the target decoded all tokens at once."""
 
+TRUSTED, GATE, AUDIT, OPENING, ALARM = "trusted", "gate", "audit", "opening", "alarm"
+NO_DRAFT, STREAK = "no draft", "streak"
+"""Reasons of `Trust`: executed unverified; verified because the score is too low, at random, at an episode's start,
+after an alarm, because nothing was drafted, or because the verifications before do not allow more."""
+
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
 
@@ -48,6 +53,22 @@ class Round:
 
 
 @dataclass(frozen=True)
+class Trust:
+    """Why a draft was executed unverified or was verified (docs/methods.md §4.5, §4.6)."""
+
+    score: float  # of the draft, larger = safer; NaN for rules without a score
+    level: float  # from which on it is trusted
+    reason: str  # TRUSTED, GATE, AUDIT, …
+    loss: float | None = None  # ℓ in [0, 1], where it was verified
+    alarm: bool = False  # an alarm was on, or this decode's loss raised one
+
+    @property
+    def audited(self) -> bool:
+        """Whether the gate trusted the draft and it was verified all the same: a sample of the risk."""
+        return self.loss is not None and self.score >= self.level
+
+
+@dataclass(frozen=True)
 class DecodeRecord:
     """One call of the decoder: from an observation to the actions to execute."""
 
@@ -64,6 +85,7 @@ class DecodeRecord:
     variability: float | None = None  # K of this decode (§3.2), normalised action units
     similarity: float | None = None  # best retrieval similarity, where one was looked up
     metric: float | None = None  # fused hybrid-boundary metric F (§4.4)
+    trust: Trust | None = None  # of a gate with a score
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
 
     @property

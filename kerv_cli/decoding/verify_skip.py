@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks
+from kerv_cli.decoding.loss import chunk_loss, judged_tokens
 from kerv_cli.decoding.proposers import RetrievalProposer
-from kerv_cli.decoding.record import PARALLEL, Round
+from kerv_cli.decoding.record import PARALLEL, STREAK, TRUSTED, Round, Trust
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import SimilaritySkipSettings, StreakSkipSettings
 from kerv_cli.targets.protocol import ParallelTarget
@@ -37,7 +37,7 @@ class Skip(ABC):
 
     phase = "propose"
 
-    def reset(self) -> None:  # noqa: B027 - most rules keep nothing between decodes
+    def begin(self, task: str, seed: int) -> None:  # noqa: B027 - most rules keep nothing between decodes
         """A new episode begins."""
 
     def finish(self, success: bool) -> None:  # noqa: B027
@@ -49,6 +49,9 @@ class Skip(ABC):
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
         """Told when the prefill of a chunk that was not taken has judged the in-prefill draft."""
+
+    def completed(self, chunk: Chunk) -> None:  # noqa: B027
+        """Told when a chunk that was not taken is complete."""
 
 
 class ParallelPass(Skip):
@@ -95,15 +98,17 @@ class StreakSkip(Skip):
         self.allowed = self.left = 0  # after the last verification, and of these still
         self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
 
-    def reset(self) -> None:
-        """A new episode begins."""
+    def begin(self, task: str, seed: int) -> None:
+        """As `Skip.begin`."""
         self.allowed = self.left = 0
 
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`."""
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
-        if not self.left or len(self.chain) < chunk.size:
+        taken = self.left > 0 and len(self.chain) == chunk.size
+        chunk.trust = Trust(math.nan, math.nan, TRUSTED if taken else STREAK)
+        if not taken:
             return False
         self.left -= 1
         chunk.skip(self.chain, self.source.name)
@@ -117,18 +122,13 @@ class StreakSkip(Skip):
     def _agrees(self, chunk: Chunk) -> bool:
         """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's
         tokens on its own path, strict DoFs equal."""
-        played, rejection = chunk.rounds[-1], chunk.rejection
-        path = (*played.drafted, *rejection.draft)
-        if len(path) < chunk.size - 1 or path != self.chain[: len(path)]:
+        wanted = judged_tokens(chunk, self.chain)
+        if wanted is None:
             return False
-        if played.accepted == len(played.drafted):
+        if chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted):
             return True
-        wanted = np.array((*played.target_tokens[: len(played.drafted)], *rejection.target[: len(rejection.draft)]))
-        strict = chunk.space.strict_tokens(len(path))
-        if (np.array(path) != wanted)[strict].any():
-            return False
-        off = np.abs(chunk.space.values_of(np.array(path)) - chunk.space.values_of(wanted))
-        return bool(off.mean() <= self.settings.tolerance)
+        scale = self.settings.tolerance
+        return scale > 0 and chunk_loss(chunk.space, self.chain[: len(wanted)], wanted, 2 * scale) <= 0.5
 
 
 class VerifySkip(Skip):
@@ -146,8 +146,8 @@ class VerifySkip(Skip):
         self.in_a_row = 0
         self.ended: set[int] = set()  # seeds of stored episodes that were executed to their end
 
-    def reset(self) -> None:
-        """A new episode begins."""
+    def begin(self, task: str, seed: int) -> None:
+        """As `Skip.begin`."""
         self.in_a_row = 0
         self.ended.clear()
 

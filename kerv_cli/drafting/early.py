@@ -86,6 +86,11 @@ class EarlyDrafter(nn.Module):
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
+    @torch.inference_mode()
+    def distance(self, features: Tensor) -> float:
+        """Mean square of the standardised features (1, F): 1 on average over the training observations."""
+        return float(((features.float() - self.mean) * self.scale).square().mean())
+
     def forward(self, features: Tensor, history: Tensor, known: Tensor) -> Tensor:
         """pooled prompts (B, F), history (B, h, D) normalised, known (B, h) -> logits (B, N, V)."""
         x = torch.cat([(features - self.mean) * self.scale, history.flatten(1), known], -1)
@@ -96,15 +101,31 @@ class EarlyDrafter(nn.Module):
         return logits
 
     @torch.inference_mode()
-    def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
-        """features (1, F), history (m, D) normalised executed actions, oldest first -> all N draft tokens, and the
-        drafter's estimate that all are accepted (see `acceptance_odds`). radius: r in bins, see `choose`."""
+    def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
+        """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
+        radius: r in bins, see `choose`."""
         weight = self.head.weight
         shown = padded(history, self.settings.history, self.actions.dofs)
         actions, known = (torch.from_numpy(x).to(device=weight.device, dtype=weight.dtype)[None] for x in shown)
         logits = self(features.to(weight.dtype), actions, known)
         tokens = choose(logits, radius, self.strict)
-        return tokens[0].tolist(), float(acceptance_odds(logits, tokens, radius, self.strict)[0])
+        return EarlyDraft(tokens[0].tolist(), float(acceptance_odds(logits, tokens, radius, self.strict)[0]), logits[0])
+
+
+@dataclass(frozen=True)
+class EarlyDraft:
+    """A draft. tokens: N of them. odds: the drafter's estimate that all are accepted, see `acceptance_odds`. logits:
+    (N, V)."""
+
+    tokens: list[int]
+    odds: float
+    logits: Tensor
+
+    @property
+    def entropy(self) -> float:
+        """Mean over the tokens of their distributions' entropy, nats."""
+        shares = self.logits.float().log_softmax(-1)
+        return float(-(shares.exp() * shares).sum(-1).mean())
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:

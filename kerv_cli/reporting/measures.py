@@ -30,6 +30,8 @@ _RATIOS = {
     "compensation_rate": ("compensated_decodes", "decodes"),
     "retrieval_share": ("retrieval_decodes", "decodes"),
     "deviation": ("deviation_sum", "deviation_count"),
+    "realised_risk": ("audit_loss", "audits"),
+    "audits_to_alarm": ("alarm_audits", "alarmed"),
 }
 """Quotients of sums over episodes; NaN where the denominator is 0."""
 
@@ -63,6 +65,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
         **_columns("episode_speedup", _speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
+        **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
         "pairs": sum(counts),
         **counts._asdict(),
         "mcnemar_p": stats.mcnemar(counts) if len(pairs) else math.nan,
@@ -88,6 +91,14 @@ def _acceptance_interval(episodes: pd.DataFrame, macro: bool) -> stats.Interval:
     mean = sum(ratio.value for ratio in found) / len(found)
     reach = math.sqrt(sum((ratio.high - ratio.value) ** 2 for ratio in found)) / len(found)
     return stats.Interval(mean - reach, mean + reach)
+
+
+def _risk_interval(episodes: pd.DataFrame) -> stats.Interval:
+    """Of the realised risk, pooled over all audits."""
+    if not episodes["audits"].sum():
+        return stats.Interval(math.nan, math.nan)
+    found = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
+    return stats.Interval(max(0.0, found.low), min(1.0, found.high))
 
 
 def _columns(name: str, estimate: Estimate) -> dict[str, float]:
@@ -136,6 +147,7 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
         "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
         "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
         **_latencies(episodes["decode_seconds"]),
+        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].sum() else math.nan,
         "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
     }
     values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}

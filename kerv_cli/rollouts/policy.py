@@ -94,7 +94,9 @@ def check(settings: RolloutSettings) -> None:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     check_method(method, settings.chunk, target.chunk, target.parallel)
     wanted = needs(method)
-    artifacts.check(wanted)
+    hashes = artifacts.check(wanted)
+    if "risk" in wanted:
+        artifacts.load("risk").check_sources(hashes)
     if "calibration" in wanted and method["threshold"].kind in ("kinematic", "change"):
         calibration = artifacts.load("calibration")
         for task in tasks if method["threshold"].k_s is None else ():

@@ -40,6 +40,10 @@ EPISODE_SCHEMA = pa.schema(
         ("unverified_tokens", pa.int64()),  # executed without a target token on their accepted path
         ("executed_tokens", pa.int64()),  # numbers handed over for execution: steps times DoFs
         ("retrieval_decodes", pa.int64()),
+        ("audits", pa.int64()),  # decodes that a gate trusted and that were verified all the same
+        ("audit_loss", pa.float64()),  # their summed loss
+        ("alarmed", pa.int64()),  # 1 where an alarm was raised
+        ("alarm_audits", pa.int64()),  # audits up to the first alarm, its own included
         ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
         ("deviation_count", pa.int64()),
         ("wall_seconds", pa.float64()),
@@ -87,8 +91,14 @@ DECODE_SCHEMA = pa.schema(
         ("compensated", pa.int64()),
         ("skipped", pa.bool_()),
         *[(name, pa.float64()) for name in _MEASURES],
+        ("score", pa.float64()),  # of the draft; these: null without a gate, see decoding.record.Trust
+        ("level", pa.float64()),
+        ("reason", pa.string()),
+        ("loss", pa.float64()),
+        ("alarm", pa.bool_()),
     ]
 )
+_TRUST = ("score", "level", "reason", "loss", "alarm")
 
 
 @dataclass(frozen=True)
@@ -130,6 +140,7 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         "unverified_tokens": sum(d.unverified for d in decodes),
         "executed_tokens": sum(int(d.actions.size) for d in decodes),
         "retrieval_decodes": sum(any(r.proposer == "retrieval" for r in d.rounds) for d in decodes),
+        **_audit(decodes),
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),
         "initial_state": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
@@ -137,6 +148,14 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         **asdict(at),
         "worker_pid": os.getpid(),
     }
+
+
+def _audit(decodes: Sequence[DecodeRecord]) -> dict[str, Any]:
+    """Columns of an episode's audits."""
+    audits = [(d.trust.loss or 0.0, d.trust.alarm) for d in decodes if d.trust is not None and d.trust.audited]
+    first = next((count for count, (_, alarm) in enumerate(audits, 1) if alarm), 0)
+    losses = sum(loss for loss, _ in audits)
+    return {"audits": len(audits), "audit_loss": losses, "alarmed": int(first > 0), "alarm_audits": first}
 
 
 def _phase_seconds(decode: DecodeRecord) -> dict[str, float | None]:
@@ -159,6 +178,7 @@ def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
             "tokens": list(decode.tokens),
             "actions": np.asarray(decode.actions, dtype=np.float32).tolist(),
             "rounds": [_round_row(r) for r in decode.rounds],
+            **{name: getattr(decode.trust, name, None) for name in _TRUST},
         }
         for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
     ]

@@ -75,7 +75,12 @@ class TargetDescription(Description):
 
 T = TypeVar("T", bound=Description)
 
-_TRAINED_BY = {"target": "train target", "drafter": "train drafter", "early": "train drafter drafter=early"}
+_TRAINED_BY = {
+    "target": "train target",
+    "drafter": "train drafter",
+    "early": "train drafter drafter=early",
+    "score": "train score",
+}
 """Kind of a description -> the command that makes one."""
 
 

@@ -35,6 +35,7 @@ from kerv_cli.runtime import set_up
 from kerv_cli.settings import BuildDatastoreSettings
 from kerv_cli.spaces import ObservationSpace
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.coverage import covered
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_spaces, read_chunks, read_observations
 from kerv_cli.training.recorded import prompts_of, steps_of
@@ -106,7 +107,8 @@ class DatastoreBuild:
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         self.settings = settings
-        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.dataset = covered(dataset, settings.task, settings.starts)
         tasks = sorted(resolve_tasks(settings.task))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)

@@ -25,6 +25,7 @@ from kerv_cli.runtime import set_up
 from kerv_cli.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.coverage import covered
 from kerv_cli.training.distillation import Distillation, StatesByLength, TeacherStates, teach
 from kerv_cli.training.early_distillation import EarlyDistillation, teach_early
 from kerv_cli.training.imitation import (
@@ -254,7 +255,8 @@ class DrafterRun(Run):
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
         self.folder = self.place()
-        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.dataset = covered(dataset, settings.task, settings.starts)
         described = read_target(self.target_folder)
         check_spaces(self.dataset, described.actions, described.observation, "the target")
         described.check_autoregressive(
@@ -305,7 +307,9 @@ class DrafterRun(Run):
 
     def identity(self) -> dict[str, Any]:
         """Shapes and the target's weights."""
-        return {"drafter": asdict(self.settings.drafter), "target": self.described.sha256}
+        s = self.settings
+        covering = {"task": list(resolve_tasks(s.task)), "starts": s.starts} if s.task or s.starts != "all" else {}
+        return {"drafter": asdict(s.drafter), "target": self.described.sha256, **covering}
 
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
         """See `Run.write`."""

@@ -1,0 +1,176 @@
+"""The recorded decodes that certify a gate's level: drafts, their scores and their losses, read and checked (docs/
+methods.md §4.6).
+
+`kerv calibrate risk` writes them (training/risk_recording.py); `skip=risk` reads them. The certificate is computed when
+a method is built, so that ε and δ are settings of the method.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.decoding.certification import Certified, certify, episodes_needed
+from kerv_cli.errors import CheckpointError
+from kerv_cli.files import sha256_of, write_folder, write_json
+from kerv_cli.manifests import read_file
+
+FORMAT = 1
+DECODES, FEATURES = "decodes.parquet", "features.npy"
+AGAIN = "run 'kerv calibrate risk'"
+ROW = [("source", pa.string()), ("task", pa.string()), ("seed", pa.int64()), ("index", pa.int64())]
+"""Columns of DECODES before `loss` and one column per score: what drafted, the episode, the decode in it."""
+
+
+@dataclass(frozen=True)
+class RiskManifest:
+    """Description of a recording. sources: what drafted -> hash of its artifact, empty where it has none. scale: ε_a.
+    tasks: task -> seeds, all of them selection seeds. scores: columns. files: name -> SHA-256."""
+
+    target: MadeFor
+    sources: dict[str, str]
+    scale: float
+    tasks: dict[str, list[int]]
+    scores: list[str]
+    files: dict[str, str]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    format: Literal[1] = 1
+    kind: Literal["risk"] = "risk"
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0 or not set(self.files) <= {DECODES, FEATURES}:
+            raise ValueError("the scale is not above 0, or another file is named")
+
+
+@dataclass(frozen=True)
+class Losses:
+    """n recorded decodes of one source. scores: name -> (n,). losses: (n,) in [0, 1]. episodes: (n,) numbers."""
+
+    scores: dict[str, np.ndarray]
+    losses: np.ndarray
+    episodes: np.ndarray
+    tasks: np.ndarray
+
+
+class RiskRecording:
+    """The recorded decodes of a policy's drafts."""
+
+    def __init__(self, manifest: RiskManifest, table: pa.Table) -> None:
+        self.manifest, self._table = manifest, table
+        self._certified: dict[tuple[Any, ...], Certified] = {}
+
+    def losses(self, source: str) -> Losses:
+        """Decodes of one source.
+
+        Raises:
+            CheckpointError: it was not recorded.
+        """
+        if source not in self.manifest.sources:
+            known = ", ".join(self.manifest.sources)
+            raise CheckpointError(f"the risk of drafts from {source} was not recorded, only of {known}: {AGAIN}")
+        columns = self._table.filter(pa.compute.equal(self._table["source"], source))
+        tasks, seeds = (columns[name].to_numpy(zero_copy_only=False) for name in ("task", "seed"))
+        _, numbers = np.unique(tasks, return_inverse=True)
+        _, episodes = np.unique(np.stack([numbers, seeds]), axis=1, return_inverse=True)
+        scores = {name: columns[f"score.{name}"].to_numpy() for name in self.manifest.scores}
+        return Losses(scores, columns["loss"].to_numpy(), episodes.reshape(-1), tasks)
+
+    def certified(self, source: str, score: str, epsilon: float, delta: float) -> Certified:
+        """The lowest level of `score` from which on drafts of `source` may be executed unverified.
+
+        Raises:
+            CheckpointError: source or score was not recorded.
+        """
+        key = source, score, epsilon, delta
+        if key not in self._certified:
+            found = self.losses(source)
+            if score not in found.scores:
+                raise CheckpointError(
+                    f"score {score} was not recorded, only {', '.join(found.scores)}: {AGAIN} scores=[…,{score}]"
+                )
+            known = np.isfinite(found.scores[score])
+            values = np.where(known, found.scores[score], -math.inf)
+            self._certified[key] = certify(values, found.losses, found.episodes, epsilon, delta)
+        return self._certified[key]
+
+    def check_size(self, source: str, epsilon: float, delta: float) -> None:
+        """Refuses a recording of too few episodes to certify anything.
+
+        Raises:
+            CheckpointError: it is.
+        """
+        episodes, needed = len(np.unique(self.losses(source).episodes)), episodes_needed(epsilon, delta)
+        if episodes < needed:
+            raise CheckpointError(
+                f"{episodes} recorded episodes cannot certify a risk of {epsilon:g} at δ = {delta:g}: {needed} are "
+                f"needed, without any loss: {AGAIN} with more episodes"
+            )
+
+    def check_sources(self, hashes: Mapping[str, str]) -> None:
+        """Refuses another artifact than the one whose drafts were recorded. hashes: artifact kind -> hash.
+
+        Raises:
+            CheckpointError: it is another one.
+        """
+        for source, digest in self.manifest.sources.items():
+            if digest and hashes.get(source, digest) != digest:
+                raise CheckpointError(
+                    f"the recorded risk is that of {source} {digest[:12]}, not of {hashes[source][:12]}: {AGAIN}"
+                )
+
+
+def save_risk(
+    folder: Path, manifest: RiskManifest, rows: Sequence[Mapping[str, Any]], features: np.ndarray | None = None
+) -> RiskRecording:
+    """Writes manifest and decodes atomically -> the recording. features: (n, F) float16, pooled
+    prompts of the first source's decodes."""
+    schema = pa.schema([*ROW, ("loss", pa.float64()), *((f"score.{name}", pa.float64()) for name in manifest.scores)])
+    table = pa.Table.from_pylist(list(rows), schema=schema)
+
+    def fill(temporary: Path) -> None:
+        pq.write_table(table, temporary / DECODES, compression="zstd")
+        if features is not None:
+            np.save(temporary / FEATURES, features)
+        files = {path.name: sha256_of(path) for path in sorted(temporary.iterdir())}
+        write_json(temporary / "risk.json", asdict(replace(manifest, files=files)))
+
+    write_folder(folder, fill, replace=True)
+    return RiskRecording(manifest, table)
+
+
+def read_risk(folder: Path, request: Request) -> RiskManifest:
+    """The manifest in `folder`, which must have been recorded for this target.
+
+    Raises:
+        CheckpointError: none there, damaged, or another target's.
+    """
+    path = folder / "risk.json"
+    if not path.is_file():
+        raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
+    manifest = read_file(RiskManifest, path, f"a recording of format {FORMAT}: {AGAIN}")
+    for name, digest in manifest.files.items():
+        if sha256_of(folder / name) != digest:
+            raise CheckpointError(f"{folder / name} does not match its manifest: {AGAIN}")
+    own = request.description
+    manifest.target.check_same(MadeFor(own.sha256, own.actions, own.chunk), f"the risk in {folder}", "recorded", AGAIN)
+    return manifest
+
+
+def _check(folder: Path, request: Request) -> str:
+    read_risk(folder, request)
+    return sha256_of(folder / "risk.json")
+
+
+def _load(folder: Path, request: Request) -> RiskRecording:
+    return RiskRecording(read_risk(folder, request), pq.read_table(folder / DECODES))
+
+
+ARTIFACT = Artifact("risk", artifact_folder("risk"), _check, _load)

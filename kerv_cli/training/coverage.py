@@ -1,0 +1,44 @@
+"""Demonstrations of a part of what the target knows: some of its tasks, or one side of the initial range."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kerv_cli.environments import resolve_tasks
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.errors import CheckpointError, UsageError
+
+ALL, HALF = "all", "half"
+
+
+def covered(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> DemoDataset:
+    """The dataset with only the episodes of `tasks` (tasks and suites; none: all), and with starts=half only those that
+    begin on one side.
+
+    Raises:
+        UnknownName: no such task. CheckpointError: the dataset has none of a task.
+    """
+    wanted = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
+    missing = [task for task in wanted if task not in dataset.manifest.tasks]
+    if missing:
+        raise CheckpointError(f"{dataset.path} has no demonstrations of {missing[0]}")
+    chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in wanted]
+    if starts == HALF:
+        chosen = _one_side(dataset, chosen)
+    return replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
+
+
+def _one_side(dataset: DemoDataset, chosen: Sequence[int]) -> list[int]:
+    """Of every task the episodes whose first place, as a rule the object, begins at or below the task's median x."""
+    places = dataset.manifest.observation.places
+    if not places:
+        raise UsageError("starts=half: these demonstrations name no place that begins on one side")
+    begins = {index: float(dataset.load(index).states[0][places[0].first]) for index in chosen}
+    by_task: dict[str, list[float]] = {}
+    for index, x in begins.items():
+        by_task.setdefault(dataset.episodes[index].task, []).append(x)
+    medians = {task: float(np.median(values)) for task, values in by_task.items()}
+    return [index for index, x in begins.items() if x <= medians[dataset.episodes[index].task]]

@@ -1,0 +1,182 @@
+"""Records drafts, their scores and their losses in closed loop, on selection seeds (docs/methods.md §4.6).
+
+Training observations would flatter a draft: a drafter or a datastore is at home on what it was made from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.artifacts import Artifacts, MadeFor
+from kerv_cli.decoding.build import Context, compose
+from kerv_cli.decoding.chunk import Chunk, DraftsChunks
+from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.decoding.loss import chunk_loss, target_tokens
+from kerv_cli.decoding.risk_file import RiskManifest, RiskRecording, save_risk
+from kerv_cli.decoding.scores import Draft, Score
+from kerv_cli.decoding.verify_skip import Skip
+from kerv_cli.environments import resolve_tasks, spec_of
+from kerv_cli.errors import UsageError
+from kerv_cli.parts import part_of
+from kerv_cli.places import artifact
+from kerv_cli.provenance import provenance
+from kerv_cli.registry import NoSettings, find
+from kerv_cli.rollouts.episode import run_episode
+from kerv_cli.rollouts.run import close_worlds, open_world
+from kerv_cli.runtime import set_up
+from kerv_cli.settings import CalibrateRiskSettings, RolloutSettings, as_plain
+from kerv_cli.targets.protocol import ReadableTarget
+
+Progress = Callable[[int, int], None]
+Row = dict[str, Any]
+
+
+class Recorder(Skip):
+    """Compares every source's draft with the target, by a forward of its own, and executes the first source's in a
+    random share of the decodes; the others are verified. Not for timing.
+
+    rows: a row of the recording per decode and source. features: pooled prompts (F,), one per decode, where wanted.
+    """
+
+    def __init__(
+        self,
+        target: ReadableTarget,
+        sources: Sequence[DraftsChunks],
+        scores: Mapping[str, Mapping[str, Score]],
+        settings: CalibrateRiskSettings,
+    ) -> None:
+        self.target, self.sources, self.scores, self.settings = target, sources, scores, settings
+        self.rows: list[Row] = []
+        self.features: list[np.ndarray] = []
+        self.random = np.random.default_rng(0)
+        self.episode: Row = {}
+        self.decodes = 0
+
+    def begin(self, task: str, seed: int) -> None:
+        """As `Skip.begin`."""
+        digest = hashlib.sha256(f"risk {task} {seed}".encode()).digest()
+        self.random = np.random.default_rng(int.from_bytes(digest[:8]))
+        self.episode, self.decodes = {"task": task, "seed": seed}, 0
+
+    def take(self, chunk: Chunk) -> bool:
+        """As `Skip.take`."""
+        chains = [self._record(chunk, source) for source in self.sources]
+        if chains[0] and self.settings.features:
+            self.features.append(self.target.pooled(chunk.prompt)[0].half().cpu().numpy())
+        self.decodes += 1
+        if self.random.random() >= self.settings.unverified or not chains[0]:
+            return False
+        chunk.skip(chains[0], self.sources[0].name)
+        return True
+
+    def _record(self, chunk: Chunk, source: DraftsChunks) -> tuple[int, ...]:
+        """Adds the row of one source's draft -> the draft; empty where there is none."""
+        drafted = source.chains(chunk, chunk.size)
+        if not drafted or len(drafted[0]) < chunk.size:
+            return ()
+        chain = tuple(drafted[0])
+        draft = Draft(chunk, source, chain)
+        values = {f"score.{name}": score.of(draft) for name, score in self.scores[source.name].items()}
+        loss = chunk_loss(chunk.space, chain, target_tokens(self.target, chunk, chain), self.settings.scale)
+        self.rows.append({"source": source.name, **self.episode, "index": self.decodes, "loss": loss, **values})
+        return chain
+
+
+class RiskRun:
+    """`kerv calibrate risk`: call `record`, then `finish`, which writes.
+
+    Raises:
+        UsageError: no such task, source or score; seeds that are not for selection. CheckpointError: no such target, or
+            an artifact that a source or a score reads is missing or another target's.
+    """
+
+    def __init__(self, settings: CalibrateRiskSettings) -> None:
+        self.settings = settings
+        self.tasks = resolve_tasks(settings.task)
+        self.seeds = range(settings.seed, settings.seed + settings.episodes)
+        spec_of(self.tasks[0]).seeds.check(self.seeds, "selection", f"seed={settings.seed}")
+        for name in settings.sources:
+            if not find("proposer", name, "source").traits.get("chains"):
+                raise UsageError(f"sources: '{name}' does not draft whole chunks from the prompt")
+        device, _ = set_up(settings.runtime)
+        self.artifacts = Artifacts(
+            settings.results, settings.policy, NoSettings("exact"), device, settings.runtime.dtype
+        )
+        self.artifacts.description.check_autoregressive("kerv calibrate risk", "there is no draft to calibrate")
+        scores = [need for name in settings.scores for need in find("score", name, "score").needs(None)]
+        sources = [need for name in settings.sources for need in find("proposer", name).needs(None)]
+        self.hashes = self.artifacts.check(dict.fromkeys([*sources, *scores]))
+        self.folder = self.artifacts.place("risk")
+        if settings.name is not None:
+            self.folder = artifact(settings.results, "risk", settings.name)
+        self.rows: list[Row] = []
+        self.features: list[np.ndarray] = []
+
+    def plan(self) -> str:
+        """One line for --plan."""
+        s, episodes = self.settings, len(self.tasks) * len(self.seeds)
+        return (
+            f"{self.folder}: {episodes} episodes on selection seeds {self.seeds.start} to {self.seeds.stop - 1}, about "
+            f"{episodes * 1.5 / 60:.0f} min (a guess); drafts of {', '.join(s.sources)}, scores {', '.join(s.scores)}"
+        )
+
+    def record(self, progress: Progress) -> None:
+        """Runs the episodes, task by task."""
+        done, total = 0, len(self.tasks) * len(self.seeds)
+        for task in self.tasks:
+            decoder, recorder = self._decoder(task)
+            for seed in self.seeds:
+                run_episode(open_world(task, self.settings.world), decoder, seed)
+                progress(done := done + 1, total)
+            self.rows += recorder.rows
+            self.features += recorder.features
+            close_worlds()
+
+    def _decoder(self, task: str) -> tuple[Decoder, Recorder]:
+        """A decoder that drafts from the first source, verifies and decodes on, and its recorder."""
+        target: Any = self.artifacts.target
+        context = Context(target, self.artifacts.load, task)
+        built: list[Any] = [find("proposer", n).built(_own(n), context) for n in self.settings.sources]
+        scores = {}
+        for source in built:
+            beside = Context(target, self.artifacts.load, task, {"prefill_draft": source})
+            wanted = self.settings.scores
+            scores[source.name] = {n: find("score", n).built(NoSettings(n), beside) for n in wanted}
+        recorder = Recorder(target, built, scores, self.settings)
+        method = RolloutSettings(acceptance=part_of("acceptance", "relaxed").settings()).parts()
+        method["prefill_draft"] = _own(self.settings.sources[0])
+        decoder = compose(method, target, self.artifacts.load, task)
+        return Decoder(target, replace(decoder.parts, skip=recorder)), recorder
+
+    def finish(self) -> RiskRecording:
+        """Writes the recording -> what was written.
+
+        Raises:
+            StorageError: writing failed.
+        """
+        described = self.artifacts.description
+        made = {
+            "command": "kerv calibrate risk",
+            "settings": as_plain(self.settings),
+            **provenance(self.settings.runtime.device),
+        }
+        manifest = RiskManifest(
+            target=MadeFor(described.sha256, described.actions, described.chunk),
+            sources={name: self.hashes.get(name, "") for name in self.settings.sources},
+            scale=self.settings.scale,
+            tasks={task: list(self.seeds) for task in self.tasks},
+            scores=list(self.settings.scores),
+            files={},
+            provenance=made,
+        )
+        return save_risk(self.folder, manifest, self.rows, np.array(self.features) if self.features else None)
+
+
+def _own(name: str) -> Any:
+    """Default settings of a proposer."""
+    return find("proposer", name).settings(kind=name)

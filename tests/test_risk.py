@@ -1,0 +1,362 @@
+"""skip=risk (docs/methods.md §4.6): the certificate, the audit, the gate in the decode loop, the recording."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+from examples.own_target import MockTarget
+from test_streak import ByPlace, near
+from test_unverified import SHOWN, Near
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.decoding.audit import Audit, Evidence
+from kerv_cli.decoding.certification import certify, episodes_needed, hoeffding_bentkus, p_value
+from kerv_cli.decoding.chunk import Chunk
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.loss import chunk_loss, target_tokens
+from kerv_cli.decoding.record import DecodeRecord
+from kerv_cli.decoding.risk import RiskSkip
+from kerv_cli.decoding.scores import Draft
+from kerv_cli.parts import RiskSkipSettings
+from kerv_cli.reporting.risk import auc, coverage
+
+# --- the certificate
+
+
+def population(seed: int, episodes: int, decodes: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scores, losses and episodes: a lower score loses more often, and decodes of an episode resemble each other."""
+    random = np.random.default_rng(seed)
+    mood = np.repeat(random.normal(size=episodes), decodes)
+    scores = mood + random.normal(size=episodes * decodes)
+    odds = 1 / (1 + np.exp(2.0 * scores + 1.5))
+    return scores, (random.random(len(scores)) < odds).astype(float), np.repeat(np.arange(episodes), decodes)
+
+
+def test_hoeffding_bentkus_against_its_formula() -> None:
+    n, mean, alpha = 40, 0.05, 0.2
+    bentkus = math.e * sum(math.comb(n, k) * alpha**k * (1 - alpha) ** (n - k) for k in range(3))
+    divergence = scipy.stats.entropy([mean, 1 - mean], [alpha, 1 - alpha])
+    assert hoeffding_bentkus(mean, alpha, n) == pytest.approx(min(bentkus, math.exp(-n * divergence)))
+    assert hoeffding_bentkus(0.2, 0.2, n) == 1.0
+
+
+def test_the_test_errs_no_oftener_than_it_says() -> None:
+    """Means just above ε, of a skewed and of a two-point distribution."""
+    random = np.random.default_rng(0)
+    skewed = [p_value(random.beta(0.2, 1.75, 80), 0.1) for _ in range(400)]
+    points = [p_value((random.random(80) < 0.101).astype(float), 0.1) for _ in range(400)]
+    for p in (skewed, points):
+        assert np.mean(np.array(p) <= 0.1) <= 0.1 + 3 * math.sqrt(0.09 / 400)
+
+
+def test_a_certified_risk_holds_in_repeated_calibrations() -> None:
+    """200 calibrations on 120 episodes each; the truth is that of 4,000 others."""
+    scores, losses, episodes = population(1, 4000)
+    epsilon, delta, held, shares = 0.15, 0.1, [], []
+    for seed in range(200):
+        found = certify(*population(100 + seed, 120), epsilon, delta)
+        shares.append(found.share)
+        skipped = scores >= found.level
+        if not skipped.any():
+            held.append(True)
+            continue
+        sums = np.bincount(episodes[skipped], losses[skipped], 4000)
+        counts = np.bincount(episodes[skipped], minlength=4000)
+        held.append(bool((sums[counts > 0] / counts[counts > 0]).mean() <= epsilon))
+    assert np.mean(held) >= 1 - delta
+    assert np.median(shares) > 0.15  # it is not empty
+
+
+def test_nothing_is_certified_where_the_draft_is_bad_or_episodes_are_few() -> None:
+    scores, losses, episodes = population(2, 100)
+    assert certify(scores, np.ones_like(losses), episodes, 0.1, 0.1).level == math.inf
+    few = episodes < episodes_needed(0.1, 0.1) - 1
+    assert certify(scores[few], np.zeros(few.sum()), episodes[few], 0.1, 0.1).level == math.inf
+    enough = episodes < episodes_needed(0.1, 0.1)
+    found = certify(scores[enough], np.zeros(enough.sum()), episodes[enough], 0.1, 0.1)
+    assert found.share == 1.0
+    assert found.risk == 0.0
+
+
+def test_coverage_and_auc_by_hand() -> None:
+    scores, losses = np.array([3.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.5])
+    shares, risks = coverage(scores, losses)
+    assert shares.tolist() == pytest.approx([1 / 3, 2 / 3, 1])
+    assert risks.tolist() == pytest.approx([0.0, 0.25, 0.5])
+    assert auc(scores, np.array([False, True, False])) == 1.0
+    assert auc(np.array([1.0, 1.0, 1.0]), np.array([False, True, False])) == 0.5
+
+
+# --- the audit
+
+
+def test_evidence_is_seldom_large_where_there_is_no_shift() -> None:
+    """Ville: with a mean of ε the e-value reaches 10 in at most a tenth of the sequences, whenever one looks."""
+    random, reached = np.random.default_rng(0), [0, 0]
+    for _ in range(500):
+        evidence = Evidence(0.1)
+        largest = [1.0, 1.0]
+        for loss in random.beta(0.2, 1.8, 60):
+            evidence.add(float(loss))
+            largest = [max(largest[0], evidence.above), max(largest[1], evidence.below)]
+        reached = [count + (value >= 10) for count, value in zip(reached, largest, strict=True)]
+    assert max(reached) <= 500 * 0.1
+
+
+def test_an_alarm_comes_within_ten_audits_and_goes_when_losses_stay_away() -> None:
+    audit = Audit(0.1, 0.1)
+    count = 0
+    while not audit.alarm:
+        audit.add(1.0)
+        count += 1
+    assert count <= 3
+    for _ in range(200):
+        audit.add(0.0)
+        if not audit.alarm:
+            break
+    assert not audit.alarm
+    audit.add(1.0)
+    audit.reset()
+    assert audit.evidence.above == 1.0
+
+
+# --- the loss
+
+
+@torch.inference_mode()
+def test_the_loss_is_a_share_of_the_scale_and_one_where_a_strict_dof_flips() -> None:
+    target = MockTarget()
+    space, truth = target.actions, np.array(near(target).drafted)
+    strict = space.strict_tokens(len(truth))
+    off = np.where(strict, truth, np.where(truth + 4 < space.tokens, truth + 4, truth - 4))
+    expected = 4 * 2 / space.tokens * (~strict).mean()
+    assert chunk_loss(space, off, truth, 1.0) == pytest.approx(expected)
+    assert chunk_loss(space, off, truth, expected / 2) == 1.0
+    flipped = truth.copy()
+    flipped[np.flatnonzero(strict)[0]] ^= 1
+    assert chunk_loss(space, flipped, truth, 1.0) == 1.0
+
+
+class Fixed:
+    """A score that is given."""
+
+    def __init__(self, *values: float) -> None:
+        self.values = list(values)
+
+    def of(self, draft: Draft) -> float:
+        return self.values.pop(0) if len(self.values) > 1 else self.values[0]
+
+
+def decoder_of(source: Near, target: MockTarget, score: Any = None, level: float = 0.0, **settings: Any) -> Decoder:
+    wanted = RiskSkipSettings(**{"audit": 0.0, "opening": 0, **settings})
+    skip = RiskSkip(wanted, source, score or Fixed(1.0), level, 0.1)
+    made = Decoder(target, Parts(prefill_draft=source, skip=skip))
+    made.reset("t", 0, np.zeros(3))
+    return made
+
+
+def reasons(decoder: Decoder, decodes: int) -> list[str]:
+    return [trust_of(decoder.decode(SHOWN)).reason for _ in range(decodes)]
+
+
+def trust_of(record: DecodeRecord) -> Any:
+    assert record.trust is not None
+    return record.trust
+
+
+@torch.inference_mode()
+def test_a_trusted_draft_is_executed_and_another_is_verified() -> None:
+    target = MockTarget()
+    decoder = decoder_of(near(target, 3), target, Fixed(1.0, -1.0, 1.0))
+    first, second, third = (decoder.decode(SHOWN) for _ in range(3))
+    assert first.skipped
+    assert third.skipped
+    assert first.tokens == tuple(near(target, 3).drafted)
+    assert (first.forwards, first.unverified) == (0, len(first.tokens))
+    assert not second.skipped
+    assert second.tokens == tuple(near(target).drafted)  # verified strictly: AR's tokens
+    assert [trust_of(r).reason for r in (first, second)] == ["trusted", "gate"]
+    assert trust_of(first).loss is None
+
+
+@torch.inference_mode()
+def test_the_opening_decodes_of_every_episode_are_verified_and_audited() -> None:
+    target = MockTarget()
+    decoder = decoder_of(near(target), target, opening=2)
+    assert reasons(decoder, 3) == ["opening", "opening", "trusted"]
+    decoder.finish(True)
+    decoder.reset("t", 1, np.zeros(3))
+    record = decoder.decode(SHOWN)
+    assert trust_of(record).audited
+    assert trust_of(record).loss == 0.0
+
+
+@torch.inference_mode()
+def test_audits_are_a_random_share_that_the_episode_determines() -> None:
+    target = MockTarget()
+    one, other = (decoder_of(near(target), target, audit=0.3) for _ in range(2))
+    drawn = reasons(one, 300)
+    assert drawn == reasons(other, 300)
+    assert 60 <= drawn.count("audit") <= 120
+    one.reset("t", 1, np.zeros(3))
+    assert reasons(one, 300) != drawn
+
+
+@torch.inference_mode()
+def test_bad_drafts_raise_an_alarm_after_which_everything_is_verified() -> None:
+    target = ByPlace()
+    source = near(target, 60)
+    decoder = decoder_of(source, target, opening=3)
+    records = [decoder.decode(SHOWN) for _ in range(6)]
+    found = [trust_of(r).reason for r in records]
+    assert found[0] == "opening"
+    assert found[-1] == "alarm"
+    assert all(trust_of(r).loss == 1.0 for r in records)
+    assert found.index("alarm") <= 3
+    first = next(r for r in records if trust_of(r).alarm)
+    assert trust_of(first).audited
+    decoder.reset("t", 1, np.zeros(3))
+    assert reasons(decoder, 1) == ["opening"]
+
+
+@torch.inference_mode()
+def test_the_audited_loss_is_that_of_a_forward_over_the_draft() -> None:
+    """The verification's own tokens against an independent forward, with a draft that is rejected on its way."""
+    target = ByPlace()
+    source = near(target, 5)
+    decoder = decoder_of(source, target, opening=1)
+    record = decoder.decode(SHOWN)
+    chunk = Chunk(target.encode(SHOWN), decoder.steps, target.actions, decoder.cache, decoder.situation)
+    wanted = target_tokens(target, chunk, source.drafted)
+    n = len(wanted) - 1  # the prefill judges all but the last token
+    assert trust_of(record).loss == pytest.approx(chunk_loss(target.actions, source.drafted[:n], wanted[:n], 0.1))
+
+
+# --- the command line
+
+
+def kerv(*words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.output
+
+
+@pytest.fixture(scope="module")
+def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
+    import shutil
+
+    from kerv_cli.drafting.early import EarlyDrafter, save_early
+    from kerv_cli.settings import DrafterSettings
+    from kerv_cli.targets.checkpoint import load_target
+
+    results = tmp_path_factory.mktemp("risk")
+    shutil.copytree(policies, results, dirs_exist_ok=True)
+    target, description = load_target(results / "artifacts/target/nano-state")
+    for name, seed in (("nano-state", 0), ("other", 1)):
+        torch.manual_seed(seed)
+        early = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
+        save_early(results / "artifacts/early" / name, early, description.sha256, {})
+    code, output = kerv("calibrate", "risk", *common(results), "episodes=2", "features=true", "world.horizon=24")
+    assert code == 0, output
+    return results
+
+
+def common(results: Path) -> tuple[str, ...]:
+    return "task=[reach,push]", "policy.target=nano-state", f"results={results}"
+
+
+def rollout(results: Path, *words: str) -> tuple[int, str]:
+    method = ("method=one_pass_risk", "proposer=none", "record=0", "episodes=1", "world.horizon=24")
+    return kerv("rollout", *common(results), *method, *words)
+
+
+def test_a_recording_certifies_a_gate_and_names_what_is_missing(recorded: Path) -> None:
+    folder = recorded / "artifacts/risk/nano-state"
+    assert {path.name for path in folder.iterdir()} == {
+        "risk.json",
+        "decodes.parquet",
+        "features.npy",
+        "coverage.png",
+    }
+    code, output = rollout(recorded)
+    assert code == 1
+    assert "4 recorded episodes cannot certify a risk of 0.1 at δ = 0.1: 29 are needed" in output
+    assert rollout(recorded, "skip.epsilon=0.9", "skip.delta=0.5")[0] == 0
+    code, output = rollout(recorded, "skip.epsilon=0.9", "skip.delta=0.5", "skip.score=similarity")
+    assert code == 1
+    assert "no datastore" in output
+
+
+def test_another_drafter_than_the_recorded_one_is_refused(recorded: Path) -> None:
+    code, output = rollout(recorded, "skip.epsilon=0.9", "skip.delta=0.5", "policy.early=other")
+    assert code == 1
+    assert "the recorded risk is that of early" in output
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("skip.epsilon=0", "skip.epsilon"),
+        ("skip.delta=0.9", "skip.delta"),
+        ("skip.score=odd", "did you mean odds"),
+        ("prefill_draft=none", "it executes what one source drafts"),
+    ],
+)
+def test_bad_input_gets_one_line(recorded: Path, word: str, message: str) -> None:
+    code, output = rollout(recorded, word)
+    assert code == 2
+    assert message in output
+
+
+def test_training_and_evaluation_seeds_are_not_calibrated_on(recorded: Path) -> None:
+    for seed in (0, 100_000):
+        code, output = kerv("calibrate", "risk", *common(recorded), f"seed={seed}")
+        assert code == 2
+        assert "seeds for selection are 50000 to 99999" in output
+
+
+def test_a_damaged_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
+    import shutil
+
+    results = tmp_path / "copy"
+    shutil.copytree(recorded, results)
+    path = results / "artifacts/risk/nano-state/decodes.parquet"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    code, output = rollout(results, "skip.epsilon=0.9", "skip.delta=0.5")
+    assert code == 1
+    assert "does not match its manifest" in output
+
+
+def test_the_learned_score_is_trained_and_used(recorded: Path) -> None:
+    code, output = kerv("train", "score", "policy.target=nano-state", f"results={recorded}", "steps=20")
+    assert code == 0, output
+    assert "auc" in output
+    again = ("episodes=2", "world.horizon=24", "seed=50200", "scores=[learned,odds]", "name=second")
+    code, output = kerv("calibrate", "risk", *common(recorded), *again)
+    assert code == 0, output
+    gate = ("skip.score=learned", "skip.epsilon=0.9", "skip.delta=0.5", "+policy.others.risk=second")
+    code, output = rollout(recorded, *gate)
+    assert code == 0, output
+
+
+def test_decodes_keep_why_they_were_verified(recorded: Path) -> None:
+    import pandas as pd
+
+    words = ("skip.level=-1e9", "skip.audit=0.5", "skip.opening=1")
+    code, output = rollout(recorded, *words)
+    assert code == 0, output
+    path = max((recorded / "rollouts").glob("*/cells/*/decodes.parquet"), key=lambda found: found.stat().st_mtime)
+    decodes, episodes = pd.read_parquet(path), pd.read_parquet(path.with_name("episodes.parquet"))
+    assert decodes["reason"].iloc[0] == "opening"
+    assert set(decodes["reason"]) <= {"opening", "audit", "alarm", "trusted"}
+    judged = decodes["loss"].notna()
+    assert (judged == ~decodes["skipped"]).all()
+    assert episodes["audits"].sum() == judged.sum()
+    assert episodes["audit_loss"].sum() == pytest.approx(decodes["loss"].sum())
