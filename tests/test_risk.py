@@ -337,7 +337,7 @@ def test_a_damaged_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
 def test_the_learned_score_is_trained_and_used(recorded: Path) -> None:
     code, output = kerv("train", "score", "policy.target=nano-state", f"results={recorded}", "steps=20")
     assert code == 0, output
-    assert "auc" in output
+    assert "loss_of_all" in output
     again = ("episodes=2", "world.horizon=24", "seed=50200", "scores=[learned,odds]", "name=second")
     code, output = kerv("calibrate", "risk", *common(recorded), *again)
     assert code == 0, output
