@@ -5,6 +5,7 @@ Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -93,6 +94,17 @@ class DecodeRecord:
         """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's and
         of a parallel one's, else what a prediction or a rejected draft filled."""
         return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
+
+    @property
+    def score(self) -> float | None:
+        """Of the draft, where a gate told one."""
+        known = self.trust is not None and math.isfinite(self.trust.score)
+        return self.trust.score if self.trust is not None and known else None
+
+    @property
+    def loss(self) -> float | None:
+        """Of the draft, where a gate's draft was verified."""
+        return self.trust.loss if self.trust is not None else None
 
     @property
     def verifications(self) -> int:

@@ -21,12 +21,14 @@ SIGNALS = {
     "variability": "K, kinematic variability",
     "metric": "F, boundary metric",
     "similarity": "similarity of the best neighbour",
+    "score": "score of the draft",
+    "loss": "loss of the draft, where verified",
     "deviation": "deviation from AR",
 }
 """Optional fields of DecodeRecord -> titles of their views."""
 
 
-LIMITS = {"metric": "F*", "similarity": "s_min"}
+LIMITS = {"metric": "F*", "similarity": "s_min", "score": "level"}
 """Signal -> name of the limit that a decision compares it with."""
 
 COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")

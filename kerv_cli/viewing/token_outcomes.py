@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from kerv_cli.decoding.record import DecodeRecord, Round
+from kerv_cli.decoding.record import DecodeRecord, Round, Trust
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,20 @@ def decode_line(decode: DecodeRecord) -> str:
         parts.append(f"{decode.compensated} compensated")
     if decode.skipped:
         parts.append("verification skipped")
+    if decode.trust is not None:
+        parts.append(trust_words(decode.trust))
     parts.append(f"{len(decode.actions)} step{'s' * (len(decode.actions) != 1)} · {1000 * decode.seconds:.1f} ms")
     return " · ".join(parts)
+
+
+def trust_words(trust: Trust) -> str:
+    """Why a draft was verified or not, in a few words."""
+    words = [trust.reason]
+    if math.isfinite(trust.score):
+        words.append(f"score {trust.score:.3g} against {trust.level:.3g}")
+    if trust.loss is not None:
+        words.append(f"loss {trust.loss:.2f}")
+    return ", ".join([*words, *(["ALARM"] * trust.alarm)])
 
 
 def acceptance(decode: DecodeRecord) -> tuple[float, float]:
