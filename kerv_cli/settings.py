@@ -84,6 +84,8 @@ class PolicySettings:
     early: str | None = None
     datastore: str | None = None
     calibration: str | None = None
+    risk: str | None = None
+    score: str | None = None
     others: dict[str, str] = field(default_factory=dict)  # artifacts of parts that are not kerv's: kind -> name
 
     def named(self, kind: str) -> str | None:

@@ -341,7 +341,7 @@ def test_the_learned_score_is_trained_and_used(recorded: Path) -> None:
     again = ("episodes=2", "world.horizon=24", "seed=50200", "scores=[learned,odds]", "name=second")
     code, output = kerv("calibrate", "risk", *common(recorded), *again)
     assert code == 0, output
-    gate = ("skip.score=learned", "skip.epsilon=0.9", "skip.delta=0.5", "+policy.others.risk=second")
+    gate = ("skip.score=learned", "skip.epsilon=0.9", "skip.delta=0.5", "policy.risk=second")
     code, output = rollout(recorded, *gate)
     assert code == 0, output
 
