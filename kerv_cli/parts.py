@@ -228,7 +228,7 @@ class RiskSkipSettings:
 
     kind: str = "risk"
     score: str = "odds"
-    epsilon: float = number(0.1, above=0, most=0.99)  # mean loss of unverified drafts
+    epsilon: float = number(0.15, above=0, most=0.99)  # mean loss of unverified drafts
     delta: float = number(0.1, above=0, most=0.5)  # probability that the calibration, or an alarm, errs
     level: float | None = number(None, -1e9, 1e9)  # least score that is trusted; None: the certified one
     audit: float = number(0.05, 0, 1)  # p_a, share of trusted drafts that are verified all the same

@@ -98,7 +98,7 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "prefill_draft": NoSettings("early"),
         "proposer": CHAIN,
         "acceptance": RELAXED,
-        "skip": p.RiskSkipSettings(score="odds", epsilon=0.1, delta=0.1, audit=0.05, opening=1),
+        "skip": p.RiskSkipSettings(score="odds", epsilon=0.15, delta=0.1, audit=0.05, opening=1),
     },
     "parallel": {"skip": NoSettings("parallel")},
     "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": p.JacobiProposerSettings(depth=0)},

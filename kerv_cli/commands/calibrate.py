@@ -136,7 +136,7 @@ def _risk(overrides: list[str], cfg: bool, plan: bool) -> None:
         run.record(advance)
     recording = run.finish()
     title = f"levels with a risk of at most {settings.epsilon:g}, certified at 1 - {settings.delta:g}"
-    columns = ("source", "score", "level", "trusted", "risk", "p", "AUC", "episodes")
+    columns = ("source", "score", "level", "trusted", "risk", "p", "holds in", "AUC", "episodes")
     print_table(columns, coverage_table(recording, settings.epsilon, settings.delta), title)
     plot = plot_coverage(recording, run.folder / "coverage.png")
     typer.echo(f"{run.folder}\n{plot}")

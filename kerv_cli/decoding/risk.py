@@ -19,7 +19,8 @@ from kerv_cli.parts import RiskSkipSettings
 class RiskSkip(Skip):
     """Executes drafts unverified where their score reaches the certified level, and audits a random share of them.
 
-    An episode's first `opening` decodes are verified, and so is everything after an alarm, until the audit ends it.
+    An episode's first `opening` decodes are verified, and so is everything after an alarm, until the audit ends it. An
+    audited loss above ε is followed by another audit, so that a shift shows within few decodes.
     level: least score that is trusted. scale: ε_a, normalised action units, of the loss.
     """
 
@@ -30,6 +31,7 @@ class RiskSkip(Skip):
         self.audit = Audit(settings.epsilon, settings.delta)
         self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
         self.decodes = 0  # of this episode
+        self.suspicious = False  # the last audited loss was above ε
         self.random = np.random.default_rng(0)
 
     def begin(self, task: str, seed: int) -> None:
@@ -37,7 +39,7 @@ class RiskSkip(Skip):
         digest = hashlib.sha256(f"audit {task} {seed}".encode()).digest()
         self.random = np.random.default_rng(int.from_bytes(digest[:8]))
         self.audit.reset()
-        self.decodes = 0
+        self.decodes, self.suspicious = 0, False
 
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`."""
@@ -63,7 +65,7 @@ class RiskSkip(Skip):
             return GATE
         if self.decodes < self.settings.opening:
             return OPENING
-        return AUDIT if drawn else TRUSTED
+        return AUDIT if drawn or self.suspicious else TRUSTED
 
     def verified(self, chunk: Chunk) -> None:
         """As `Skip.verified`: the loss, where the first verification judged this very draft."""
@@ -82,5 +84,6 @@ class RiskSkip(Skip):
         chunk.trust = replace(trust, loss=loss)
         if trust.score >= self.level:  # the gate would have trusted it: this is what the certificate speaks of
             self.audit.add(loss)
+            self.suspicious = loss > self.settings.epsilon
             if self.audit.alarm and not trust.alarm:
                 chunk.trust = replace(chunk.trust, alarm=True)

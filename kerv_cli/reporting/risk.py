@@ -10,10 +10,12 @@ import matplotlib as mpl
 import numpy as np
 from scipy.stats import rankdata
 
-from kerv_cli.decoding.risk_file import RiskRecording
+from kerv_cli.decoding.certification import certify, episode_means
+from kerv_cli.decoding.risk_file import Losses, RiskRecording
 from kerv_cli.files import atomic_path
 from kerv_cli.reporting.drawing import MUTED, STYLE, colour, entitle, figure_bytes, new_figure
 
+REPEATS = 200
 BAD = 0.5  # a draft with a larger loss is one that should have been verified
 
 
@@ -35,8 +37,24 @@ def auc(scores: np.ndarray, bad: np.ndarray) -> float:
     return float(1 - (ranks[bad].sum() - below * (below + 1) / 2) / (below * above))
 
 
+def held(found: Losses, score: str, epsilon: float, delta: float, repeats: int = REPEATS) -> float:
+    """Share of repeated calibrations, each on as many episodes drawn with replacement, whose level has a risk of at
+    most ε over all recorded episodes; a calibration that certifies nothing holds."""
+    count, scores, kept = int(found.episodes.max()) + 1, found.scores[score], 0
+    decodes = [np.flatnonzero(found.episodes == number) for number in range(count)]
+    random = np.random.default_rng(0)
+    for _ in range(repeats):
+        drawn = [decodes[number] for number in random.integers(0, count, count)]
+        rows, numbers = np.concatenate(drawn), np.repeat(np.arange(count), [len(own) for own in drawn])
+        level = certify(scores[rows], found.losses[rows], numbers, epsilon, delta).level
+        trusted = scores >= level
+        kept += not trusted.any() or episode_means(trusted, found.losses, found.episodes).mean() <= epsilon
+    return kept / repeats
+
+
 def coverage_table(recording: RiskRecording, epsilon: float, delta: float) -> list[tuple[str, ...]]:
-    """A row per source and score: level, trusted share, risk, p, AUC, episodes; `-` where nothing is certified."""
+    """A row per source and score: level, trusted share, risk, p, how often repeated calibrations hold, AUC, episodes;
+    `-` where nothing is certified."""
     rows: list[tuple[str, ...]] = []
     for source in recording.manifest.sources:
         found = recording.losses(source)
@@ -44,8 +62,9 @@ def coverage_table(recording: RiskRecording, epsilon: float, delta: float) -> li
             result = recording.certified(source, name, epsilon, delta)
             certain = (f"{result.level:.4g}", f"{result.share:.1%}", f"{result.risk:.4f}")
             figures = certain if math.isfinite(result.level) else ("-", "0%", "-")
-            discriminates = auc(scores, found.losses > BAD)
-            rows.append((source, name, *figures, f"{result.p:.3g}", f"{discriminates:.3f}", str(result.episodes)))
+            rest = (f"{result.p:.3g}", f"{held(found, name, epsilon, delta):.1%}")
+            discriminates = f"{auc(scores, found.losses > BAD):.3f}"
+            rows.append((source, name, *figures, *rest, discriminates, str(result.episodes)))
     return rows
 
 
