@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import secrets
+import tempfile
 from pathlib import Path
 
 from kerv_cli.errors import StorageError, UsageError
@@ -34,15 +33,12 @@ def check_writable(results: str) -> None:
     there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if not there.is_dir():
         raise UsageError(f"results={results}: {there} is a file, name a folder")
-    probe = there / f".kerv-{secrets.token_hex(6)}.tmp"
     try:
-        with storage_errors(folder):
-            probe.touch(exist_ok=False)
+        # nameless where the file system can: nothing stays when the process is killed here
+        with storage_errors(folder), tempfile.TemporaryFile(dir=there):
+            pass
     except OSError as error:
         raise StorageError(f"cannot write {folder}: {error.strerror}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            probe.unlink(missing_ok=True)
 
 
 def artifact(results: str, kind: str, name: str) -> Path:

@@ -1,44 +1,48 @@
 """Kills kerv's commands at random moments and at every write, and feeds them strange settings and damaged files.
 
-    python scripts/torture.py [--short] [--minutes 15] [--seed 0] [--only kills,overrides,artifacts]
+    python scripts/torture.py [--short] [--minutes 15] [--jobs CORES] [--seed 0] [--only kills,requests,artifacts]
 
 What must hold: a killed command, started again, ends with the artifacts and tables of an undisturbed run and leaves no
-temporary file; a wrong request or a damaged file gives exit 1 or 2 and one line, or the same result; nothing hangs.
-The figures are printed; the exit code is 1 where something did not hold. Every command runs in a fork of this process,
-so that Python and torch load once.
+file and no process behind; a wrong request or a damaged file gives exit 1 or 2 and one line, or the same result;
+nothing hangs. The figures are printed; the exit code is 1 where something did not hold. Every command runs in a fork of
+this process, so that Python and torch load once; the trials of all parts are shared out among `--jobs` processes.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import hashlib
 import json
+import multiprocessing
 import os
 import random
 import shutil
-import signal
 import sys
 import tempfile
 import time
+import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 warnings.simplefilter("ignore")
 
-from torture_cases import damages, wrong_requests  # noqa: E402
+from torture_cases import PLANNED, damage, wrong_request  # noqa: E402
+from torture_runs import Ended, Kill, learn, load, names_below, run, warm  # noqa: E402
+from torture_states import state  # noqa: E402
 
 from kerv_cli.config import conf_dir  # noqa: E402
 
 LONGEST = 10.0  # seconds of CPU that a wrong request or a damaged file may take
-TASK, NAME = "drawer-close", "mine"
+HANGS = 60.0  # seconds after which a command that waits for something is ended
+TRIALS = {"kills": 60, "requests": 1000, "artifacts": 1000}  # kills: at random, besides those at every write
+TASK, NAME = "handle-press", "mine"  # a task whose episodes are short
 FEW = [f"task={TASK}", "world.horizon=8"]
-NANO = ["target=nano", "target.observation=state", "train.batch=4", "train.validate_every=2"]
+NANO = ["target=nano", "target.observation=state", "target.chunk=2", "train.batch=4", "train.validate_every=2"]
 POLICY = ["policy=state", f"policy.target={NAME}"]
 STUDY = f"""
 name: tortured
@@ -60,11 +64,29 @@ COMMANDS = {  # in the order in which each needs what the ones before it made
     "sweep": ["sweep", "study=tortured"],
     "report": ["report", "study=tortured"],
 }
+READERS = {
+    "rollout": ["rollout", *FEW, *POLICY, "episodes=1", "record=0", "method=heisd"],
+    "resume": COMMANDS["train target"],
+    "build": [*COMMANDS["build"], "name=again"],
+    "report": COMMANDS["report"],
+    "sweep": [*COMMANDS["sweep"], "--plan"],
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One thing to try. number: its place among the trials of its part, which decides what is drawn at random.
+    command, at: of a kill, the command and the write before which it happens; 0: a random moment."""
+
+    part: str
+    number: int
+    command: str = ""
+    at: int = 0
 
 
 @dataclass
 class Tally:
-    """What was tried and what did not hold."""
+    """What was tried and what did not hold. slowest: seconds of CPU of a request or of a reader of damaged files."""
 
     kills: int = 0
     at_writes: int = 0
@@ -75,195 +97,129 @@ class Tally:
     slowest: float = 0.0
     faults: list[str] = field(default_factory=list)
 
-
-@dataclass(frozen=True)
-class Ended:
-    """How a command ended. code: its exit code, negative for a signal. cpu: seconds."""
-
-    code: int
-    cpu: float
-    text: str
-
-
-def run(
-    words: list[str], limit: float = 900.0, kill_at: int = 0, kill_after: float = 0.0, log: Path | None = None
-) -> Ended:
-    """Runs a command in a fork of this process, in its own process group.
-
-    kill_at: SIGKILL before this write, counted from 1. kill_after: SIGKILL after so many seconds. log: gets a byte for
-    every write.
-    """
-    output = tempfile.TemporaryFile()  # noqa: SIM115 - shared with the child
-    child = os.fork()
-    if child == 0:
-        _be_command(words, output.fileno(), kill_at, log)
-    with contextlib.suppress(OSError):  # the child does the same: whoever is first
-        os.setpgid(child, child)
-    deadline, killed = time.monotonic() + (kill_after or limit), False
-    while True:
-        ended, status, used = os.wait4(child, os.WNOHANG)
-        if ended:
-            break
-        if not killed and time.monotonic() > deadline:
-            os.killpg(child, signal.SIGKILL)
-            killed = True
-        time.sleep(0.003)
-    output.seek(0)
-    text = output.read().decode(errors="replace")
-    return Ended(os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, text)
-
-
-def _be_command(words: list[str], output: int, kill_at: int, log: Path | None) -> None:
-    os.setpgid(0, 0)
-    os.dup2(output, 1)
-    os.dup2(output, 2)
-    _count_writes(kill_at, log)
-    code: object = 0
-    try:
-        from kerv_cli.app import app
-
-        app(words)
-    except SystemExit as error:
-        code = error.code or 0
-    except BaseException:  # noqa: BLE001 - told apart by the exit code
-        import traceback
-
-        traceback.print_exc()
-        code = 99
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code if isinstance(code, int) else 98)
-
-
-def _count_writes(kill_at: int, log: Path | None) -> None:
-    """Counts what changes the disk for good, renames and syncs, in this process."""
-    done = [0]
-
-    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
-        def counting(*arguments: Any, **keywords: Any) -> Any:
-            done[0] += 1
-            if done[0] == kill_at:
-                os.kill(os.getpid(), signal.SIGKILL)
-            if log is not None:
-                with log.open("ab") as file:
-                    file.write(b".")
-            return function(*arguments, **keywords)
-
-        return counting
-
-    os.replace, os.rename, os.fsync = counted(os.replace), counted(os.rename), counted(os.fsync)
-
-
-def state(results: Path, command: str) -> dict[str, str]:
-    """What a command must make again after a kill: file -> hash. Of a sweep, the columns that no clock decides."""
-    places = {"train target": "target", "train drafter": "drafter", "build": "datastore", "calibrate": "calibration"}
-    if command == "sweep":
-        return dict(_sweep_state(results))
-    folder = results / ("report" if command == "report" else f"artifacts/{places.get(command, 'demos')}")
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(results)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def _sweep_state(results: Path) -> Iterator[tuple[str, str]]:
-    import pandas as pd
-
-    plan = results / "studies/tortured/plan.yaml"
-    yield "plan.yaml", hashlib.sha256(plan.read_bytes()).hexdigest()
-    for path in sorted(results.glob("studies/tortured/cells/*/episodes.parquet")):
-        table = pd.read_parquet(path, columns=["task", "seed", "success", "steps", "forwards", "tokens", "accepted"])
-        yield path.parent.name, table.to_csv()
+    def add(self, other: Tally) -> None:
+        """Adds what another process tried."""
+        for name, value in vars(other).items():
+            both = (getattr(self, name), value)
+            setattr(self, name, max(both) if name == "slowest" else both[0] + both[1])
 
 
 class Torture:
-    """Runs the three parts in a temporary folder. short: a tenth of everything."""
+    """The undisturbed runs in a temporary folder, and the trials that are compared with them."""
 
-    def __init__(self, folder: Path, seed: int, minutes: float, short: bool) -> None:
-        self.folder, self.random, self.short = folder, random.Random(seed), short
-        self.ends = time.monotonic() + 60 * minutes
+    def __init__(self, folder: Path, seed: int, ends: float) -> None:
+        self.folder, self.seed, self.ends = folder, seed, ends
         self.tally, self.writes, self.seconds = Tally(), dict[str, int](), dict[str, float]()
-
-    def enter(self, name: str) -> None:
-        """Makes a folder and goes there: `results` means the same in every run."""
-        (self.folder / name).mkdir()
-        os.chdir(self.folder / name)
+        self.wanted, self.names = dict[str, dict[str, str]](), dict[str, set[str]]()
 
     def prepare(self) -> None:
-        """Runs every command undisturbed; what lies in `results` before each is kept for the trials of that command."""
+        """Runs every command undisturbed, and learns what it loads; what lies in `results` before each is kept for its
+        trials. Then a second time, which must not change the results, and tells how long a command takes that finds
+        everything loaded."""
         conf = self.folder / "conf"
         shutil.copytree(conf_dir(), conf)
         (conf / "study/tortured.yaml").write_text(STUDY)
         os.environ["KERV_CONF_DIR"] = str(conf)
-        self.enter("whole")
+        whole, log = self.folder / "whole", self.folder / "log"
+        whole.mkdir()
         for command, words in COMMANDS.items():
-            if Path("results").exists():
-                shutil.copytree("results", self.folder / f"before {command}")
-            log, began = self.folder / "writes", time.monotonic()
-            log.unlink(missing_ok=True)
-            ended = run(words, log=log)
-            if ended.code:
-                raise SystemExit(f"{command} does not run: {ended.text[-600:]}")
-            self.writes[command] = log.stat().st_size
+            shutil.copytree(whole, self.folder / f"before {command}")
+            os.chdir(whole)
+            self.undisturbed(command, words, log)
+            self.wanted[command], self.names[command] = state(Path("results"), command), names_below(whole)
+            self.writes[command] = learn(log)
+        for name, words in PLANNED.items():
+            self.undisturbed(f"the plan of {name}", words, log)
+            learn(log)
+        warm(TASK)
+        for command in COMMANDS:
+            began = time.monotonic()
+            self.kill(command, [], random.Random())
             self.seconds[command] = time.monotonic() - began
             print(f"{command}: {self.writes[command]} writes, {self.seconds[command]:.1f} s", flush=True)
 
-    def time_left(self) -> bool:
-        """Whether another trial may begin."""
-        return time.monotonic() < self.ends
+    def undisturbed(self, name: str, words: list[str], log: Path) -> None:
+        """Runs a command that must succeed."""
+        ended = run(words, limit=10 * HANGS, log=log)
+        if ended.code:
+            raise SystemExit(f"{name} does not run: {ended.text[-600:]}")
 
-    def kills(self, at_random: int) -> None:
-        """Kills each command at every write (short: at every tenth), and at `at_random` random moments in all."""
-        step = 10 if self.short else 1
-        trials: list[tuple[str, int]] = [(c, at) for c in COMMANDS for at in range(1, self.writes[c] + 1, step)]
-        trials += [(self.random.choice([*COMMANDS]), 0) for _ in range(at_random)]
-        self.random.shuffle(trials)
-        wanted = {command: state(self.folder / "whole/results", command) for command in COMMANDS}
-        for command, at in trials:
-            if not self.time_left():
-                break
-            self.kill(command, at, wanted[command])
+    def trials(self, parts: list[str], share: int) -> list[Trial]:
+        """All trials, in an order drawn at random, so that a run that ends early has tried some of everything. share:
+        of so many takes one."""
+        kills = [(command, at) for command in COMMANDS for at in range(1, self.writes[command] + 1)]
+        kills += [(command, 0) for command, _ in zip(_forever([*COMMANDS]), range(TRIALS["kills"]), strict=False)]
+        found = [Trial("kills", number, *kill) for number, kill in enumerate(kills)]
+        found += [Trial(part, number) for part in ("requests", "artifacts") for number in range(TRIALS[part])]
+        random.Random(self.seed).shuffle(found)
+        return [trial for trial in found if trial.part in parts and trial.number % share == 0]
 
-    def kill(self, command: str, at: int, wanted: dict[str, str]) -> None:
-        """One trial: kill, start again, compare."""
-        self.enter("killed")
-        before = self.folder / f"before {command}"
-        if before.exists():
-            shutil.copytree(before, "results")
-        after = 0.0 if at else self.random.uniform(0.0, 1.2 * self.seconds[command])
-        first = run(COMMANDS[command], kill_at=at, kill_after=after)
-        self.tally.kills += first.code == -signal.SIGKILL
-        self.tally.at_writes += bool(at) and first.code == -signal.SIGKILL
-        again = run(COMMANDS[command])
-        what = f"{command}, killed {f'at write {at}' if at else f'after {after:.2f} s'}"
-        if again.code:
-            self.tally.faults.append(f"{what}: started again: exit {again.code}: {again.text[-300:]}")
-        elif (found := state(Path("results"), command)) != wanted:
-            differing = sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))
-            self.tally.faults.append(f"{what}: other results: {', '.join(differing[:5])}")
-        left = [*Path("results").rglob(".*.tmp"), *Path("results").glob("studies/*/claims/*")]
-        if left:
-            self.tally.faults.append(f"{what}: left {', '.join(map(str, left[:5]))}")
+    def __call__(self, trial: Trial) -> Tally:
+        """Makes one trial, in a folder of this process -> what came of it. Nothing once time is up."""
+        self.tally = Tally()
+        if time.monotonic() < self.ends:
+            draw = random.Random(f"{self.seed} {trial.part} {trial.number}")
+            try:
+                if trial.part == "kills":
+                    self.kill(trial.command, self.moments(trial, draw), draw)
+                else:
+                    getattr(self, trial.part)(draw)
+            except Exception:  # noqa: BLE001 - one trial that cannot be made must not end the others
+                self.tally.faults.append(f"{trial}: {traceback.format_exc()[-600:]}")
+        return self.tally
+
+    def place(self, content: str) -> Path:
+        """Goes to a new folder of this process with the content of one of the prepared ones."""
         os.chdir(self.folder)
-        shutil.rmtree("killed")
+        place = self.folder / f"process {os.getpid()}" / "below" / "here"
+        shutil.rmtree(place.parent, ignore_errors=True)
+        shutil.copytree(self.folder / content, place)
+        os.chdir(place)
+        return place
 
-    def overrides(self, count: int) -> None:
-        """Wrong and strange requests, each with --plan or --cfg so that nothing long begins."""
-        os.chdir(self.folder / "whole")
-        for words in wrong_requests(self.random, count):
-            if not self.time_left():
-                break
-            self.tally.requests += 1
-            self.judge(" ".join(words), run(words, limit=12 * LONGEST))
+    def moments(self, trial: Trial, draw: random.Random) -> list[Kill]:
+        """When a command is killed; at random moments up to three times, so that a command that goes on is killed
+        too."""
+        if trial.at:
+            return [Kill(at=trial.at)]
+        return [Kill(after=draw.uniform(0.0, self.seconds[trial.command])) for _ in range(draw.choice((1, 1, 2, 3)))]
 
-    def artifacts(self, count: int) -> None:
-        """Damaged files, each met by the command that reads it."""
-        whole = self.folder / "whole/results"
-        for damage in damages(self.random, count, whole):
-            if not self.time_left():
-                break
-            self.tally.artifacts += 1
-            with damage.applied(whole):
-                os.chdir(self.folder / "whole")
-                self.judge(damage.name, run(READERS[damage.reader], limit=12 * LONGEST))
+    def kill(self, command: str, moments: list[Kill], draw: random.Random) -> None:
+        """Kills a command, starts it again, compares."""
+        place, name = self.place(f"before {command}"), f"{command}, killed {', then '.join(map(str, moments))}"
+        ended = [run(COMMANDS[command], limit=HANGS, kill=moment) for moment in moments]
+        ended.append(run(COMMANDS[command], limit=HANGS))
+        self.tally.kills += sum(one.was_killed for one in ended[:-1])
+        self.tally.at_writes += sum(one.was_killed and bool(kill.at) for one, kill in zip(ended, moments, strict=False))
+        if ended[-1].code:
+            self.tally.faults.append(f"{name}: started again: exit {ended[-1].code}: {ended[-1].text[-300:]}")
+        elif (found := state(Path("results"), command)) != (wanted := self.wanted[command]):
+            differing = sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))
+            self.tally.faults.append(f"{name}: other results: {', '.join(differing[:5])}")
+        elif (names := names_below(place)) != self.names[command]:
+            self.tally.faults.append(f"{name}: other files: {', '.join(sorted(names ^ self.names[command])[:5])}")
+        if any(one.left for one in ended):
+            self.tally.faults.append(f"{name}: processes outlived it")
+
+    def requests(self, draw: random.Random) -> None:
+        """A wrong or strange request."""
+        words, place = wrong_request(draw), self.place("whole")
+        self.tally.requests += 1
+        self.judge(" ".join(words), run(words, limit=HANGS))
+        left = names_below(place.parent.parent) ^ {f"below/here/{name}" for name in self.names["report"]}
+        if left - {"below/", "below/here/"}:
+            self.tally.faults.append(f"{' '.join(words)[:200]!r}: left {', '.join(sorted(left)[:5])}")
+
+    def artifacts(self, draw: random.Random) -> None:
+        """A damaged file, met by the command that reads it."""
+        place = self.place("whole")
+        damaged = damage(draw, place / "results")
+        damaged.apply(place / "results")
+        self.tally.artifacts += 1
+        self.judge(damaged.name, run(READERS[damaged.reader], limit=HANGS))
+        left = [name for name in names_below(place) if name.endswith((".tmp", ".tmp/")) or "/claims/" in name[:-1]]
+        if left:
+            self.tally.faults.append(f"{damaged.name}: left {', '.join(left[:5])}")
 
     def judge(self, what: str, ended: Ended) -> None:
         """Notes a refusal that is not one line, a crash or a hang."""
@@ -271,8 +227,8 @@ class Torture:
         lines = [line for line in ended.text.splitlines() if line.startswith("kerv: ")]
         self.tally.refused += ended.code in (1, 2)
         self.tally.same += ended.code == 0
-        if ended.code not in (0, 1, 2) or ended.cpu > LONGEST:
-            fault = f"exit {ended.code} after {ended.cpu:.1f} s of CPU: {ended.text[-200:]}"
+        if ended.code not in (0, 1, 2) or ended.cpu > LONGEST or ended.left:
+            fault = f"exit {ended.code} after {ended.cpu:.1f} s of CPU, {ended.wall:.1f} in all: {ended.text[-200:]}"
         elif ended.code and (len(lines) != 1 or "internal error" in lines[0] or "Traceback" in ended.text):
             fault = f"exit {ended.code}: {(lines or [ended.text[-200:]])[0]}"
         else:
@@ -280,57 +236,54 @@ class Torture:
         self.tally.faults.append(f"{what[:200]!r}: {fault}")
 
 
-READERS = {
-    "rollout": ["rollout", *FEW, *POLICY, "episodes=1", "record=0", "method=heisd"],
-    "resume": COMMANDS["train target"],
-    "build": [*COMMANDS["build"], "name=again"],
-    "report": COMMANDS["report"],
-    "sweep": [*COMMANDS["sweep"], "--plan"],
-}
+def _forever(names: list[str]) -> Iterator[str]:
+    while True:
+        yield from names
+
+
+def share_out(torture: Torture, trials: list[Trial], jobs: int) -> Tally:
+    """Makes the trials in `jobs` forks of this process -> the sum of what came of them."""
+    whole, told = Tally(), time.monotonic()
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
+        try:
+            for done in as_completed([pool.submit(torture, trial) for trial in trials]):
+                whole.add(done.result())
+                if time.monotonic() > told + 60:
+                    told = time.monotonic()
+                    print(_summary(whole), flush=True)
+        except BrokenProcessPool:
+            whole.faults.append("a process that makes the trials ended; the machine may be short of memory")
+    return whole
+
+
+def _summary(tally: Tally) -> str:
+    figures = {**vars(tally), "slowest": round(tally.slowest, 1), "faults": len(tally.faults)}
+    return json.dumps(figures)
 
 
 def main() -> None:
     """Runs the parts and prints the figures."""
+    began = time.monotonic()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--short", action="store_true", help="a tenth of everything")
     parser.add_argument("--minutes", type=float, default=15.0, help="longest time of all together")
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="processes that make the trials")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="kills,overrides,artifacts")
+    parser.add_argument("--only", default=",".join(TRIALS))
     asked = parser.parse_args()
-    share = 10 if asked.short else 1
-    began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="kerv-torture-") as folder:
-        torture = Torture(Path(folder), asked.seed, asked.minutes, asked.short)
-        _load()
-        if asked.only == "overrides":
-            torture.enter("whole")
-        else:
-            torture.prepare()
-        for part, count in (("kills", 60), ("overrides", 1000), ("artifacts", 1000)):
-            if part in asked.only.split(","):
-                getattr(torture, part)(count // share)
+        torture = Torture(Path(folder), asked.seed, began + 60 * 0.98 * asked.minutes)  # what has begun must end, too
+        load()
+        torture.prepare()
+        print(f"ready after {time.monotonic() - began:.0f} s", flush=True)
+        trials = torture.trials(asked.only.split(","), 10 if asked.short else 1)
+        tally = share_out(torture, trials, asked.jobs)
+        tally.faults += torture.tally.faults
         os.chdir("/")
-    figures = {**vars(torture.tally), "faults": len(torture.tally.faults), "minutes": (time.monotonic() - began) / 60}
-    for fault in torture.tally.faults:
+    for fault in tally.faults:
         print(f"FAULT {' '.join(fault.split())}")
-    print(json.dumps({key: round(value, 1) for key, value in figures.items()}))
-    sys.exit(bool(torture.tally.faults))
-
-
-def _load() -> None:
-    """Imports what the commands need, so that forks need not."""
-    import torch
-
-    import kerv_cli.app
-    import kerv_cli.reporting.report
-    import kerv_cli.rollouts.cells
-    import kerv_cli.training.calibration
-    import kerv_cli.training.datastore
-    import kerv_cli.training.runs  # noqa: F401
-    from kerv_cli.environments.camera import choose_backend
-
-    torch.set_num_threads(1)
-    choose_backend()
+    print(f"{_summary(tally)} in {(time.monotonic() - began) / 60:.1f} minutes, {asked.jobs} processes")
+    sys.exit(bool(tally.faults))
 
 
 if __name__ == "__main__":

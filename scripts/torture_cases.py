@@ -1,8 +1,7 @@
-"""Strange requests and damaged files for torture.py, drawn from a seed."""
+"""Strange requests and damaged files for torture.py, drawn at random."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import random
@@ -73,54 +72,41 @@ VALUES = (
 PREFIXES = ("", "", "", "", "", "", "", "+", "++", "~", "@")
 
 
-def wrong_requests(draw: random.Random, count: int) -> Iterator[list[str]]:
-    """Command lines of one to three strange overrides."""
-    for _ in range(count):
-        command = draw.choice([*PLANNED])
-        words = [
-            f"{draw.choice(PREFIXES)}{draw.choice(KEYS[command])}={draw.choice(VALUES)}"
-            for _ in range(draw.choice((1, 1, 1, 2, 3)))
-        ]
-        # an empty result folder is made by no plan, so that these requests leave nothing behind
-        yield [*PLANNED[command], *words]
+def wrong_request(draw: random.Random) -> list[str]:
+    """A command line with one to three strange overrides. All are plans, so that nothing long begins."""
+    command = draw.choice([*PLANNED])
+    words = [
+        f"{draw.choice(PREFIXES)}{draw.choice(KEYS[command])}={draw.choice(VALUES)}"
+        for _ in range(draw.choice((1, 1, 1, 2, 3)))
+    ]
+    return [*PLANNED[command], *words]
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Another content of a file below the results, and the command that reads it. also: files that change with it."""
+    """Other contents of a file below the results, and the command that reads it. files: by path below the results; a
+    description whose hashes are renewed is one of them."""
 
     name: str
     reader: str
-    path: Path
-    content: bytes
-    also: tuple[tuple[Path, bytes], ...] = ()
+    files: dict[Path, bytes]
 
-    @contextlib.contextmanager
-    def applied(self, results: Path) -> Iterator[None]:
-        """Changes the files, and changes them back."""
-        changed = [(self.path, self.content), *self.also]
-        before = [(path, path.read_bytes()) for path, _ in changed]
-        for path, content in changed:
-            path.write_bytes(content)
-        try:
-            yield
-        finally:
-            for path, content in before:
-                path.write_bytes(content)
+    def apply(self, results: Path) -> None:
+        """Changes the files."""
+        for path, content in self.files.items():
+            (results / path).write_bytes(content)
 
 
-def damages(draw: random.Random, count: int, results: Path) -> Iterator[Damage]:
-    """Damaged descriptions, weights, datastores, training states, calibrations, plans and cells."""
-    readers = [(reader, path) for reader, pattern in _PATTERNS for path in sorted(results.glob(pattern))]
-    for _ in range(count):
-        reader, path = draw.choice(readers)
-        whole = path.read_bytes()
-        kinds = _TEXT if path.suffix in (".json", ".yaml") else _BINARY
-        kind = draw.choice(kinds)
-        content = _MADE[kind](draw, whole)
-        also = _renewed(path, content) if draw.random() < 0.5 else ()
-        name = f"{path.relative_to(results)} {kind}{', hashes renewed' if also else ''}"
-        yield Damage(name, reader, path, content, also)
+def damage(draw: random.Random, results: Path) -> Damage:
+    """A damaged description, weights, datastore, training state, calibration, plan or cell."""
+    reader, pattern = draw.choice(_PATTERNS)
+    path = draw.choice(sorted(results.glob(pattern)))
+    kind = draw.choice(_TEXT if path.suffix in (".json", ".yaml") else _BINARY)
+    content = _MADE[kind](draw, path.read_bytes())
+    also = _renewed(path, content) if draw.random() < 0.5 else {}
+    place = path.relative_to(results)
+    files = {file.relative_to(results): made for file, made in {path: content, **also}.items()}
+    return Damage(f"{place} {kind}{', hashes renewed' if also else ''}", reader, files)
 
 
 _PATTERNS = (
@@ -139,7 +125,7 @@ _PATTERNS = (
 )
 
 
-def _renewed(path: Path, content: bytes) -> tuple[tuple[Path, bytes], ...]:
+def _renewed(path: Path, content: bytes) -> dict[Path, bytes]:
     """The description beside a file with the hash that fits its new content, where there is one."""
     for name in ("manifest.json", "target.json", "drafter.json", "status.json"):
         described = path.parent / name
@@ -152,8 +138,8 @@ def _renewed(path: Path, content: bytes) -> tuple[tuple[Path, bytes], ...]:
             value.pop("sha256", None)
         else:
             value["sha256"] = digest
-        return ((described, json.dumps(value).encode()),)
-    return ()
+        return {described: json.dumps(value).encode()}
+    return {}
 
 
 def _flipped(draw: random.Random, whole: bytes) -> bytes:
