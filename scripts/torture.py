@@ -31,7 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 warnings.simplefilter("ignore")
 
-from torture_cases import PLANNED, damage, wrong_request  # noqa: E402
+from torture_cases import PLANNED, TASK, damage, wrong_request  # noqa: E402
 from torture_runs import Ended, Kill, learn, load, names_below, run, warm  # noqa: E402
 from torture_states import state  # noqa: E402
 
@@ -40,7 +40,7 @@ from kerv_cli.config import conf_dir  # noqa: E402
 LONGEST = 10.0  # seconds of CPU that a wrong request or a damaged file may take
 HANGS = 60.0  # seconds after which a command that waits for something is ended
 TRIALS = {"kills": 60, "requests": 1000, "artifacts": 1000}  # kills: at random, besides those at every write
-TASK, NAME = "handle-press", "mine"  # a task whose episodes are short
+NAME = "mine"
 FEW = [f"task={TASK}", "world.horizon=8"]
 NANO = ["target=nano", "target.observation=state", "target.chunk=2", "train.batch=4", "train.validate_every=2"]
 POLICY = ["policy=state", f"policy.target={NAME}"]

@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+TASK = "handle-press"  # its episodes are short
 PLANNED = {
     "rollout": ["rollout", "--plan"],
     "grid": ["rollout", "-m", "--plan"],
     "sweep": ["sweep", "--plan", "study=demo"],
     "demos": ["demos", "--plan"],
-    "train_target": ["train", "target", "--plan", "demos=few", "task=drawer-close"],
+    "train_target": ["train", "target", "--plan", "demos=few", f"task={TASK}"],
     "train_drafter": ["train", "drafter", "--plan", "demos=few"],
-    "build_datastore": ["build", "datastore", "--plan", "demos=few", "task=drawer-close"],
-    "calibrate": ["calibrate", "--plan", "demos=few", "task=drawer-close"],
+    "build_datastore": ["build", "datastore", "--plan", "demos=few", f"task={TASK}"],
+    "calibrate": ["calibrate", "--plan", "demos=few", f"task={TASK}"],
 }
 KEYS = {
     "rollout": (
