@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import NormalDist
 
 import pandas as pd
-from scipy.stats import norm
 
 from kerv_cli.errors import UsageError
 from kerv_cli.files import read_json, write_json
@@ -36,7 +36,7 @@ def confidence_of_a_look(looks: int) -> float:
     """
     if not 1 <= looks <= len(_CONSTANTS):
         raise UsageError(f"until=decided with {looks} looks: 1 to {len(_CONSTANTS)}; set study.block higher")
-    return float(1 - 2 * norm.sf(_CONSTANTS[looks - 1]))
+    return float(1 - 2 * NormalDist().cdf(-_CONSTANTS[looks - 1]))
 
 
 @dataclass(frozen=True)
