@@ -144,7 +144,6 @@ def load() -> None:
     """Imports and computes what every command needs, so that forks need not."""
     import torch
 
-    import kerv_cli.app
     from kerv_cli.environments.camera import choose_backend
     from kerv_cli.provenance import stamp
     from kerv_cli.studies.code import code_hash
@@ -185,4 +184,3 @@ def names_below(folder: Path) -> set[str]:
         inside = Path(root).relative_to(folder)
         found |= {str(inside / name) for name in files} | {f"{inside / name}/" for name in folders}
     return found
-

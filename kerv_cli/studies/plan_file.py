@@ -102,15 +102,18 @@ def plan_from_text(text: str) -> StudyPlan:
 
 
 def _cells(found: _File) -> Iterator[Cell]:
+    shared: dict[tuple[str, str], dict[str, Any]] = {}  # of thousands of cells: memory
     for line in found.cells:
-        label = found.labels[line.label]
+        label, key = found.labels[line.label], (line.label, line.task)
+        if key not in shared:
+            shared[key] = {**label.settings, "task": [line.task]}
         yield Cell(
             id=line.id,
             label=line.label,
             overrides=label.overrides,
             task=line.task,
             seeds=parse_seeds(line.seeds),
-            settings={**label.settings, "task": [line.task]},
+            settings=shared[key],
             identity=label.identity,
             repeat=line.repeat,
         )

@@ -16,6 +16,7 @@ import functools
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -225,7 +226,7 @@ class StudyStore:
             config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
             episodes = _columns(folder / "episodes.parquet", rows.EPISODE_SCHEMA)
             decodes = _columns(folder / "decodes.parquet", _DECODE_TIMES)
-            return _ReadCell(name, folder, config, status, episodes, _split_by_seed(decodes))
+            return _ReadCell(name, folder, config, _interned(status), episodes, _split_by_seed(decodes))
         except (OSError, ValueError, pa.ArrowException) as error:
             raise self._damaged(folder, error) from error
 
@@ -314,6 +315,11 @@ def _read_entry(text: str) -> dict[str, Any]:
     if not isinstance(entry, dict):
         raise ValueError(f"'{text[:40]}' is no entry")
     return entry
+
+
+def _interned(status: Mapping[str, Any]) -> dict[str, Any]:
+    """The same entries; texts that thousands of cells share stand in memory once."""
+    return {sys.intern(key): sys.intern(value) if isinstance(value, str) else value for key, value in status.items()}
 
 
 def _columns(path: Path, schema: pa.Schema) -> pa.Table:
