@@ -8,7 +8,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 
 GRID = 40  # candidate levels: quantiles of the scores
 
@@ -16,10 +15,12 @@ GRID = 40  # candidate levels: quantiles of the scores
 def hoeffding_bentkus(mean: float, alpha: float, n: int) -> float:
     """p-value of the hypothesis that n independent variables in [0, 1] with this mean have an expectation above alpha;
     the smaller of Hoeffding's and Bentkus' tails (Bates et al. 2021, §3.1)."""
+    from scipy.stats import binom  # 60 MB, which most commands do not need
+
     if n == 0 or mean >= alpha:
         return 1.0
     entropy = (1 - mean) * math.log((1 - mean) / (1 - alpha)) + (mean * math.log(mean / alpha) if mean > 0 else 0.0)
-    bentkus = math.e * float(scipy.stats.binom.cdf(math.ceil(n * mean), n, alpha))
+    bentkus = math.e * float(binom.cdf(math.ceil(n * mean), n, alpha))
     return min(1.0, math.exp(-n * entropy), bentkus)
 
 
