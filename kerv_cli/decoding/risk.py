@@ -20,8 +20,8 @@ class RiskSkip(Skip):
     """Executes drafts unverified where their score reaches the certified level, and audits a random share of them.
 
     An episode's first `opening` decodes are verified, and so is everything after an alarm, until the audit ends it. A
-    verified draft with a loss above ε, for whatever reason it was verified, is followed by another verification, so that
-    trust does not outlast what contradicts it.
+    verified draft with a loss above ε, for whatever reason it was verified, is followed by another verification, so
+    that trust does not outlast what contradicts it.
     level: least score that is trusted. scale: ε_a, normalised action units, of the loss.
     """
 
