@@ -233,6 +233,9 @@ class RiskSkipSettings:
     level: float | None = number(None, -1e9, 1e9)  # least score that is trusted; None: the certified one
     audit: float = number(0.05, 0, 1)  # p_a, share of trusted drafts that are verified all the same
     opening: int = number(1, 0, MOST_DECODES)  # first decodes of an episode that are verified
+    doubt: float = number(
+        1.0, above=0, most=2
+    )  # a verified draft of this loss or more has the next one verified; 2: none
 
 
 # --- what searches the datastore (§4.1): every backend gives the same neighbours

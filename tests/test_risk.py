@@ -226,13 +226,13 @@ def test_bad_drafts_raise_an_alarm_after_which_everything_is_verified() -> None:
 
 
 @torch.inference_mode()
-def test_an_audited_loss_above_epsilon_is_followed_by_another_audit() -> None:
-    """A draft that is off by little: a loss above ε, far from an alarm."""
+def test_a_verified_loss_is_followed_by_another_verification() -> None:
+    """A draft that is off by little, far from an alarm."""
     target = ByPlace()
     truth = np.array(near(target).drafted)
     source = near(target, 3)
     source.drafted = np.where(target.actions.strict_tokens(len(truth)), truth, source.drafted).tolist()
-    decoder = decoder_of(source, target, opening=1, epsilon=0.1, delta=0.001)
+    decoder = decoder_of(source, target, opening=1, epsilon=0.1, delta=0.001, doubt=0.1)
     record = decoder.decode(SHOWN)
     assert 0.1 < trust_of(record).loss < 0.5
     assert reasons(decoder, 1) == ["audit"]

@@ -20,8 +20,8 @@ class RiskSkip(Skip):
     """Executes drafts unverified where their score reaches the certified level, and audits a random share of them.
 
     An episode's first `opening` decodes are verified, and so is everything after an alarm, until the audit ends it. A
-    verified draft with a loss above ε, for whatever reason it was verified, is followed by another verification, so
-    that trust does not outlast what contradicts it.
+    verified draft with a loss of `doubt` or more, for whatever reason it was verified, is followed by another
+    verification, so that trust does not outlast what contradicts it.
     level: least score that is trusted. scale: ε_a, normalised action units, of the loss.
     """
 
@@ -32,7 +32,7 @@ class RiskSkip(Skip):
         self.audit = Audit(settings.epsilon, settings.delta)
         self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
         self.decodes = 0  # of this episode
-        self.suspicious = False  # the last decode was verified and its loss was above ε
+        self.suspicious = False  # the last decode was verified with a loss of `doubt` or more
         self.random = np.random.default_rng(0)
 
     def begin(self, task: str, seed: int) -> None:
@@ -83,7 +83,7 @@ class RiskSkip(Skip):
         trust = chunk.trust
         assert trust is not None
         chunk.trust = replace(trust, loss=loss)
-        self.suspicious = loss > self.settings.epsilon
+        self.suspicious = loss >= self.settings.doubt
         if trust.score >= self.level:  # the gate would have trusted it: this is what the certificate speaks of
             self.audit.add(loss)
             if self.audit.alarm and not trust.alarm:
