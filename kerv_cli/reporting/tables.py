@@ -25,7 +25,7 @@ from kerv_cli.reporting.ceiling import (
 )
 from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, measure
 from kerv_cli.settings import MODEL
-from kerv_cli.studies.plan import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, OBSERVATION, Cell, seeds_text, without
+from kerv_cli.studies.plan import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, OBSERVATION, Cell, seeds_text, stress_of, without
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
 
@@ -174,7 +174,7 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
 def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
     """Settings, weights and provenance of a row; where its cells differ, the values are joined by semicolons."""
     settings, policy = cells[0].settings, cells[0].settings["policy"]
-    world, runtime = settings["world"], settings["runtime"]
+    world, runtime, stress = settings["world"], settings["runtime"], stress_of(settings)
     statuses = [data.cells[cell.id].status for cell in cells]
     parts = without(settings, {*NOT_DETERMINING, "world", "runtime"})
     weights = {
@@ -189,6 +189,8 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "horizon": world["horizon"],
         "camera": world["camera"]["name"],
         **flatten({"camera": without(world["camera"], {"name"})}),
+        "stress": stress["kind"],
+        "stress_level": stress["level"],
         **without(runtime, NOT_DETERMINING_RUNTIME),
         **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),
