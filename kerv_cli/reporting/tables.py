@@ -25,7 +25,15 @@ from kerv_cli.reporting.ceiling import (
 )
 from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, measure
 from kerv_cli.settings import MODEL
-from kerv_cli.studies.plan import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, OBSERVATION, Cell, seeds_text, stress_of, without
+from kerv_cli.studies.plan import (
+    NOT_DETERMINING,
+    NOT_DETERMINING_RUNTIME,
+    OBSERVATION,
+    Cell,
+    seeds_text,
+    stress_of,
+    without,
+)
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
 

@@ -76,17 +76,23 @@ class MetaWorld(MujocoWorld):
         inside, space = env._last_rand_vec, env._random_reset_space
         outwards = (self.stress.spread - 1.0) * (inside - (space.low + space.high) / 2)
         outwards[2::3] = 0.0  # heights
-        tries = itertools.count()
+        reset_model = env.reset_model
 
-        def placement() -> NDArray[np.float64]:
-            env._last_rand_vec = inside + outwards * 0.5 ** next(tries)
-            return np.array(env._last_rand_vec)
+        def placed() -> Any:  # a reset calls it twice; it asks for placements until one suits it
+            shares = (0.5**tries for tries in itertools.count())
 
-        env._get_state_rand_vec = placement
+            def placement() -> NDArray[np.float64]:
+                env._last_rand_vec = inside + outwards * next(shares)
+                return np.array(env._last_rand_vec)
+
+            env._get_state_rand_vec = placement
+            return reset_model()
+
+        env.reset_model = placed
         try:
             state, _ = env.reset()
         finally:
-            del env._get_state_rand_vec
+            del env.reset_model, env._get_state_rand_vec
         return np.array(state, dtype=np.float64)
 
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:

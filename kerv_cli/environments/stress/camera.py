@@ -20,7 +20,7 @@ class Level:
     degrees: float
 
 
-LEVELS = (Level(0.005, 0.5), Level(0.01, 1), Level(0.02, 2), Level(0.04, 4))
+LEVELS = (Level(0.003, 0.3), Level(0.006, 0.6), Level(0.01, 1.0), Level(0.015, 1.5))
 
 
 class CameraJitter(Stress):

@@ -21,7 +21,7 @@ class Level:
     degrees: float
 
 
-LEVELS = (Level(1.25, 15), Level(1.6, 30), Level(2.2, 60), Level(4.0, 90))
+LEVELS = (Level(1.05, 5), Level(1.1, 10), Level(1.2, 15), Level(1.3, 20))
 
 
 class Light(Stress):
