@@ -13,6 +13,7 @@ from urllib.parse import quote
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from kerv_cli.reporting import stressed
 from kerv_cli.reporting.choose import choices, sentence
 from kerv_cli.reporting.decided import read_verdicts
 from kerv_cli.reporting.measures import MACRO, MICRO
@@ -86,6 +87,8 @@ def render(
 
 def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str:
     """The study's answer in one sentence."""
+    if stressed.is_stressed(whole):
+        return stressed.verdict(whole)
     if not any(row["pairs"] and row["label"] != row["baseline"] for row in rows_of(whole, MICRO)):
         rows = rows_of(whole, MICRO)
         told = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
