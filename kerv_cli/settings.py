@@ -17,6 +17,9 @@ from kerv_cli.registry import NoSettings, find
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
 
+MOST_STRESS = 4
+"""The highest level of every kind of stress."""
+
 
 @dataclass
 class CameraSettings:
@@ -41,7 +44,7 @@ class StressSettings:
     """A shift of a stated size, drawn per episode from task, seed, kind and level (docs/stress.md)."""
 
     kind: str = "none"  # push | actuation | sensor | light | colour | camera | object
-    level: int = number(0, 0, 4)  # 0: none
+    level: int = number(0, 0, MOST_STRESS)  # 0: none
 
     @property
     def active(self) -> bool:

@@ -21,14 +21,14 @@ from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.environments.recorded import register_recorded
 from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.environments.stress.base import MOST_LEVEL, Draws, Spells, objects
+from kerv_cli.environments.stress.base import Draws, Spells, objects
 from kerv_cli.environments.stress.colour import scenery_of
 from kerv_cli.environments.world import MujocoWorld
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.registry import parts
 from kerv_cli.rollouts.policy import check
 from kerv_cli.rollouts.run import Runner, close_worlds
-from kerv_cli.settings import RolloutSettings, StressSettings, as_plain, settings_from
+from kerv_cli.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
 from kerv_cli.studies.plan import determinants, stress_of
 
 SEED, STEPS, SIZE = 50_006, 24, 48
@@ -86,7 +86,7 @@ def test_every_kind_is_a_part_and_has_numbers_for_every_level() -> None:
     assert set(parts("stress")) == {*KINDS, "none"}
     for kind in KINDS:
         module = __import__(parts("stress")[kind].build.partition(":")[0], fromlist=["LEVELS"])
-        assert len(module.LEVELS) == MOST_LEVEL
+        assert len(module.LEVELS) == MOST_STRESS
         rows = [dataclasses.astuple(level) if dataclasses.is_dataclass(level) else (level,) for level in module.LEVELS]
         assert (np.diff(np.array(rows), axis=0) > 0).all(), kind  # every number grows with the level
 

@@ -158,8 +158,15 @@ def _number(value: float) -> str:
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """A row per task, a column per setting: successes and the speedup."""
+    """A row per task, a column per setting: successes and the speedup. With stress, which makes many settings, a row per
+    setting and a column per task."""
     labels = list(dict.fromkeys(per_task["label"]))
+    if stressed.is_stressed(per_task):
+        found = {(row["label"], row["task"]): row for row in rows_of(per_task)}
+        tasks = sorted(set(per_task["task"]))
+        return pd.DataFrame(
+            {"setting": label, **{task: _cell(found.get((label, task))) for task in tasks}} for label in labels
+        )
     rows = []
     for task in sorted(set(per_task["task"])):
         own = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.settings import MOST_STRESS
+
 if TYPE_CHECKING:
     from kerv_cli.spaces import ActionSpace
 
-MOST_LEVEL = 4
 Array = NDArray[np.float64]
 
 
@@ -52,7 +53,7 @@ class Stress:
     """A shift of a stated size, drawn anew for every episode. A kind overrides the methods in which it takes hold;
     this class shifts nothing.
 
-    kind: its name. level: 1 to MOST_LEVEL. spread: factor by which the range of initial states is widened around its
+    kind: its name. level: 1 to MOST_STRESS. spread: factor by which the range of initial states is widened around its
     centre. changes_model: whether `change` does anything.
     """
 
@@ -137,6 +138,6 @@ def objects(model: Any) -> list[int]:
 
 
 def level_of(levels: Sequence[Any], level: int) -> Any:
-    """The numbers of level 1 to MOST_LEVEL."""
-    assert len(levels) == MOST_LEVEL
+    """The numbers of level 1 to MOST_STRESS."""
+    assert len(levels) == MOST_STRESS
     return levels[level - 1]
