@@ -158,8 +158,8 @@ def _number(value: float) -> str:
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """A row per task, a column per setting: successes and the speedup. With stress, which makes many settings, a row per
-    setting and a column per task."""
+    """A row per task, a column per setting: successes and the speedup. With stress, which makes many settings, the other
+    way round."""
     labels = list(dict.fromkeys(per_task["label"]))
     if stressed.is_stressed(per_task):
         found = {(row["label"], row["task"]): row for row in rows_of(per_task)}
