@@ -158,7 +158,7 @@ def _number(value: float) -> str:
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """A row per task, a column per setting: successes and the speedup. With stress, which makes many settings, the other
+    """A row per task, a column per setting: successes and the speedup. Stress makes many settings: with it the other
     way round."""
     labels = list(dict.fromkeys(per_task["label"]))
     if stressed.is_stressed(per_task):
