@@ -62,7 +62,7 @@ def stress_figure(table: pd.DataFrame, title: str, about: str, averaging: str = 
     down = -(-len(kinds) // across)
     floor = success_floor(table[table["averaging"] == averaging])
     with mpl.rc_context(STYLE):
-        figure = new_figure(max(6.0, 3.1 * across), 1.4 + 2.7 * down)
+        figure = new_figure(max(8.0, 3.1 * across), 1.4 + 2.7 * down)
         panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
         for place, (panel, (kind, methods)) in enumerate(zip(panels, kinds.items(), strict=False)):
             for number, name in enumerate(names):
