@@ -353,6 +353,17 @@ def _add(
 
 for _name in ("metaworld", "insertion"):
     _add("environment", _name, f"environments.{_name}.spec:SPEC", names=f"kerv_cli.environments.{_name}.tasks:NAMES")
+for _name, _module, _class, _needs in (
+    ("push", "push", "Push", ("actions", "position")),
+    ("actuation", "actuation", "Actuation", ("actions",)),
+    ("sensor", "sensor", "Sensor", ("images",)),
+    ("light", "light", "Light", ("model",)),
+    ("colour", "colour", "Colour", ("model",)),
+    ("camera", "camera", "CameraJitter", ("model",)),
+    ("object", "objects", "Objects", ("model", "range")),
+):
+    _add("stress", _name, f"environments.stress.{_module}:{_class}", needed=_needs)
+_add("stress", "none")
 _add("target", "compact", "targets.compact.target:build")
 _add(
     *("target", "openvla", "targets.openvla.target:build"),

@@ -41,9 +41,10 @@ class Part:
     """One choice among the parts of a kind.
 
     kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
-    environment or executor. build: `module:function`; its arguments are documented where the kind is used. settings:
-    dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these settings need.
-    check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines and timeline.
+    environment, stress or executor. build: `module:function`; its arguments are documented where the kind is used.
+    settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
+    settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
+    and timeline.
     traits: further properties that the kind asks for, e.g. when a proposer can draft.
     """
 

@@ -12,10 +12,13 @@ from typing import Any
 from kerv_cli import manifests, parts
 from kerv_cli.errors import UsageError
 from kerv_cli.limits import choice, limits, number
-from kerv_cli.registry import NoSettings
+from kerv_cli.registry import NoSettings, find
 
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
+
+MOST_STRESS = 4
+"""The highest level of every kind of stress."""
 
 
 @dataclass
@@ -34,6 +37,32 @@ class WorldSettings:
 
     camera: CameraSettings = field(default_factory=CameraSettings)
     horizon: int = number(0, 0, 1_000_000)  # control steps; 0: the environment's
+
+
+@dataclass
+class StressSettings:
+    """A shift of a stated size, drawn per episode from task, seed, kind and level (docs/stress.md)."""
+
+    kind: str = "none"  # push | actuation | sensor | light | colour | camera | object
+    level: int = number(0, 0, MOST_STRESS)  # 0: none
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is shifted."""
+        return self.kind != "none" and self.level > 0
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UnknownName for a kind that is not registered, UsageError for a level without a kind."""
+        find("stress", self.kind, f"{prefix}kind")
+        if self.kind == "none" and self.level:
+            raise UsageError(f"{prefix}level={self.level} without {prefix}kind: name what is shifted")
+
+
+@dataclass
+class RolloutWorldSettings(WorldSettings):
+    """The world of a rollout, which may be shifted from the one that the policy was trained in."""
+
+    stress: StressSettings = field(default_factory=StressSettings)
 
 
 @dataclass
@@ -111,7 +140,7 @@ class RolloutSettings(TaskSettings):
     skip: Any = field(default_factory=NoSettings)
     chunk: int = number(0, 0, 1024)  # H, control steps decoded at once; 0: as many as the target was trained for
     datastore: Any = field(default_factory=lambda: NoSettings("exact"))
-    world: WorldSettings = field(default_factory=WorldSettings)
+    world: RolloutWorldSettings = field(default_factory=RolloutWorldSettings)
     deviation_every: int = number(0, 0, 1_000_000)  # decodes between two deviation samples; 0: never
     record: int = number(1, -1, 1_000_000)  # episodes per task that are saved as .rrd; -1: all
     record_size: int = number(240, 8, 4096)  # pixels of the logged camera

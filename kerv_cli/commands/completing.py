@@ -77,6 +77,10 @@ def _values(command: str, key: str) -> list[str]:
     if key == "study" and command == "report":
         results = Path("results/studies")
         return sorted(path.parent.name for path in results.glob("*/plan.yaml"))
+    if key == "world.stress.kind":
+        from kerv_cli.registry import parts
+
+        return list(parts("stress"))
     if key == "until":
         return ["decided", "done"]
     return groups_of(command).get(key, [])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -23,7 +23,7 @@ from kerv_cli.commands.common import (
 from kerv_cli.errors import KervError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     import pandas as pd
 
@@ -49,6 +49,8 @@ def rollout(
     as_json: AsJson = False,
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
+    from dataclasses import asdict
+
     from kerv_cli.config import to_yaml
     from kerv_cli.effects import without_effect
     from kerv_cli.environments import resolve_tasks
@@ -67,12 +69,20 @@ def rollout(
     cells = planned_cells(resolved)
     if plan:
         total = sum(len(cell.seeds) for cell in cells)
-        names = ", ".join(resolved.settings)
+        names = ", ".join(f"{label}{_stressed(asdict(own))}" for label, own in resolved.settings.items())
         typer.echo(f"{names}: {len(resolve_tasks(first.task))} tasks, {total} episodes, about {3 * total} s (a guess)")
         return
     arguments = ["rollout", *(["-m"] if multirun else []), *words]
     store = run_cells(resolved, cells, first.results, arguments)
     _tell(store, cells, as_json, in_same(words))
+
+
+def _stressed(settings: Mapping[str, Any]) -> str:
+    """How a setting of plain RolloutSettings is called after its label: its stress; empty without one."""
+    from kerv_cli.studies.plan import stress_of
+
+    stress = stress_of(settings)
+    return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
 
 
 def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
@@ -210,7 +220,8 @@ def _single(data: StudyData) -> None:
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     seen = cell.identity.get("observation", "")
-    print_table(headers, rows, f"{cell.label}, observation {seen}, seeds {seeds}")
+    stress = _stressed(cell.settings)
+    print_table(headers, rows, f"{cell.label}, observation {seen}{stress}, seeds {seeds}")
     decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
     seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
     rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]

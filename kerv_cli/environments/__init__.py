@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.registry import load, parts
@@ -15,6 +15,8 @@ from kerv_cli.registry import load, parts
 if TYPE_CHECKING:
     from kerv_cli.environments.spec import EnvironmentSpec
     from kerv_cli.settings import WorldSettings
+
+W = TypeVar("W", bound="WorldSettings")
 
 KIND = "environment"
 NAMES = "names"
@@ -73,7 +75,7 @@ def task_names() -> Iterator[str]:
             yield from (*spec.suites, *spec.tasks)
 
 
-def settled(world: WorldSettings, spec: EnvironmentSpec) -> WorldSettings:
+def settled(world: W, spec: EnvironmentSpec) -> W:
     """World settings with the environment's own camera and horizon where `world` leaves them open.
 
     Raises:

@@ -5,20 +5,26 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kerv_cli.environments.camera import Camera, CameraConfig
 from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.environments.stress.base import NO_STRESS, ModelChanges, Stress
 from kerv_cli.errors import KervError, UsageError
 from kerv_cli.spaces import Observation
 
 
 class EpisodeWorld(ABC):
-    """Implements the protocol `World` except for the simulator. Not
-    thread-safe."""
+    """Implements the protocol `World` except for the simulator. Not thread-safe.
+
+    stress: the shift of its episodes, from the next reset on. stressable: what a stress can change of this world
+    (docs/stress.md); one whose `_start` widens the range of initial states by `stress.spread` adds `range`.
+    """
+
+    stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
@@ -30,6 +36,7 @@ class EpisodeWorld(ABC):
         self.spec, self.task, self.instruction = spec, found.name, found.instruction
         self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
         self.steps, self.success, self.succeeded = 0, False, False
+        self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
 
     @abstractmethod
@@ -77,6 +84,7 @@ class EpisodeWorld(ABC):
         """As `World.reset`."""
         if seed < 0:
             raise UsageError(f"episode seed must be 0 or more, not {seed}")
+        self.stress.begin(self.task, seed, self.spec.actions)
         state = self._start(seed)
         self.steps, self.success, self.succeeded = 0, False, False
         return self._told(state)
@@ -92,7 +100,8 @@ class EpisodeWorld(ABC):
             raise KervError(
                 f"{self.task}: the episode ended at step {self.steps}, its horizon; reset before stepping on"
             )
-        state, self.success = self._advance(np.clip(executed, space.low, space.high))
+        executed = self.stress.act(np.clip(executed, space.low, space.high), self.steps)
+        state, self.success = self._advance(executed)
         self.succeeded = self.succeeded or self.success
         self.steps += 1
         return self._told(state)
@@ -109,7 +118,9 @@ class EpisodeWorld(ABC):
 
     def observe(self, cameras: Sequence[str]) -> Observation:
         """As `World.observe`; images have the size of the world's own camera."""
-        images = {name: self.frame(replace(self.camera, name=name)) for name in cameras}
+        images = {
+            name: self.stress.see(name, self.frame(replace(self.camera, name=name)), self.steps) for name in cameras
+        }
         return self.observation.with_images(images)
 
     def close(self) -> None:
@@ -124,15 +135,27 @@ class EpisodeWorld(ABC):
 
 
 class MujocoWorld(EpisodeWorld):
-    """A world with a MuJoCo model. Each view has a graphics context, opened when it is first drawn."""
+    """A world with a MuJoCo model. Each view has a graphics context, opened when it is first drawn. What a stress
+    changes of the model is put back at the next reset."""
+
+    stressable = EpisodeWorld.stressable | {"model"}
 
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
         self._cameras: dict[CameraConfig, Camera] = {}
+        self._changes = ModelChanges()
 
     @abstractmethod
     def _drawable(self) -> tuple[Any, Any]:
         """The MjModel, and MjData in which all poses are up to date."""
+
+    def reset(self, seed: int) -> Observation:
+        """As `World.reset`."""
+        self._changes.restore()
+        observation = super().reset(seed)
+        if self.stress.changes_model:
+            self.stress.change(self._drawable()[0], self._changes)
+        return observation
 
     def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
         model, data = self._drawable()
@@ -142,6 +165,7 @@ class MujocoWorld(EpisodeWorld):
 
     def close(self) -> None:
         """As `World.close`."""
+        self._changes.restore()
         for camera in self._cameras.values():
             camera.close()
         self._cameras.clear()

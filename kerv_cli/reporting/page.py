@@ -13,6 +13,7 @@ from urllib.parse import quote
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from kerv_cli.reporting import stressed
 from kerv_cli.reporting.choose import choices, sentence
 from kerv_cli.reporting.decided import read_verdicts
 from kerv_cli.reporting.measures import MACRO, MICRO
@@ -86,6 +87,8 @@ def render(
 
 def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str:
     """The study's answer in one sentence."""
+    if stressed.is_stressed(whole):
+        return stressed.verdict(whole)
     if not any(row["pairs"] and row["label"] != row["baseline"] for row in rows_of(whole, MICRO)):
         rows = rows_of(whole, MICRO)
         told = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
@@ -155,8 +158,15 @@ def _number(value: float) -> str:
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """A row per task, a column per setting: successes and the speedup."""
+    """A row per task, a column per setting: successes and the speedup. Stress makes many settings: with it the other
+    way round."""
     labels = list(dict.fromkeys(per_task["label"]))
+    if stressed.is_stressed(per_task):
+        found = {(row["label"], row["task"]): row for row in rows_of(per_task)}
+        tasks = sorted(set(per_task["task"]))
+        return pd.DataFrame(
+            {"setting": label, **{task: _cell(found.get((label, task))) for task in tasks}} for label in labels
+        )
     rows = []
     for task in sorted(set(per_task["task"])):
         own = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}

@@ -17,6 +17,7 @@ from kerv_cli.decoding.record import PHASES
 from kerv_cli.reporting.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.scatter import success_floor, tradeoff_figure
+from kerv_cli.reporting.stressed import is_stressed, stress_figure
 from kerv_cli.reporting.tables import is_number, rows_of
 
 _PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
@@ -33,7 +34,7 @@ _CONTINUES = "… "
 
 def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
     """Name suffix -> figure: measures against the axis, and inference time by phase; without an axis the measures by
-    setting, and success against speedup.
+    setting, and success against speedup. A study of stress has one figure, `stress_figure`.
 
     Args:
         table: `study_table`.
@@ -42,6 +43,8 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
         averaging: the rows that are drawn; named in the figure.
     """
     rows = table[table["averaging"] == averaging].reset_index(drop=True)
+    if is_stressed(rows):
+        return {"": stress_figure(rows, title, _about(rows, averaging), averaging)}
     numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
     with mpl.rc_context(STYLE):
         figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}

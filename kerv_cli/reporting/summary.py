@@ -44,7 +44,9 @@ class SummaryTable:
         frame = full if options.max_width >= WIDE else _narrow(full)
         yield Text(_title(self.table, self.averaging), style="bold", overflow="fold")
         yield _printed(frame)
-        yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {self.table['baseline'].iloc[0]}")
+        first, several = self.table["baseline"].iloc[0], self.table["baseline"].nunique() > 1
+        against = f"{first}, under the same stress" if several else first
+        yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {against}")
         if frame["speedup"].str.endswith(APART).any():
             yield Text(f"{APART} not all of its pairs were measured in one run")
         if "ceiling" in frame:

@@ -25,7 +25,16 @@ from kerv_cli.reporting.ceiling import (
 )
 from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, measure
 from kerv_cli.settings import MODEL
-from kerv_cli.studies.plan import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, OBSERVATION, Cell, seeds_text, without
+from kerv_cli.studies.plan import (
+    NOT_DETERMINING,
+    NOT_DETERMINING_RUNTIME,
+    OBSERVATION,
+    Cell,
+    determinants,
+    seeds_text,
+    stress_of,
+    without,
+)
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
 
@@ -50,6 +59,18 @@ class StudyData:
         return [first[label] for label in sorted(order, key=lambda label: label != self.plan.baseline)]
 
     @functools.cached_property
+    def references(self) -> dict[str, str]:
+        """Label -> the label that it is compared with: the baseline's setting under its own stress where the study has
+        it, else the baseline."""
+        first = {cell.label: cell for cell in reversed(self.plan.cells)}
+        baseline = first.get(self.plan.baseline)
+        if baseline is None:
+            return dict.fromkeys(first, self.plan.baseline)
+        same = {_stress(cell): label for label, cell in first.items() if _unstressed(cell) == _unstressed(baseline)}
+        same[_stress(baseline)] = self.plan.baseline
+        return {label: same.get(_stress(cell), self.plan.baseline) for label, cell in first.items()}
+
+    @functools.cached_property
     def complete(self) -> dict[str, list[Cell]]:
         """Label -> its complete cells, in the plan's order."""
         found: dict[str, list[Cell]] = {}
@@ -57,6 +78,17 @@ class StudyData:
             if cell.id in self.cells:
                 found.setdefault(cell.label, []).append(cell)
         return found
+
+
+def _stress(cell: Cell) -> tuple[str, int]:
+    stress = stress_of(cell.settings)
+    return stress["kind"], stress["level"]
+
+
+def _unstressed(cell: Cell) -> dict[str, Any]:
+    """What determines a setting, apart from its stress and the cell's task and seeds."""
+    plain = {**cell.settings, "world": without(cell.settings["world"], {"stress"})}
+    return determinants(plain, cell.identity, "", (), 0, "")
 
 
 def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
@@ -128,10 +160,10 @@ def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
 
 def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
     """One row per label that has episodes here."""
-    baseline = episodes[episodes["label"] == data.plan.baseline]
     for label in data.plan.labels:
         own = episodes[episodes["label"] == label]
         if len(own):
+            baseline = episodes[episodes["label"] == data.references[label]]
             yield _row(data, label, own, baseline, averaging)
 
 
@@ -149,7 +181,7 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "seeds": seeds_text(episodes["seed"]),
         "repeats": int(episodes["repeat"].nunique()),
         "episodes": len(episodes),
-        "baseline": data.plan.baseline,
+        "baseline": data.references[label],
     }
     best = _ceiling(data, cells[0], episodes, averaging)
     return [head, {**measure(episodes, baseline, averaging), **best.columns()}, *_origin(data, cells)]
@@ -174,7 +206,7 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
 def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
     """Settings, weights and provenance of a row; where its cells differ, the values are joined by semicolons."""
     settings, policy = cells[0].settings, cells[0].settings["policy"]
-    world, runtime = settings["world"], settings["runtime"]
+    world, runtime, stress = settings["world"], settings["runtime"], stress_of(settings)
     statuses = [data.cells[cell.id].status for cell in cells]
     parts = without(settings, {*NOT_DETERMINING, "world", "runtime"})
     weights = {
@@ -189,6 +221,8 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "horizon": world["horizon"],
         "camera": world["camera"]["name"],
         **flatten({"camera": without(world["camera"], {"name"})}),
+        "stress": stress["kind"],
+        "stress_level": stress["level"],
         **without(runtime, NOT_DETERMINING_RUNTIME),
         **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),

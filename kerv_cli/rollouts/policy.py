@@ -14,6 +14,7 @@ from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.environments.stress import check as check_stress
 from kerv_cli.errors import UsageError
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.expert import ExpertDecoder
@@ -80,6 +81,7 @@ def check(settings: RolloutSettings) -> None:
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
+    check_stress(settings.world.stress, spec)
     if is_expert(settings):
         _check_expert(settings)
         return

@@ -16,6 +16,9 @@ from kerv_cli.decoding.verify_skip import ParallelPass
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
+from kerv_cli.environments.stress import NO_STRESS, Stress
+from kerv_cli.environments.stress import build as build_stress
+from kerv_cli.environments.world import EpisodeWorld
 from kerv_cli.rollouts.episode import ActionDecoder, run_episode
 from kerv_cli.rollouts.policy import decoder_for
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
@@ -30,16 +33,19 @@ _WORLDS = 4  # kept open per process: fifty would take 1.2 GB
 _opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the most recently used one is last
 
 
-def open_world(task: str, settings: WorldSettings) -> World:
+def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
     """This process's world for a task, camera and horizon, shared by all settings that agree in them. The worlds used
-    last stay open."""
+    last stay open. stress: the shift of its next episodes."""
     key = task, camera_config(settings.camera), settings.horizon
     if key not in _opened:
         _opened[key] = spec_of(task).open_world(*key)
     _opened.move_to_end(key)
     while len(_opened) > _WORLDS:
         _opened.popitem(last=False)[1].close()
-    return _opened[key]
+    world = _opened[key]
+    if isinstance(world, EpisodeWorld):
+        world.stress = stress
+    return world
 
 
 def close_worlds() -> None:
@@ -59,13 +65,14 @@ class Runner:
     def __init__(self, settings: RolloutSettings, task: str) -> None:
         self.settings, self.task = settings, task
         self.decoder = decoder_for(settings, task)
+        self.stress = build_stress(settings.world.stress)
         camera = camera_config(settings.world.camera)
         self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
         self.on_step: Callable[[int], None] | None = None  # told the number of executed control steps, for progress
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
         """Runs the episode of a seed; its record has frames where it is recorded."""
-        world = open_world(self.task, self.settings.world)  # another runner may have closed it since
+        world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
         decoder = self.decoder if self.on_step is None else Watched(self.decoder, self.on_step)
         return run_episode(world, decoder, seed, self._recording if recorded else None)
 

@@ -106,6 +106,8 @@ def determinants(
     `code_hash`."""
     kept = without(settings, NOT_DETERMINING)
     kept["runtime"] = without(settings["runtime"], NOT_DETERMINING_RUNTIME)
+    if not stress_of(settings)["level"]:
+        kept["world"] = without(settings["world"], {"stress"})  # level 0 of every kind is the same world
     hashes = {f"{name}_sha256": value for name, value in identity.items() if name != OBSERVATION}
     return {
         "settings": kept,
@@ -125,6 +127,13 @@ def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
         return determinants(*own) == determinants(*wanted)
     except (KeyError, TypeError, AttributeError):
         return False
+
+
+def stress_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Kind and level of the stress in plain RolloutSettings; `none` where nothing is shifted."""
+    stress = settings["world"].get("stress", {})
+    level = int(stress.get("level", 0))
+    return {"kind": stress["kind"] if level else "none", "level": level}
 
 
 def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:

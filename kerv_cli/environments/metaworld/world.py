@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
+import itertools
 import pickle
 import warnings
 from typing import Any
@@ -45,6 +46,8 @@ def _quiet_simulator() -> Any:
 class MetaWorld(MujocoWorld):
     """Seed s is task `s % 50` of `MT1(task, seed=s // 50)`. The simulator is built at the first reset."""
 
+    stressable = MujocoWorld.stressable | {"range"}
+
     def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
         super().__init__(spec, task, camera, horizon)
         self._env: Any = None
@@ -60,7 +63,36 @@ class MetaWorld(MujocoWorld):
         if self._env is None:
             self._env = pickle.loads(placement.data)["env_cls"]()
         self._env.set_task(placement)
+        if self.stress.spread != 1.0:
+            return self._start_outside()
         state, _ = self._env.reset()
+        return np.array(state, dtype=np.float64)
+
+    def _start_outside(self) -> NDArray[np.float64]:
+        """As `_start`, with the placement moved horizontally away from the centre of its range by `stress.spread`.
+        Where the task refuses a placement, e.g. an object too close to its goal, the move is halved until it does
+        not."""
+        env = self._env
+        inside, space = env._last_rand_vec, env._random_reset_space
+        outwards = (self.stress.spread - 1.0) * (inside - (space.low + space.high) / 2)
+        outwards[2::3] = 0.0  # heights
+        reset_model = env.reset_model
+
+        def placed() -> Any:  # a reset calls it twice; it asks for placements until one suits it
+            shares = (0.5**tries for tries in itertools.count())
+
+            def placement() -> NDArray[np.float64]:
+                env._last_rand_vec = inside + outwards * next(shares)
+                return np.array(env._last_rand_vec)
+
+            env._get_state_rand_vec = placement
+            return reset_model()
+
+        env.reset_model = placed
+        try:
+            state, _ = env.reset()
+        finally:
+            del env.reset_model, env._get_state_rand_vec
         return np.array(state, dtype=np.float64)
 
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:

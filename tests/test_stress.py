@@ -1,0 +1,404 @@
+"""Stress: what each kind changes of a world and what it leaves alone, seeds, levels, refusals, the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kerv_cli.config import compose
+from kerv_cli.environments import stress as stressing
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.insertion.spec import SPEC as INSERTION
+from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
+from kerv_cli.environments.recorded import register_recorded
+from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.environments.stress.base import Draws, Spells, objects
+from kerv_cli.environments.stress.colour import scenery_of
+from kerv_cli.environments.world import MujocoWorld
+from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.registry import parts
+from kerv_cli.rollouts.policy import check
+from kerv_cli.rollouts.run import Runner, close_worlds
+from kerv_cli.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
+from kerv_cli.studies.plan import determinants, stress_of
+
+SEED, STEPS, SIZE = 50_006, 24, 48
+KINDS = ("push", "actuation", "sensor", "light", "colour", "camera", "object")
+SEEN, FELT = ("sensor", "light", "colour", "camera"), ("push", "actuation", "object")
+
+
+@pytest.fixture(scope="module")
+def insertion() -> Iterator[MujocoWorld]:
+    with INSERTION.open_world("fetch-peg", CameraConfig(size=SIZE)) as world:
+        assert isinstance(world, MujocoWorld)
+        yield world
+
+
+@pytest.fixture(scope="module")
+def metaworld() -> Iterator[MujocoWorld]:
+    with METAWORLD.open_world("push", CameraConfig(size=SIZE)) as world:
+        assert isinstance(world, MujocoWorld)
+        yield world
+
+
+@dataclasses.dataclass
+class Episode:
+    """What a policy meets that always executes the same actions."""
+
+    states: np.ndarray  # (steps + 1, s)
+    images: np.ndarray  # (n, size, size, 3)
+    frames: np.ndarray  # the same, as recorded
+    start: np.ndarray
+
+
+def play(world: MujocoWorld, kind: str, level: int, seed: int = SEED, steps: int = STEPS) -> Episode:
+    world.stress = stressing.build(StressSettings(kind, level))
+    space, camera = world.spec.actions, world.spec.cameras[0]
+    actions = np.random.default_rng(1).uniform(space.low, space.high, (steps, space.dofs)) * 0.5
+    states, images, frames = [world.reset(seed).state], [], []
+    for step, action in enumerate(actions):
+        if step % 8 == 0:
+            images.append(world.observe([camera]).images[camera])
+            frames.append(world.frame())
+        states.append(world.step(action).state)
+    return Episode(np.array(states), np.array(images), np.array(frames), world.initial_state)
+
+
+def model_of(world: MujocoWorld) -> dict[str, np.ndarray]:
+    """All numbers of the model that a stress could change."""
+    model: Any = world._drawable()[0]
+    names = [name for name in dir(model) if name[0] != "_" and isinstance(getattr(model, name), np.ndarray)]
+    head = model.vis.headlight
+    own = {name: np.array(getattr(model, name)) for name in names}
+    return own | {f"head {name}": np.array(getattr(head, name)) for name in ("ambient", "diffuse", "specular")}
+
+
+def test_every_kind_is_a_part_and_has_numbers_for_every_level() -> None:
+    assert set(parts("stress")) == {*KINDS, "none"}
+    for kind in KINDS:
+        module = __import__(parts("stress")[kind].build.partition(":")[0], fromlist=["LEVELS"])
+        assert len(module.LEVELS) == MOST_STRESS
+        rows = [dataclasses.astuple(level) if dataclasses.is_dataclass(level) else (level,) for level in module.LEVELS]
+        assert (np.diff(np.array(rows), axis=0) > 0).all(), kind  # every number grows with the level
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["insertion", "metaworld"])
+def test_level_0_is_no_stress_to_the_last_bit(kind: str, name: str, request: pytest.FixtureRequest) -> None:
+    world = request.getfixturevalue(name)
+    plain, zero = play(world, "none", 0), play(world, kind, 0)
+    assert plain.states.tobytes() == zero.states.tobytes()
+    assert plain.images.tobytes() == zero.images.tobytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["insertion", "metaworld"])
+def test_a_kind_changes_what_it_should_and_nothing_else(kind: str, name: str, request: pytest.FixtureRequest) -> None:
+    world = request.getfixturevalue(name)
+    plain, stressed = play(world, "none", 0), play(world, kind, 4)
+    assert (plain.states.tobytes() == stressed.states.tobytes()) == (kind in SEEN)
+    assert plain.images.tobytes() != stressed.images.tobytes()
+    assert (plain.frames.tobytes() == stressed.frames.tobytes()) == (kind == "sensor")
+    assert (plain.start.tobytes() == stressed.start.tobytes()) == (kind != "object")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_seed_gives_the_same_stress_and_another_seed_another(insertion: MujocoWorld, kind: str) -> None:
+    first, other, again = (play(insertion, kind, 4, seed) for seed in (SEED, SEED + 1, SEED))
+    assert first.states.tobytes() == again.states.tobytes()
+    assert first.images.tobytes() == again.images.tobytes()
+    assert first.images.tobytes() != other.images.tobytes()
+
+
+@pytest.mark.parametrize("name", ["insertion", "metaworld"])
+def test_the_model_is_whole_again_at_the_next_episode(name: str, request: pytest.FixtureRequest) -> None:
+    world = request.getfixturevalue(name)
+    play(world, "none", 0, steps=1)
+    before = model_of(world)
+    for kind in ("light", "colour", "camera", "object"):
+        play(world, kind, 4, steps=1)
+        during = model_of(world)
+        assert any(during[key].tobytes() != before[key].tobytes() for key in before), kind
+        play(world, "none", 0, steps=1)
+        after = model_of(world)
+        assert [key for key in before if after[key].tobytes() != before[key].tobytes()] == []
+
+
+@pytest.mark.parametrize("kind", ["sensor", "light", "colour"])
+def test_pictures_differ_more_at_higher_levels(insertion: MujocoWorld, kind: str) -> None:
+    seeds = range(50_000, 50_010)
+    plain = [play(insertion, "none", 0, seed, 1).images.astype(int) for seed in seeds]
+
+    def gap(level: int) -> float:
+        stressed = [play(insertion, kind, level, seed, 1).images for seed in seeds]
+        return float(np.mean([np.abs(a - b).mean() for a, b in zip(plain, stressed, strict=True)]))
+
+    gaps = [gap(level) for level in range(5)]
+    assert gaps[0] == 0.0
+    assert gaps == sorted(gaps)
+    assert gaps[1] > 0.0
+
+
+def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion: MujocoWorld) -> None:
+    from kerv_cli.environments.stress.camera import LEVELS
+
+    play(insertion, "none", 0, steps=1)
+    plain = model_of(insertion)
+    for level, wanted in enumerate(LEVELS, 1):
+        play(insertion, "camera", level, steps=1)
+        moved = model_of(insertion)
+        assert np.allclose(np.linalg.norm(moved["cam_pos"] - plain["cam_pos"], axis=1), wanted.metres)
+        half = np.abs((moved["cam_quat"] * plain["cam_quat"]).sum(axis=1)).clip(max=1.0)
+        assert np.allclose(np.rad2deg(2 * np.arccos(half)), wanted.degrees, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["push", "actuation"])
+def test_executed_actions_differ_more_at_higher_levels(kind: str) -> None:
+    space = METAWORLD.actions
+
+    def gap(level: int) -> float:
+        total = 0.0
+        for seed in range(50_000, 50_010):
+            stress = stressing.build(StressSettings(kind, level))
+            stress.begin("push-v3", seed, space)
+            wanted = np.full(4, 0.5)
+            executed = np.array([stress.act(wanted, step) for step in range(400)])
+            assert (executed[:, 3] == 0.5).all()  # the gripper does what it is told
+            assert (np.abs(executed) <= 1.0).all()
+            assert (wanted == 0.5).all()
+            total += float(np.abs(executed - wanted).mean())
+        return total
+
+    gaps = [gap(level) for level in range(5)]
+    assert gaps[0] == 0.0
+    assert gaps[1] > 0.0
+    assert gaps == sorted(gaps)
+
+
+def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction(metaworld: MujocoWorld) -> None:
+    stress = stressing.build(StressSettings("push", 4))
+    space, still = METAWORLD.actions, np.zeros(4)
+    stress.begin("push-v3", SEED, space)
+    executed = np.array([stress.act(still, step)[:3] for step in range(400)])
+    pushed = np.linalg.norm(executed, axis=1)
+    assert set(np.round(pushed, 9)) == {0.0, 1.0}  # 1 cm per step, the most that there is
+    first = int(np.argmax(pushed))
+    assert (executed[first : first + 8] == executed[first]).all()  # 8 steps at 80 Hz
+    assert (executed[first + 8] != executed[first]).any()
+    metaworld.stress = stress
+    metaworld.reset(SEED)
+    begin = metaworld.end_effector
+    for _ in range(first + 8):
+        metaworld.step(still)
+    assert np.linalg.norm(metaworld.end_effector - begin) > 0.02
+
+
+def test_what_a_policy_does_changes_neither_pushes_nor_noise() -> None:
+    def executed(kind: str, wanted: float) -> np.ndarray:
+        stress = stressing.build(StressSettings(kind, 2))
+        stress.begin("push-v3", SEED, METAWORLD.actions)
+        return np.array([stress.act(np.full(4, wanted), step)[:3] for step in range(400)])
+
+    one, other = executed("push", 0.0), executed("push", 0.1)
+    pushed = (one != 0.0).any(axis=1)
+    assert 0 < pushed.sum() < 400
+    assert (one[pushed] == other[pushed]).all()
+    assert (other[~pushed] == 0.1).all()
+    shift = executed("actuation", 0.1) - executed("actuation", 0.0)
+    gain = np.median(shift, axis=0)  # a stuck axis does not shift, and neither does one at its limit
+    assert (np.isclose(shift, gain).mean(axis=0) > 0.8).all()
+    assert ((gain > 0.08) & (gain < 0.12)).all()
+
+
+def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_looked(insertion: MujocoWorld) -> None:
+    camera = INSERTION.cameras[0]
+
+    def seen(looks: tuple[int, ...]) -> np.ndarray:
+        insertion.stress = stressing.build(StressSettings("sensor", 1))
+        insertion.reset(50_005)
+        for step in range(9):
+            if step in looks:
+                insertion.observe([camera])
+            insertion.step(np.zeros(7))
+        return insertion.observe([camera]).images[camera]
+
+    assert seen(()).tobytes() == seen((0, 3)).tobytes()
+
+
+def test_a_dropped_picture_is_the_one_observed_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    from kerv_cli.environments.stress import sensor
+
+    monkeypatch.setattr(sensor, "LEVELS", (sensor.Level(1.0, 0.0, 1.0),) * 4)
+    stress = stressing.build(StressSettings("sensor", 4))
+    stress.begin("push-v3", SEED, METAWORLD.actions)
+    first = stress.see("corner4", np.full((4, 4, 3), 100, np.uint8), 0)
+    assert stress.see("corner4", np.full((4, 4, 3), 200, np.uint8), 4).tobytes() == first.tobytes()
+    assert stress.see("topview", np.full((4, 4, 3), 200, np.uint8), 4).mean() > 190  # another camera's first
+
+
+def test_the_object_is_what_the_robot_is_not(metaworld: MujocoWorld) -> None:
+    metaworld.stress = stressing.build(StressSettings())
+    metaworld.reset(SEED)
+    model = metaworld._drawable()[0]
+    assert [model.body(body).name for body in objects(model)] == ["obj"]
+    painted = {model.body(model.geom_bodyid[geom]).name for geom in scenery_of(model)}
+    assert {"world", "tablelink", "RetainingWall"} <= painted
+    assert not painted & {"obj", "hand", "right_arm_base_link", "mocap"}
+
+
+def test_an_object_has_another_size_mass_and_friction(metaworld: MujocoWorld) -> None:
+    play(metaworld, "none", 0, steps=1)
+    before, model = model_of(metaworld), metaworld._drawable()[0]
+    body = objects(model)[0]
+    geom = int(np.flatnonzero(model.geom_bodyid == body)[0])
+    play(metaworld, "object", 3, steps=1)
+    after = model_of(metaworld)
+    size = after["geom_size"][geom, 0] / before["geom_size"][geom, 0]
+    mass = after["body_mass"][body] / before["body_mass"][body]
+    friction = after["geom_friction"] / before["geom_friction"]
+    from kerv_cli.environments.stress.objects import LEVELS
+
+    assert np.isclose(max(size, 1 / size), LEVELS[2].size)
+    assert np.isclose(max(mass, 1 / mass), LEVELS[2].mass)
+    assert np.isclose(np.maximum(friction, 1 / friction), LEVELS[2].friction).all()
+    grown = after["body_mass"][body] - before["body_mass"][body]
+    assert np.isclose(after["body_subtreemass"][0] - before["body_subtreemass"][0], grown)
+
+
+def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metaworld: MujocoWorld) -> None:
+    from kerv_cli.environments.stress.objects import LEVELS
+
+    inside = play(metaworld, "none", 0, steps=1).start
+    outside = play(metaworld, "object", 1, steps=1).start
+    space = metaworld._env._random_reset_space
+    centre = (space.low + space.high) / 2
+    flat = np.array([True, True, False, True, True, False])
+    assert np.allclose((outside - centre)[flat], LEVELS[0].spread * (inside - centre)[flat])
+    assert (outside[~flat] == inside[~flat]).all()
+    starts = [play(metaworld, "object", 4, seed, 1).start for seed in range(50_000, 50_020)]
+    left = [not space.contains(np.asarray(start, dtype=space.dtype)) for start in starts]
+    assert any(left)
+    # a placement that the task refuses is drawn nearer, not forever
+    assert all(np.linalg.norm(start[:2] - start[3:5]) >= 0.15 for start in starts)
+
+
+def test_worlds_are_shared_between_stressed_and_plain_settings() -> None:
+    words = ["policy=expert", "task=insert-peg", "record=0"]
+    plain = Runner(compose("rollout", words, RolloutSettings), "insert-peg")
+    pushed = compose("rollout", [*words, "world.stress.kind=object", "world.stress.level=4"], RolloutSettings)
+    try:
+        first = plain.episode(SEED)
+        shifted = Runner(pushed, "insert-peg").episode(SEED)
+        again = plain.episode(SEED)
+    finally:
+        close_worlds()
+    assert first.actions.tobytes() == again.actions.tobytes()
+    assert first.initial_state.tobytes() != shifted.initial_state.tobytes()
+
+
+def test_draws_and_spells() -> None:
+    same = [Draws("reach-v3", 7, "push", 2).random().random() for _ in range(2)]
+    assert same[0] == same[1]
+    others = (Draws("push-v3", 7, "push", 2), Draws("reach-v3", 8, "push", 2), Draws("reach-v3", 7, "push", 3))
+    assert len({same[0], *(draws.random().random() for draws in others)}) == 4
+    spells, random = Spells.per_second(4.0, 0.1, 80.0), np.random.default_rng(0)
+    told = np.array([spells.goes_on(random) for _ in range(80_000)])
+    free = (~told[:, 0]).sum() + told[:, 1].sum()
+    assert told[:, 0].sum() == pytest.approx(8 * told[:, 1].sum(), abs=8)
+    assert told[:, 1].sum() / free == pytest.approx(4 / 80, rel=0.1)
+
+
+def settings(*words: str) -> RolloutSettings:
+    return compose("rollout", ["policy=expert", "task=insert-peg", *words], RolloutSettings)
+
+
+def test_an_unstressed_cell_is_what_it_was_before_there_was_stress() -> None:
+    def whole(plain: dict[str, Any]) -> dict[str, Any]:
+        return determinants(plain, {}, "insert-peg", (SEED,), 0, "code")
+
+    now, zero = as_plain(settings()), as_plain(settings("world.stress.kind=light"))
+    old = {**now, "world": {key: value for key, value in now["world"].items() if key != "stress"}}
+    two = as_plain(settings("world.stress.kind=light", "world.stress.level=2"))
+    assert whole(now) == whole(old) == whole(zero) != whole(two)
+    assert settings_from(old).world.stress == StressSettings()  # a plan from before can be read
+    assert settings_from(two).world.stress == StressSettings("light", 2)
+    assert [stress_of(plain)["kind"] for plain in (now, old, zero, two)] == ["none", "none", "none", "light"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("world.stress.kind=pusch",), "unknown world.stress.kind 'pusch': did you mean push?"),
+        (("world.stress.kind=push", "world.stress.level=5"), "world.stress.level=5: from 0 to 4"),
+        (("world.stress.kind=push", "world.stress.level=-1"), "world.stress.level=-1: from 0 to 4"),
+        (("world.stress.level=1",), "world.stress.level=1 without world.stress.kind: name what is shifted"),
+    ],
+)
+def test_bad_settings_get_one_line(words: tuple[str, ...], says: str) -> None:
+    with pytest.raises((UsageError, UnknownName)) as refused:
+        settings(*words)
+    assert str(refused.value) == says
+
+
+def test_what_an_environment_cannot_do_is_refused() -> None:
+    from examples.point_mass import SPEC as POINT
+
+    turns_only = dataclasses.replace(
+        INSERTION.actions, groups=tuple(dataclasses.replace(g, name=f"my {g.name}") for g in INSERTION.actions.groups)
+    )
+    recorded = register_recorded("tape", INSERTION.actions, INSERTION.observation, {"wipe": "wipe the table"}, "front")
+    no_position = dataclasses.replace(INSERTION, actions=turns_only)
+
+    def refusal(kind: str, spec: EnvironmentSpec) -> str:
+        with pytest.raises(UsageError) as refused:
+            stressing.check(StressSettings(kind, 1), spec)
+        return str(refused.value)
+
+    start = "world.stress.kind="
+    assert refusal("camera", POINT) == f"{start}camera: not possible in point-mass: its world has no MuJoCo model"
+    assert refusal("push", recorded) == f"{start}push: not possible in tape: its world takes no stress"
+    assert (
+        refusal("push", no_position) == f"{start}push: not possible in insertion: its actions have no group 'position'"
+    )
+    for kind in ("push", "actuation", "sensor"):
+        stressing.check(StressSettings(kind, 1), POINT)
+    for kind in KINDS:
+        stressing.check(StressSettings(kind, 4), METAWORLD)
+        stressing.check(StressSettings(kind, 0), recorded)
+    check(settings("world.stress.kind=object", "world.stress.level=4"))
+
+
+def kerv(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *words]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env={**os.environ})
+
+
+WORDS = ["policy=expert", "task=insert-peg", "episodes=2", "record=0", "world.stress.kind=push"]
+
+
+def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -> None:
+    run = kerv("rollout", "-m", *WORDS, "world.stress.level=0,2", "--json", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    rows = json.loads(run.stdout)["settings"]
+    assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]
+    wrong = kerv("rollout", *WORDS, "world.stress.level=5", cwd=tmp_path)
+    assert (wrong.returncode, wrong.stderr) == (2, "kerv: world.stress.level=5: from 0 to 4\n")
+
+
+def test_the_plan_and_the_figures_say_which_stress_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from kerv_cli.commands.rollout import rollout
+
+    words = [*WORDS, "world.stress.level=2", f"results={tmp_path}"]
+    rollout(words, plan=True)
+    assert capsys.readouterr().out.startswith("expert, stress push 2: 1 tasks, 2 episodes")
+    rollout(words)
+    assert "stress push 2" in capsys.readouterr().out

@@ -1,0 +1,118 @@
+"""The report of a study of stress: what a stressed setting is compared with, the figure, the sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from studies_synthetic import run_cell, settings_of
+
+from kerv_cli.config import compose
+from kerv_cli.decoding.record import EpisodeRecord
+from kerv_cli.reporting.page import verdict as page_verdict
+from kerv_cli.reporting.plots import study_figures
+from kerv_cli.reporting.stressed import by_kind, is_stressed, stem, verdict
+from kerv_cli.reporting.tables import StudyData, load_study, rows_of, study_table
+from kerv_cli.settings import RolloutSettings, StressSettings, StudySettings, SweepSettings
+from kerv_cli.studies.plan import Cell, plan, stress_of
+from kerv_cli.studies.resolve import resolve
+from kerv_cli.studies.store import StudyStore
+
+TASKS = ["reach-v3", "push-v3"]
+EPISODES = 20
+
+
+def settings() -> dict[str, RolloutSettings]:
+    found: dict[str, RolloutSettings] = {}
+    for name, method, r in (("ar", "ar", 0), ("bold", "spec_vla", 9)):
+        found[name] = settings_of(method, r, EPISODES)
+        for kind in ("push", "light"):
+            for level in (1, 4):
+                stressed = settings_of(method, r, EPISODES)
+                stressed.world.stress = StressSettings(kind, level)
+                found[f"{name}, kind={kind} level={level}"] = stressed
+    return found
+
+
+def episodes(cell: Cell) -> list[EpisodeRecord]:
+    """Pushes of level 4 let half of everything fail; light of level 4 only what is bold."""
+    stress = stress_of(cell.settings)
+    fails = stress["level"] == 4 and (stress["kind"] == "push" or cell.settings["method"] != "ar")
+    records = run_cell(cell)
+    return [replace(record, success=not (fails and record.seed % 2)) for record in records]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> StudyData:
+    store = StudyStore(tmp_path_factory.mktemp("stress"), "stress")
+    cells = plan(settings(), TASKS, {"target": "t"}, baseline="ar")
+    for cell in cells:
+        store.write_cell(cell, episodes(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
+    store.write_plan(StudySettings("stress", "", "ar"), cells)
+    return load_study(store)
+
+
+@pytest.fixture(scope="module")
+def table(data: StudyData) -> pd.DataFrame:
+    return study_table(data)
+
+
+def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
+    data: StudyData, table: pd.DataFrame
+) -> None:
+    rows = {row["label"]: row for row in rows_of(table, "micro over tasks")}
+    assert data.references["bold"] == "ar"
+    assert rows["bold, kind=push level=4"]["baseline"] == "ar, kind=push level=4"
+    assert rows["bold, kind=push level=4"]["difference"] == 0.0
+    assert rows["bold, kind=light level=4"]["difference"] == -0.5
+    assert rows["bold, kind=light level=4"]["pairs"] == len(TASKS) * EPISODES
+    assert (rows["ar, kind=light level=4"]["stress"], rows["ar, kind=light level=4"]["stress_level"]) == ("light", 4)
+    assert (rows["ar"]["stress"], rows["ar"]["stress_level"]) == ("none", 0)
+
+
+def test_lines_begin_with_the_unstressed_setting(table: pd.DataFrame) -> None:
+    assert stem("bold, kind=push level=4") == stem("bold kind=push level=4") == stem("bold") == "bold"
+    kinds = by_kind(table)
+    assert list(kinds) == ["push", "light"]
+    assert [row["label"] for row in kinds["light"]["bold"]] == [
+        "bold", "bold, kind=light level=1", "bold, kind=light level=4"
+    ]  # fmt: skip
+
+
+def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(table: pd.DataFrame) -> None:
+    figures = study_figures(table, "", "Success under stress")
+    assert list(figures) == [""]
+    panels = [panel for panel in figures[""].axes if panel.get_visible()]
+    assert [panel.get_title(loc="left") for panel in panels] == ["push", "light"]
+    named = [line for line in panels[1].lines if line.get_label() in ("ar", "bold")]
+    assert [list(line.get_ydata()) for line in named] == [[100, 100, 100], [100, 100, 50]]
+    assert {text.get_text() for text in figures[""].legends[0].get_texts()} == {"ar", "bold"}
+
+
+def test_the_sentence_says_who_falls_behind_where(data: StudyData, table: pd.DataFrame) -> None:
+    assert verdict(table).endswith("bold: light 4*.")
+    assert page_verdict(data, table, table) == verdict(table)
+    kept = table[table["stress"] != "light"]
+    assert verdict(kept) == "No method falls 10 points of success or more behind ar under the same stress."
+    assert not is_stressed(table[table["stress"] == "none"])
+
+
+def test_the_shipped_study_has_every_method_under_every_kind_and_level() -> None:
+    resolved = resolve(["study=stress", "task=reach", "episodes=1"])
+    found = {(s.method, s.world.stress.kind, s.world.stress.level) for s in resolved.settings.values()}
+    methods = {method for method, _, _ in found}
+    kinds = {kind for _, kind, _ in found}
+    assert methods >= {"ar", "one_pass", "one_pass_streak", "early_unverified", "retrieval_unverified"}
+    assert len(kinds) == 8
+    assert len(found) == len(resolved.settings) == len(methods) * 29
+    study = compose("sweep", ["study=stress"], SweepSettings).study
+    assert study.baseline == "ar"
+
+
+def test_a_level_0_of_a_kind_is_one_cell_with_no_stress(tmp_path: Path) -> None:
+    plain, zero = settings_of("ar", 0, 1), settings_of("ar", 0, 1)
+    zero.world.stress = StressSettings("light", 0)
+    cells = plan({"ar": plain, "ar, kind=light level=0": zero}, ["reach-v3"], {"target": "t"}, baseline="ar")
+    assert len({cell.id for cell in cells}) == 1
