@@ -42,7 +42,7 @@ MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
 
 @dataclass
 class TimingSettings:
-    """What the world does while the policy decodes (docs/methods.md §6.1)."""
+    """What the world does while the policy decodes (docs/methods.md §8)."""
 
     clock: str = choice(WAITS, WAITS, REAL)  # waits: it stands still; real: it goes on for as long as the decode takes
     latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE)  # of a decode

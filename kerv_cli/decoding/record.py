@@ -71,7 +71,7 @@ class Trust:
 
 @dataclass(frozen=True)
 class Delay:
-    """What the world did while the policy decoded (docs/methods.md §6.1), in control steps but for `seconds`.
+    """What the world did while the policy decoded (docs/methods.md §8), in control steps but for `seconds`.
 
     observed: the step at which the observation was taken. steps: latency, rounded up. carried, held: how many of them
     executed the chunk in hand on, and held the last action; fewer than `steps` where the episode ended. dropped: first

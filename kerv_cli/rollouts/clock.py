@@ -1,4 +1,4 @@
-"""The clock of a world that goes on while the policy decodes, and compensations of the delay (docs/methods.md §6.1)."""
+"""The clock of a world that goes on while the policy decodes, and compensations of the delay (docs/methods.md §8)."""
 
 from __future__ import annotations
 

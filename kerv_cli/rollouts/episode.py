@@ -104,7 +104,7 @@ def run_episode(
     world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
 ) -> EpisodeRecord:
     """One closed-loop episode until success or the horizon: decodes a chunk and executes it whole, or, with a clock,
-    as docs/methods.md §6.1 says.
+    as docs/methods.md §8 says.
 
     Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
     record keeps, one per control step; None: none. clock: of a world that goes on during decodes; None: it waits.

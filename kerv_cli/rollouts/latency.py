@@ -1,5 +1,5 @@
 """How long a decode lasts for a world that does not wait: as measured, constant, or by a latency profile of another
-model and device (docs/methods.md §6.1)."""
+model and device (docs/methods.md §8)."""
 
 from __future__ import annotations
 

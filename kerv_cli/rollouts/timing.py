@@ -1,4 +1,4 @@
-"""Checks `rollout.*` of a rollout's settings and builds the latency that they name (docs/methods.md §6.1)."""
+"""Checks `rollout.*` of a rollout's settings and builds the latency that they name (docs/methods.md §8)."""
 
 from __future__ import annotations
 
