@@ -50,7 +50,7 @@ class TimingSettings:
     profile: str = ""  # latency=profile: a document of `kerv bench`, its path or its name in <results>/bench
     # an autoregressive decode of the same target takes so long, all others in proportion; 0: as measured or profiled
     ar_ms: float = number(0.0, 0, 600_000)
-    delay_compensation: str = choice("none", "none", "hold", "linear", "kalman", "chunk")
+    delay_compensation: str = choice("none", "none", "chunk", "hold", "linear", "kalman", "position")
 
     def check_together(self, prefix: str) -> None:
         """Raises UsageError for latency=profile without a profile."""

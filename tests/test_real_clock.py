@@ -23,7 +23,7 @@ from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.errors import KervError
 from kerv_cli.rollouts import policy as policies_of
 from kerv_cli.rollouts import run
-from kerv_cli.rollouts.clock import Motion, RealClock
+from kerv_cli.rollouts.clock import RealClock, displacement, predictor
 from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.latency import Constant, Measured, Profiled, steps_of
 from kerv_cli.settings import EVALUATION_SEED, RolloutSettings
@@ -77,10 +77,10 @@ def point_episode(clock: RealClock | None, decoder: Any = None, horizon: int = 0
 
 
 def constant(steps: float, compensation: str = "none") -> RealClock:
-    return RealClock(Constant(steps / HZ), HZ, compensation, SPEC.horizon)
+    return RealClock(Constant(steps / HZ), SPEC.actions, compensation)
 
 
-@pytest.mark.parametrize("compensation", ["none", "hold", "linear", "kalman", "chunk"])
+@pytest.mark.parametrize("compensation", ["none", "hold", "linear", "kalman", "chunk", "position"])
 def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: str) -> None:
     waiting, real = point_episode(None), point_episode(constant(0, compensation))
     assert (waiting.actions == real.actions).all()
@@ -140,7 +140,7 @@ def test_a_fake_clock_says_how_long_each_decode_took() -> None:
     """Measured seconds, rounded up; a decode begins as early as the one before took long."""
     seconds = {1: 0.11, 2: 0.31, 3: 0.05}
     decoder = Numbered(4, lambda n: seconds.get(n, 0.2))
-    record = point_episode(RealClock(Measured(), HZ), decoder)
+    record = point_episode(RealClock(Measured(), SPEC.actions), decoder)
     delays = [d.delay for d in record.decodes[:4] if d.delay is not None]
     assert [d.steps for d in delays] == [2, 4, 1, 2]
     assert [d.seconds for d in delays] == [0.11, 0.31, 0.05, 0.2]
@@ -172,45 +172,75 @@ def test_chunk_drops_what_is_stale() -> None:
     record = point_episode(constant(2, "chunk"))
     assert played(record)[:8] == [(0, 0), (0, 0), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2), (3, 3)]
     assert {d.delay.dropped for d in record.decodes if d.delay} == {2}
-    slow = point_episode(RealClock(Measured(), HZ, "chunk"), Numbered(4, lambda n: 0.6))
+    slow = point_episode(RealClock(Measured(), SPEC.actions, "chunk"), Numbered(4, lambda n: 0.6))
     assert played(slow)[6:12] == [(1, 3)] * 6  # the last action of a chunk is always left
     assert slow.decodes[0].delay == Delay(0.6, 6, 0, carried=0, held=6, dropped=3)
 
 
 @pytest.mark.parametrize(
-    ("kind", "expected"),
-    # moves of 1, 2, 4 (mm): the last one again; a line through the last two
-    [("hold", 4 + 4 + 4), ("linear", 6 + 8 + 10)],
+    ("kind", "steps", "wanted"),
+    [
+        ("hold", 2, [(1, 2), (1, 3), (1, 3), (1, 3)]),
+        ("linear", 2, [(1, 2), (1, 3), (1, 4), (1, 5)]),
+        ("kalman", 2, [(1, 2), (1, 3), (1, 4), (1, 5)]),  # a chunk that is a line, from its first action on
+        ("linear", 6, [(1, 6), (1, 7), (1, 8), (1, 9)]),
+        ("hold", 6, [(1, 3)] * 4),
+    ],
 )
-def test_motion_is_a_prediction_of_displacements(kind: str, expected: float) -> None:
-    path = np.cumsum([0, 1, 2, 4])[:, None] * np.array([1e-3, -2e-3, 0.0])
-    assert Motion(kind, 60).ahead(path, 3) == pytest.approx(expected * np.array([1e-3, -2e-3, 0.0]))
-    assert Motion(kind, 60).ahead(path[:1], 3) == pytest.approx(np.zeros(3))
+def test_predictions_go_on_behind_the_chunk(kind: str, steps: int, wanted: list[tuple[int, int]]) -> None:
+    """Action i of a chunk is executed at the step that it is meant for; what lies behind its last is predicted."""
+    clock = constant(steps, kind)
+    decode = Numbered(4).decode(Observation(np.zeros(3), np.zeros(6)))
+    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
+    assert decode.delay is not None
+    assert (decode.delay.dropped, decode.delay.predicted) == (min(steps, 4), min(steps, 4))
+    line = [np.array([1, -i]) / 2000 for i in range(30, 0, -1)]  # what was executed before leads up to it
+    found = clock.chunk(decode, line if kind == "kalman" else [])
+    assert found.dtype == np.float32
+    assert found * 2000 == pytest.approx(np.array(wanted), abs=0.05)
+    assert (found[: 4 - min(steps, 4)] == decode.actions[min(steps, 4) :]).all()
 
 
-def test_kalman_goes_on_where_motion_is_uniform_and_smooths_where_it_is_not() -> None:
+def test_strict_dofs_are_held_and_far_predictions_stay_finite() -> None:
+    space = METAWORLD.actions
+    clock = RealClock(Constant(3.0), space, "linear")
+    actions = np.array([[0.1, 0, 0, -1], [0.2, 0, 0, 1]], np.float32)
+    decode = DecodeRecord((), actions, 0, (), "ar", 0.0, {})
+    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
+    assert decode.delay is not None
+    assert decode.delay.steps == 240
+    found = clock.chunk(decode, [])
+    assert found == pytest.approx(np.array([[1.0, 0, 0, 1]] * 2))  # clipped to the limits; the gripper as it was last
+
+
+def test_one_action_is_no_line() -> None:
+    clock = constant(3, "kalman")
+    decode = Numbered(1).decode(Observation(np.zeros(3), np.zeros(6)))
+    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
+    assert clock.chunk(decode, []) == pytest.approx(decode.actions)
+
+
+def test_a_compensated_episode_executes_what_the_clock_says() -> None:
+    record = point_episode(constant(2, "hold"))
+    assert played(record)[:10] == [(0, 0)] * 2 + [(n, i) for n in (1, 2) for i in (2, 3, 3, 3)]
+
+
+def test_the_decoder_is_shown_the_end_effector_where_it_will_be() -> None:
     uniform = np.arange(12)[:, None] * np.array([0.002, 0.0, -0.001])
-    motion = Motion("kalman", 60)
-    assert motion.ahead(uniform, 5) == pytest.approx(5 * np.array([0.002, 0.0, -0.001]), abs=1e-12)
-    moves = np.array([0.0, 1, 2, 3, 4, 5, 6, 7, 8, 12])  # a jump at the end
-    jumped = np.concatenate([[0.0], np.cumsum(moves)])[:, None] * np.array([1e-3, 0, 0])
-    hold, linear, kalman = (float(Motion(k, 60).ahead(jumped, 2)[0]) for k in ("hold", "linear", "kalman"))
-    assert hold < kalman < linear
-
-
-@pytest.mark.parametrize("compensation", ["hold", "linear", "kalman"])
-def test_the_decoder_is_shown_the_end_effector_where_it_will_be(compensation: str) -> None:
+    motion = predictor("kalman", np.zeros(3, dtype=bool))
+    assert displacement(motion, uniform, 5) == pytest.approx(5 * uniform[1])
+    assert displacement(motion, uniform[:2], 5) == pytest.approx(np.zeros(3))  # one displacement is no motion
     decoder = Numbered(1)
-    record = point_episode(constant(3, compensation), decoder)
+    record = point_episode(constant(3, "position"), decoder)
     for number, shown in enumerate(decoder.shown[:6]):
-        decode = record.decodes[number]
-        assert decode.delay is not None
-        path = record.path[: decode.delay.observed + 1].astype(float)
-        ahead = Motion(compensation, SPEC.horizon).ahead(path, 3) if number else np.zeros(3)
+        delay = record.decodes[number].delay
+        assert delay is not None
+        path = record.path[: delay.observed + 1].astype(float)
+        ahead = displacement(motion, path, 3) if number else np.zeros(3)
         assert shown.proprioception[:3] == pytest.approx(path[-1] + ahead, abs=1e-6)
         assert (shown.state[:3] == shown.proprioception[:3]).all()
         assert (shown.state[3:] == record.initial_state[3:]).all()
-    assert np.linalg.norm(decoder.shown[4].state[:3] - record.path[record.decodes[4].delay.observed]) > 1e-4  # type: ignore[union-attr]
+        assert number < 4 or np.linalg.norm(ahead) > 1e-4
 
 
 def test_before_its_first_action_a_robot_stands_still() -> None:

@@ -81,10 +81,12 @@ class _Execution:
         self.trace.add(self.last)
         self.decoder.observe(self.trace.actions[-1], self.trace.path[-1])
 
-    def take(self, decode: DecodeRecord) -> None:
+    def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
         """A new chunk replaces the one in hand."""
-        dropped = 0 if decode.delay is None else decode.delay.dropped
-        self.in_hand = deque(decode.actions[dropped:])
+        if clock is None or decode.delay is None:
+            self.in_hand = deque(decode.actions)
+        else:
+            self.in_hand = deque(clock.chunk(decode, self.trace.actions[: decode.delay.observed]))
 
     def until(self, left: int) -> None:
         """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
@@ -121,7 +123,7 @@ def run_episode(
     while not world.done:
         decodes.append(_decode(execution, clock))
         decode_steps.append(len(trace.actions))
-        execution.take(decodes[-1])
+        execution.take(decodes[-1], clock)
         execution.until(0 if clock is None else clock.expected)
     decoder.finish(world.succeeded)
     return EpisodeRecord(

@@ -196,7 +196,6 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
     """
     if settings.rollout.clock == WAITS:
         return None
-    spec = spec_of(task)
     target = None if is_expert(settings) else artifacts_of(settings).description
     measured = 0.0
     if timing.calibrates(settings):
@@ -206,8 +205,7 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
             *(runtime.device, runtime.dtype, runtime.threads),
         )
     latency = timing.latency_of(settings, target, measured)
-    horizon = spec.control_steps(settings.world.horizon)
-    return RealClock(latency, spec.actions.control_hz, settings.rollout.delay_compensation, horizon)
+    return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
 
 
 @functools.cache

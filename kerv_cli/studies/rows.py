@@ -77,7 +77,7 @@ _ROUND = pa.struct(
         ("threshold", _TOKENS),
     ]
 )
-_OF_DELAY = ("observed", "carried", "held", "dropped")  # fields of Delay
+_OF_DELAY = ("observed", "carried", "held", "dropped", "predicted")  # fields of Delay
 _MEASURES = ("variability", "similarity", "metric", "deviation")
 _OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds")  # fields of EpisodeRecord
 _OF_DECODE = ("mode", "forwards", "seconds", "compensated", "skipped", *_MEASURES)  # fields of DecodeRecord
