@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from kerv_cli.parts import METHOD_KINDS, part_of
-from kerv_cli.settings import EXPERT, RolloutSettings
+from kerv_cli.settings import CONSTANT, EXPERT, PROFILE, WAITS, RolloutSettings, TimingSettings
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
 """The parts that judge drafts."""
@@ -30,6 +30,20 @@ def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: b
     return found
 
 
+def _idle_timing(timing: TimingSettings) -> dict[str, str]:
+    if timing.clock == WAITS:
+        own = ("latency", "latency_ms", "profile", "ar_ms", "delay_compensation")
+        return {f"rollout.{name}": "rollout.clock=waits: the world waits for every decode" for name in own}
+    idle = {}
+    if timing.latency != CONSTANT:
+        idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
+    if timing.latency != PROFILE:
+        idle["rollout.profile"] = f"rollout.latency={timing.latency} reads no profile"
+    if timing.latency == CONSTANT:
+        idle["rollout.ar_ms"] = "rollout.latency=constant scales nothing"
+    return idle
+
+
 def _idle(settings: RolloutSettings) -> dict[str, str]:
     """Key -> why it is not read."""
     method = settings.parts()
@@ -47,6 +61,7 @@ def _idle(settings: RolloutSettings) -> dict[str, str]:
             idle[f"policy.{kind}"] = f"method {settings.method} reads no {kind}"
     if "datastore" not in needed:
         idle["datastore"] = f"method {settings.method} reads no datastore"
+    idle |= _idle_timing(settings.rollout)
     if not settings.record:
         idle["record_size"] = "record=0 saves no recording"
     return idle

@@ -39,6 +39,30 @@ class WorldSettings:
     horizon: int = number(0, 0, 1_000_000)  # control steps; 0: the environment's
 
 
+WAITS, REAL = "waits", "real"
+MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
+
+
+@dataclass
+class TimingSettings:
+    """What the world does while the policy decodes (docs/methods.md §8)."""
+
+    clock: str = choice(WAITS, WAITS, REAL)  # waits: it stands still; real: it goes on for as long as the decode takes
+    latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE)  # of a decode
+    latency_ms: float = number(0.0, 0, 600_000)  # latency=constant
+    profile: str = ""  # latency=profile: a document of `kerv bench`, its path or its name in <results>/bench
+    # an autoregressive decode of the same target takes so long, all others in proportion; 0: as measured or profiled
+    ar_ms: float = number(0.0, 0, 600_000)
+    delay_compensation: str = choice("none", "none", "chunk", "hold", "linear", "kalman", "position")
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError for latency=profile without a profile."""
+        if self.clock == REAL and self.latency == PROFILE and not self.profile:
+            raise UsageError(
+                f"{prefix}latency=profile: name a document of 'kerv bench', {prefix}profile=mt10-vision-float32"
+            )
+
+
 @dataclass
 class StressSettings:
     """A shift of a stated size, drawn per episode from task, seed, kind and level (docs/stress.md)."""
@@ -141,6 +165,7 @@ class RolloutSettings(TaskSettings):
     chunk: int = number(0, 0, 1024)  # H, control steps decoded at once; 0: as many as the target was trained for
     datastore: Any = field(default_factory=lambda: NoSettings("exact"))
     world: RolloutWorldSettings = field(default_factory=RolloutWorldSettings)
+    rollout: TimingSettings = field(default_factory=TimingSettings)
     deviation_every: int = number(0, 0, 1_000_000)  # decodes between two deviation samples; 0: never
     record: int = number(1, -1, 1_000_000)  # episodes per task that are saved as .rrd; -1: all
     record_size: int = number(240, 8, 4096)  # pixels of the logged camera

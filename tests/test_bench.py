@@ -18,9 +18,10 @@ from kerv_cli.bench.ceilings import ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import layer_weights, open_model
 from kerv_cli.bench.phases import Phase, Stage, costs, flipped
-from kerv_cli.bench.profile import Profile, projected, read_profile
-from kerv_cli.bench.replay import Player, predicted
-from kerv_cli.bench.sequences import DecodeSequence, Forward, Recorded, sequence_of
+from kerv_cli.bench.profile import profile_of, projected
+from kerv_cli.bench.replay import Player
+from kerv_cli.bench.sequences import Recorded
+from kerv_cli.decoding.cost import DecodeSequence, Forward, Profile, predicted, read_profile, sequence_of
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import BenchSettings
 from kerv_cli.studies.execute import execute
@@ -132,7 +133,7 @@ def profile() -> Profile:
     found = [phase("encode", 1, 1.0), *(phase("verify", n, 1 + 0.01 * (n - 1)) for n in (1, 2, 16))]
     found += [phase("prefill", 31, 4.0), phase("prefill", 46, 4.15), phase("draft", 2, 0.1), phase("draft", 6, 0.5)]
     found += [phase("feed", 1, 0.1), phase("feed", 31, 0.3)]
-    return Profile.of(31, found)
+    return profile_of(31, found)
 
 
 def test_the_cost_model_adds_the_forwards_up() -> None:

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from kerv_cli.bench.profile import Profile
 from kerv_cli.config import compose, groups
+from kerv_cli.decoding.cost import Profile
 from kerv_cli.settings import EXPERT, RolloutSettings
 
 

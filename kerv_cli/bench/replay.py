@@ -1,4 +1,4 @@
-"""Executes recorded sequences of forwards on a model of another shape, and predicts them from a latency profile."""
+"""Executes recorded sequences of forwards on a model of another shape."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 from kerv_cli.bench.machine import synchronise
 from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Stage
-from kerv_cli.bench.profile import Profile
-from kerv_cli.bench.sequences import DRAFTER, DecodeSequence, Forward, Recorded
+from kerv_cli.bench.sequences import Recorded
+from kerv_cli.decoding.cost import DRAFTER, DecodeSequence, Forward
 from kerv_cli.drafting.eagle import grow_tree
 from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
 
@@ -73,26 +73,6 @@ class Player:
 def _tree(proposer: Mapping[str, Any]) -> tuple[int, int]:
     """Depth and children per level of a setting's drafter; 0, 0 without one."""
     return int(proposer.get("depth") or 0), int(proposer.get("top_k") or 0)
-
-
-def predicted(decode: DecodeSequence, profile: Profile) -> float:
-    """Seconds of the decode by the cost model: the profile's times of its forwards, the drafter's passes
-    and the states it is fed, and the recorded host seconds."""
-    seconds = profile.seconds("encode", 1) + decode.host
-    for place, forward in enumerate(decode.forwards):
-        rows = forward.drafted + (profile.prompt if forward.kind == "prefill" else 1)
-        seconds += profile.seconds(forward.kind, rows)
-        if forward.proposer == DRAFTER:
-            seconds += profile.drafting(min(forward.drafted, profile_depth(forward)))
-        if decode.drafts and place + 1 < len(decode.forwards):
-            first = forward.kind == "prefill"
-            seconds += profile.seconds("feed", profile.prompt if first else forward.accepted + 1)
-    return seconds
-
-
-def profile_depth(forward: Forward) -> int:
-    """Levels of a draft: a chain's length; a tree has more nodes than a chunk has tokens, and few levels."""
-    return forward.drafted if forward.drafted < 32 else 5
 
 
 def play_all(player: Player, recorded: Sequence[Recorded]) -> np.ndarray:

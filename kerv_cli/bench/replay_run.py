@@ -14,10 +14,11 @@ import torch
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Phase, measure
-from kerv_cli.bench.profile import Profile, projected, read_profile
-from kerv_cli.bench.replay import Player, play_all, predicted
+from kerv_cli.bench.profile import profile_of, projected
+from kerv_cli.bench.replay import Player, play_all
 from kerv_cli.bench.run import open_and_card, place_of
 from kerv_cli.bench.sequences import Recorded, read_study
+from kerv_cli.decoding.cost import Profile, predicted, read_profile
 from kerv_cli.errors import UsageError
 from kerv_cli.files import atomic_path, write_json
 from kerv_cli.provenance import stamp
@@ -158,9 +159,9 @@ def _rows(
     measured: Mapping[str, Profile],
 ) -> list[Row]:
     prompt, layers = model.target.max_prompt, model.target.settings.layers
-    here = Profile.of(prompt, phases)
+    here = profile_of(prompt, phases)
     there = {
-        name: Profile.of(prompt, projected(phases, machine, Machine(gb * 1e9, tf * 1e12), layers * _PER_LAYER))
+        name: profile_of(prompt, projected(phases, machine, Machine(gb * 1e9, tf * 1e12), layers * _PER_LAYER))
         for name, (gb, tf) in settings.projections.items()
     }
     there |= measured

@@ -13,7 +13,7 @@ from kerv_cli.bench.ceilings import MethodCeiling, ceilings
 from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
 from kerv_cli.bench.phases import Phase, Stage, costs, flipped, measure
-from kerv_cli.bench.profile import Profile
+from kerv_cli.bench.profile import profile_of
 from kerv_cli.errors import UsageError
 from kerv_cli.places import results_dir
 from kerv_cli.provenance import stamp
@@ -61,7 +61,7 @@ class Bench:
             "phases": [phase.as_dict() for phase in self.phases],
             "ceilings": {str(n): [asdict(c) for c in found] for n, found in self.ceilings.items()},
             "ties": {"flipped": self.ties[0], "compared": self.ties[1]},
-            "profile": Profile.of(int(self.card["prompt"]), self.phases).as_dict(),
+            "profile": profile_of(int(self.card["prompt"]), self.phases).as_dict(),
         }
 
 
@@ -120,7 +120,7 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
     synchronise(model.target.device)
     cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
     machine, phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
-    profile = Profile.of(stage.length, phases)
+    profile = profile_of(stage.length, phases)
     found = {n: ceilings(profile, n) for n in settings.tokens}
     card = card_of(model, machine, max(settings.tokens))
     return Bench(model, machine, card, cold, phases, found, flipped(model, FLIP_CHUNKS, max(settings.tokens)))

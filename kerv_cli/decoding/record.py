@@ -70,6 +70,24 @@ class Trust:
 
 
 @dataclass(frozen=True)
+class Delay:
+    """What the world did while the policy decoded (docs/methods.md §8), in control steps but for `seconds`.
+
+    observed: the step at which the observation was taken. steps: latency, rounded up. carried, held: how many of them
+    executed the chunk in hand on, and held the last action; fewer than `steps` where the episode ended. dropped: first
+    actions of the new chunk that were left out. predicted: actions that were put behind its last.
+    """
+
+    seconds: float
+    steps: int
+    observed: int
+    carried: int = 0
+    held: int = 0
+    dropped: int = 0
+    predicted: int = 0
+
+
+@dataclass(frozen=True)
 class DecodeRecord:
     """One call of the decoder: from an observation to the actions to execute."""
 
@@ -88,6 +106,12 @@ class DecodeRecord:
     metric: float | None = None  # fused hybrid-boundary metric F (§4.4)
     trust: Trust | None = None  # of a gate with a score
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
+    delay: Delay | None = None  # None: the world waited
+
+    @property
+    def delay_steps(self) -> int | None:
+        """Control steps that the world went on during the decode; None: it waited."""
+        return None if self.delay is None else self.delay.steps
 
     @property
     def unverified(self) -> int:

@@ -153,7 +153,8 @@ class EnvironmentSpec:
     cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
     with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras
     whose raw images are rotated by 180 degrees. suffix: ending of all full task names, which users may leave out.
-    packages: those whose versions determine the physics.
+    packages: those whose versions determine the physics. grip: actions of the strict DoFs that close and that open the
+    gripper; empty where there is none.
     """
 
     name: str
@@ -169,6 +170,7 @@ class EnvironmentSpec:
     upside_down: tuple[str, ...] = ()
     suffix: str = ""
     packages: tuple[str, ...] = ()
+    grip: tuple[float, float] | tuple[()] = ()
     seeds: Seeds = Seeds()
 
     def full_name(self, task: str) -> str | None:
@@ -218,6 +220,18 @@ class EnvironmentSpec:
         if not 0 <= horizon <= self.horizon:
             raise UsageError(f"horizon must lie between 1 and {self.horizon} control steps in {self.name}: {horizon}")
         return horizon or self.horizon
+
+    def standstill(self, opening: float) -> NDArray[np.float64]:
+        """The action (D,), environment units, that leaves the robot where it is: the middle of every DoF's limits, and
+        of the strict ones the present opening of the gripper (0 closed to 1 open)."""
+        import numpy as np
+
+        space = self.actions
+        action = (np.asarray(space.low) + np.asarray(space.high)) / 2
+        if self.grip:
+            closed, opened = self.grip
+            action[space.is_strict] = closed + (opened - closed) * opening
+        return action
 
     def open_world(self, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> World:
         """A world of the task; its simulator is built at the first reset.

@@ -32,6 +32,9 @@ _RATIOS = {
     "deviation": ("deviation_sum", "deviation_count"),
     "realised_risk": ("audit_loss", "audits"),
     "audits_to_alarm": ("alarm_audits", "alarmed"),
+    "felt_latency": ("delay_seconds", "delay_decodes"),
+    "felt_latency_steps": ("delay_steps", "delay_decodes"),
+    "held_share": ("held_steps", "steps"),
 }
 """Quotients of sums over episodes; NaN where the denominator is 0."""
 
@@ -153,6 +156,7 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
     values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
     sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
     values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
+    values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
     return values
 
 

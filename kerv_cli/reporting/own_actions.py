@@ -13,6 +13,7 @@ from kerv_cli.decoding.calibration_file import Calibration
 from kerv_cli.reporting.ceiling import is_autoregressive
 from kerv_cli.reporting.prediction import Predictions, error_rows
 from kerv_cli.reporting.tables import StudyData
+from kerv_cli.settings import REAL
 from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.store import StudyStore
 
@@ -47,8 +48,15 @@ def own_errors(store: StudyStore, data: StudyData, found: Predictions) -> pd.Dat
 
 
 def _autoregressive(data: StudyData, target: str) -> list[Cell]:
-    """The cells of one label that decodes this target autoregressively: the baseline if it does, else the first."""
-    cells = [c for c in data.plan.cells if is_autoregressive(c.settings) and c.settings["policy"]["target"] == target]
+    """The cells of one label that decodes this target autoregressively: the baseline if it does, else the first. Where
+    the world goes on during decodes, chunks are not executed whole."""
+    cells = [
+        c
+        for c in data.plan.cells
+        if is_autoregressive(c.settings)
+        and c.settings["policy"]["target"] == target
+        and c.settings.get("rollout", {}).get("clock") != REAL
+    ]
     labels = {cell.label for cell in cells}
     chosen = data.plan.baseline if data.plan.baseline in labels else next((cell.label for cell in cells), None)
     return [cell for cell in cells if cell.label == chosen]

@@ -16,6 +16,8 @@ from kerv_cli.reporting import prediction
 from kerv_cli.reporting.agreement import agreement_table
 from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
+from kerv_cli.reporting.latency import latency_figure, latency_summary, latency_table
+from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.own_actions import own_errors
 from kerv_cli.reporting.page import Section, render
 from kerv_cli.reporting.plots import study_figures
@@ -91,7 +93,7 @@ class _Reporter:
         figures = study_figures(whole, data.plan.axis, data.plan.title or name)
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
-        sections = []
+        sections = [self.latency_section(data)]
         for target in prediction.predicting_targets(settings):
             sections += [self.prediction_section(target), self.own_actions_section(store, data, target)]
         if _varies_boundary(settings):
@@ -144,6 +146,21 @@ class _Reporter:
             note=f"As above, on what the autoregressive episodes of this study executed: tables/{name}.csv.",
             figure=self._save_plot(prediction.prediction_figure(title, table, "episodes of the policy"), name),
             table=prediction.prediction_summary(table),
+        )
+
+    def latency_section(self, data: StudyData) -> Section | None:
+        """Writes success at the latencies of a study whose world goes on; None where it waits."""
+        table = latency_table(data)
+        if table is None:
+            return None
+        name, title = f"{data.plan.name}_latency", "Success against the time that AR takes"
+        self._save_table(table, name)
+        about = f"{table['episodes'].max()} episodes per setting, {MICRO}"
+        return Section(
+            title=title,
+            note=f"Every setting beside AR at the same latency and compensation, same episodes: tables/{name}.csv.",
+            figure=self._save_plot(latency_figure(table, title, about), name),
+            table=latency_summary(table),
         )
 
     def curvature_section(self) -> Section:

@@ -27,8 +27,10 @@ _WHERE_USED = {
     "compensation_rate": "compensated",
     "retrieval_share": "retrieved",
     "deviation": "deviation",
+    "felt_latency_ms": "felt ms",
+    "held_share": "held",
 }
-_PERCENT = frozenset({"skip_rate", "unverified_share", "compensation_rate", "retrieval_share"})
+_PERCENT = frozenset({"skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "held_share"})
 
 
 @dataclass(frozen=True)

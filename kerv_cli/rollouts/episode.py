@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
+from collections import deque
 from typing import Protocol
 
 import numpy as np
 
-from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord
+from kerv_cli.decoding.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
+from kerv_cli.rollouts.clock import RealClock
 from kerv_cli.spaces import Observation
 
 
@@ -62,26 +65,66 @@ class _Trace:
                 self.places.setdefault(place.name, []).append(state[place.first : place.first + 3])
 
 
-def run_episode(world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None) -> EpisodeRecord:
-    """One closed-loop episode: decodes a chunk, executes it whole, until success or the horizon.
+class _Execution:
+    """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
+    the first one the robot stands still."""
+
+    def __init__(self, world: World, decoder: ActionDecoder, trace: _Trace) -> None:
+        self.world, self.decoder, self.trace = world, decoder, trace
+        self.in_hand: deque[np.ndarray] = deque()
+        self.last = world.spec.standstill(world.gripper)
+
+    def step(self) -> None:
+        """One control step."""
+        if self.in_hand:
+            self.last = self.in_hand.popleft()
+        self.trace.add(self.last)
+        self.decoder.observe(self.trace.actions[-1], self.trace.path[-1])
+
+    def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
+        """A new chunk replaces the one in hand."""
+        if clock is None or decode.delay is None:
+            self.in_hand = deque(decode.actions)
+        else:
+            self.in_hand = deque(clock.chunk(decode, self.trace.actions[: decode.delay.observed]))
+
+    def until(self, left: int) -> None:
+        """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
+        while len(self.in_hand) > left and not self.world.done:
+            self.step()
+
+    def during(self, delay: Delay) -> Delay:
+        """The world goes on for a decode's delay -> the delay, with what was executed."""
+        before, in_hand = len(self.trace.actions), len(self.in_hand)
+        while len(self.trace.actions) < before + delay.steps and not self.world.done:
+            self.step()
+        carried = in_hand - len(self.in_hand)
+        return dataclasses.replace(delay, carried=carried, held=len(self.trace.actions) - before - carried)
+
+
+def run_episode(
+    world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
+) -> EpisodeRecord:
+    """One closed-loop episode until success or the horizon: decodes a chunk and executes it whole, or, with a clock,
+    as docs/methods.md §8 says.
 
     Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
-    record keeps, one per control step; None: none.
+    record keeps, one per control step; None: none. clock: of a world that goes on during decodes; None: it waits.
     """
     began = time.perf_counter()
     world.reset(seed)
     decoder.reset(world.task, seed, world.end_effector)
     trace = _Trace(world, camera)
+    execution = _Execution(world, decoder, trace)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
+    if clock is not None:
+        clock.reset()
     while not world.done:
-        decodes.append(decoder.decode(world.observe(decoder.cameras)))
+        decodes.append(_decode(execution, clock))
         decode_steps.append(len(trace.actions))
-        for action in decodes[-1].actions:
-            trace.add(action)
-            decoder.observe(trace.actions[-1], trace.path[-1])
-            if world.done:
-                break
+        execution.take(decodes[-1], clock)
+        execution.until(0 if clock is None else clock.expected)
     decoder.finish(world.succeeded)
     return EpisodeRecord(
         environment=world.spec.name,
@@ -101,3 +144,14 @@ def run_episode(world: World, decoder: ActionDecoder, seed: int, camera: CameraC
         places={name: np.asarray(path, dtype=np.float32) for name, path in trace.places.items()},
         wall_seconds=time.perf_counter() - began,
     )
+
+
+def _decode(execution: _Execution, clock: RealClock | None) -> DecodeRecord:
+    """Decodes the present observation; with a clock the world goes on for as long as that takes."""
+    world, decoder, trace = execution.world, execution.decoder, execution.trace
+    observation = world.observe(decoder.cameras)
+    if clock is None:
+        return decoder.decode(observation)
+    decode = decoder.decode(clock.observed(observation, trace.path))
+    delay = clock.delay(decode, len(trace.actions))
+    return dataclasses.replace(decode, delay=execution.during(delay))

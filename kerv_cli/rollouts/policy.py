@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -16,13 +17,17 @@ from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.environments.stress import check as check_stress
 from kerv_cli.errors import UsageError
+from kerv_cli.rollouts import timing
+from kerv_cli.rollouts.clock import RealClock
 from kerv_cli.rollouts.episode import ActionDecoder
 from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.runtime import set_up
-from kerv_cli.settings import EXPERT, RolloutSettings
+from kerv_cli.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings
 from kerv_cli.spaces import Observation
 
 WARM_UP_DECODES = 6
+CALIBRATION_DECODES = 15
+"""Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
 OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
@@ -46,9 +51,10 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     """
     if is_expert(settings):
         return {"target": "", OBSERVATION: "state (privileged)"}
+    profile = timing.identity_of(settings)
     artifacts = artifacts_of(settings)
     shown = shown_to(artifacts.description.settings)
-    return {**artifacts.check(needs(settings.parts())), OBSERVATION: shown}
+    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: shown}
 
 
 def shown_to(target: Mapping[str, object]) -> str:
@@ -82,8 +88,9 @@ def check(settings: RolloutSettings) -> None:
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     check_stress(settings.world.stress, spec)
+    timing.check_numbers(settings, spec)
     if is_expert(settings):
-        _check_expert(settings)
+        _check_expert(settings, spec)
         return
     artifacts = artifacts_of(settings)
     target, camera = artifacts.description, settings.world.camera
@@ -95,6 +102,7 @@ def check(settings: RolloutSettings) -> None:
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     check_method(method, settings.chunk, target.chunk, target.parallel)
+    timing.check_method(settings, spec, target)
     wanted = needs(method)
     hashes = artifacts.check(wanted)
     if "risk" in wanted:
@@ -114,7 +122,8 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
 
 
-def _check_expert(settings: RolloutSettings) -> None:
+def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
+    timing.check_expert(settings, spec)
     if settings.deviation_every > 0:
         raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
     if settings.chunk:
@@ -181,12 +190,51 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     return decoder
 
 
+def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
+    """The clock of one setting on one task; None where the world waits.
+
+    Raises:
+        UsageError: as `check`.
+    """
+    if settings.rollout.clock == WAITS:
+        return None
+    target = None if is_expert(settings) else artifacts_of(settings).description
+    measured = 0.0
+    if timing.calibrates(settings):
+        runtime = settings.runtime
+        measured = _ar_seconds(
+            *(settings.results, settings.policy.target, settings.chunk, task, settings.world.camera.size),
+            *(runtime.device, runtime.dtype, runtime.threads),
+        )
+    latency = timing.latency_of(settings, target, measured)
+    return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
+
+
+@functools.cache
+def _ar_seconds(
+    results: str, target: str, chunk: int, task: str, pixels: int, device: str, dtype: str, threads: int
+) -> float:
+    """Median seconds of an autoregressive decode here, after warm-up; measured once per process."""
+    runtime = RuntimeSettings(device=device, dtype=dtype, threads=threads)
+    policy = PolicySettings(target=target)
+    artifacts = artifacts_of(RolloutSettings(results=results, runtime=runtime, policy=policy))
+    decoder = Decoder(artifacts.target, chunk=chunk)
+    warm_up(decoder, task, spec_of(task), pixels)
+    still = still_observation(decoder, spec_of(task), pixels)
+    return float(np.median([decoder.decode(still).seconds for _ in range(CALIBRATION_DECODES)]))
+
+
+def still_observation(decoder: ActionDecoder, spec: EnvironmentSpec, pixels: int) -> Observation:
+    """Zeros for everything that the decoder reads. pixels: size of the images."""
+    images = {name: np.zeros((pixels, pixels, 3), dtype=np.uint8) for name in decoder.cameras}
+    space = spec.observation
+    return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+
+
 def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: int) -> None:
     """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
     so that parts that need a history or a path run too. pixels: size of the images."""
-    images = {name: np.zeros((pixels, pixels, 3), dtype=np.uint8) for name in decoder.cameras}
-    space = spec.observation
-    still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+    still = still_observation(decoder, spec, pixels)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
     for i in range(WARM_UP_DECODES):
         for action in decoder.decode(still).actions:

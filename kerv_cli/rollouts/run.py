@@ -20,7 +20,7 @@ from kerv_cli.environments.stress import NO_STRESS, Stress
 from kerv_cli.environments.stress import build as build_stress
 from kerv_cli.environments.world import EpisodeWorld
 from kerv_cli.rollouts.episode import ActionDecoder, run_episode
-from kerv_cli.rollouts.policy import decoder_for
+from kerv_cli.rollouts.policy import clock_for, decoder_for
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
 
 
@@ -66,6 +66,7 @@ class Runner:
         self.settings, self.task = settings, task
         self.decoder = decoder_for(settings, task)
         self.stress = build_stress(settings.world.stress)
+        self.clock = clock_for(settings, task)
         camera = camera_config(settings.world.camera)
         self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
         self.on_step: Callable[[int], None] | None = None  # told the number of executed control steps, for progress
@@ -74,7 +75,7 @@ class Runner:
         """Runs the episode of a seed; its record has frames where it is recorded."""
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
         decoder = self.decoder if self.on_step is None else Watched(self.decoder, self.on_step)
-        return run_episode(world, decoder, seed, self._recording if recorded else None)
+        return run_episode(world, decoder, seed, self._recording if recorded else None, self.clock)
 
 
 class Watched:

@@ -46,6 +46,12 @@ EPISODE_SCHEMA = pa.schema(
         ("alarm_audits", pa.int64()),  # audits up to the first alarm, its own included
         ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
         ("deviation_count", pa.int64()),
+        ("delay_decodes", pa.int64()),  # decodes during which the world went on
+        ("delay_seconds", pa.float64()),  # of those: latency that the world felt
+        ("delay_steps", pa.int64()),  # the same in control steps
+        ("carried_steps", pa.int64()),  # control steps during decodes that executed the chunk before
+        ("held_steps", pa.int64()),  # … that held the last action
+        ("dropped_steps", pa.int64()),  # actions of new chunks that were left out as stale
         ("wall_seconds", pa.float64()),
         ("initial_state", pa.list_(pa.float64())),
         ("repeat", pa.int64()),
@@ -71,6 +77,7 @@ _ROUND = pa.struct(
         ("threshold", _TOKENS),
     ]
 )
+_OF_DELAY = ("observed", "carried", "held", "dropped", "predicted")  # fields of Delay
 _MEASURES = ("variability", "similarity", "metric", "deviation")
 _OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds")  # fields of EpisodeRecord
 _OF_DECODE = ("mode", "forwards", "seconds", "compensated", "skipped", *_MEASURES)  # fields of DecodeRecord
@@ -96,6 +103,9 @@ DECODE_SCHEMA = pa.schema(
         ("reason", pa.string()),
         ("loss", pa.float64()),
         ("alarm", pa.bool_()),
+        ("delay_seconds", pa.float64()),  # these: null where the world waited
+        ("delay_steps", pa.int64()),
+        *[(name, pa.int64()) for name in _OF_DELAY],
     ]
 )
 _TRUST = ("score", "level", "reason", "loss", "alarm")
@@ -143,6 +153,7 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         **_audit(decodes),
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),
+        **_delay_sums(record),
         "initial_state": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
         "repeat": repeat,
         **asdict(at),
@@ -156,6 +167,18 @@ def _audit(decodes: Sequence[DecodeRecord]) -> dict[str, Any]:
     first = next((count for count, (_, alarm) in enumerate(audits, 1) if alarm), 0)
     losses = sum(loss for loss, _ in audits)
     return {"audits": len(audits), "audit_loss": losses, "alarmed": int(first > 0), "alarm_audits": first}
+
+
+def _delay_sums(record: EpisodeRecord) -> dict[str, float]:
+    delays = [d.delay for d in record.decodes if d.delay is not None]
+    return {
+        "delay_decodes": len(delays),
+        "delay_seconds": float(sum(d.seconds for d in delays)),
+        "delay_steps": sum(d.steps for d in delays),
+        "carried_steps": sum(d.carried for d in delays),
+        "held_steps": sum(d.held for d in delays),
+        "dropped_steps": sum(d.dropped for d in delays),
+    }
 
 
 def _phase_seconds(decode: DecodeRecord) -> dict[str, float | None]:
@@ -179,6 +202,9 @@ def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
             "actions": np.asarray(decode.actions, dtype=np.float32).tolist(),
             "rounds": [_round_row(r) for r in decode.rounds],
             **{name: getattr(decode.trust, name, None) for name in _TRUST},
+            "delay_seconds": None if decode.delay is None else decode.delay.seconds,
+            "delay_steps": decode.delay_steps,
+            **{name: getattr(decode.delay, name, None) for name in _OF_DELAY},
         }
         for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
     ]

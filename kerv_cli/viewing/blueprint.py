@@ -24,8 +24,9 @@ SIGNALS = {
     "score": "score of the draft",
     "loss": "loss of the draft, where verified",
     "deviation": "deviation from AR",
+    "delay_steps": "latency that the world felt, control steps",
 }
-"""Optional fields of DecodeRecord -> titles of their views."""
+"""Optional attributes of DecodeRecord -> titles of their views."""
 
 
 LIMITS = {"metric": "F*", "similarity": "s_min", "score": "level"}

@@ -38,4 +38,5 @@ SPEC = EnvironmentSpec(
     world_class="kerv_cli.environments.insertion.world:InsertionWorld",
     expert_class="kerv_cli.environments.insertion.expert:InsertionExpert",
     packages=("mujoco",),
+    grip=(0.0, 1.0),
 )

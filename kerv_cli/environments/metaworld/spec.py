@@ -40,4 +40,5 @@ SPEC = EnvironmentSpec(
     expert_class="kerv_cli.environments.metaworld.world:MetaWorldExpert",
     suffix=SUFFIX,
     packages=("metaworld", "mujoco"),
+    grip=(1.0, -1.0),
 )

@@ -1,0 +1,107 @@
+"""Success at a latency that the world feels, from a made-up study: every setting beside AR at the same latency."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from studies_synthetic import IDENTITY, episode, settings_of
+
+from kerv_cli.decoding.record import Delay, EpisodeRecord
+from kerv_cli.reporting.latency import latency_figure, latency_summary, latency_table
+from kerv_cli.reporting.report import report
+from kerv_cli.reporting.tables import load_study
+from kerv_cli.settings import RolloutSettings, StudySettings, TimingSettings
+from kerv_cli.studies.execute import execute
+from kerv_cli.studies.plan import Cell, plan
+from kerv_cli.studies.store import StudyStore
+
+SHARE = {"ar": 1.0, "spec_vla": 0.4}
+
+
+def setting(method: str, r: int, **timing: object) -> RolloutSettings:
+    chosen = settings_of(method, r)
+    chosen.rollout = TimingSettings(clock="real", latency="profile", profile="p", **timing)  # type: ignore[arg-type]
+    return chosen
+
+
+def prepare(cell: Cell) -> Callable[[int], EpisodeRecord]:
+    """AR takes 30 ms, or what it is asked to; where it takes 100 ms it fails."""
+    timing = cell.settings["rollout"]
+
+    def run(seed: int) -> EpisodeRecord:
+        record = episode(cell, seed)
+        if timing["clock"] == "waits":
+            return record
+        seconds = SHARE[cell.settings["method"]] * (timing["ar_ms"] or 30.0) / 1000
+        steps = int(seconds * 80) + 1
+        delay = Delay(seconds, steps, 0, min(4, steps), max(0, steps - 4))
+        decodes = tuple(dataclasses.replace(d, delay=delay) for d in record.decodes)
+        fails = cell.settings["method"] == "ar" and timing["ar_ms"] == 100
+        return dataclasses.replace(record, decodes=decodes, success=not fails)
+
+    return run
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    settings = {"ar waits": settings_of("ar")}
+    for method, r in (("ar", 0), ("spec_vla", 9)):
+        for ms in (0.0, 20.0, 100.0):
+            for kind in ("none", "chunk"):
+                settings[f"{method} ar_ms={ms:g} {kind}"] = setting(method, r, ar_ms=ms, delay_compensation=kind)
+    cells = plan(settings, ["reach-v3", "push-v3"], IDENTITY, baseline="ar waits")
+    store = StudyStore(tmp_path, "latency")
+    store.write_plan(StudySettings(name="latency", title="Latency", baseline="ar waits", axis="rollout.ar_ms"), cells)
+    execute(cells, prepare, store)
+    return tmp_path
+
+
+def test_every_setting_stands_beside_ar_at_its_latency(results: Path) -> None:
+    table = latency_table(load_study(StudyStore(results, "latency")))
+    assert table is not None
+    assert len(table) == 12  # not the world that waits
+    rows = table.set_index("label")
+    fast = rows.loc["spec_vla ar_ms=100 none"]
+    assert fast["ar"] == "ar ar_ms=100 none"
+    assert (fast["ar_latency_ms"], fast["felt_latency_ms"]) == pytest.approx((100.0, 40.0))
+    assert (fast["difference"], fast["only_method"], fast["pairs"]) == (1.0, 8, 8)
+    assert fast["difference_low"] > 0.5
+    own = rows.loc["spec_vla ar_ms=0 chunk"]
+    assert (own["ar_latency_ms"], own["felt_latency_ms"]) == pytest.approx((30.0, 12.0))
+    assert own["difference"] == 0.0
+    assert fast["held_share"] == 0.0 < rows.loc["ar ar_ms=100 none"]["held_share"]  # four steps of its chunk, and nine
+    told = latency_summary(table).set_index("setting")
+    assert told.loc["spec_vla ar_ms=100 none"]["minus AR's"].startswith("100.0 (")
+    assert told.loc["ar ar_ms=100 none"]["minus AR's"] == ""
+
+
+def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(results: Path) -> None:
+    table = latency_table(load_study(StudyStore(results, "latency")))
+    assert table is not None
+    figure = latency_figure(table, "title", "about")
+    titles = [panel.get_title(loc="left") for panel in figure.axes]
+    assert titles == ["delay compensation: none", "delay compensation: chunk"]
+    lines = {line.get_label(): line for line in figure.axes[0].get_lines()}
+    assert {"ar", "spec_vla"} <= set(lines)
+    assert list(lines["ar"].get_ydata()) == [100.0, 100.0, 0.0]  # by latency: 20, 30 (its own), 100 ms
+    assert [text.get_text() for text in figure.axes[0].get_xticklabels()] == ["20", "30", "100"]
+
+
+def test_a_report_has_the_section_where_the_world_goes_on_alone(results: Path) -> None:
+    written = report(results, "latency")
+    names = {path.name for path in written.files}
+    assert {"latency.csv", "latency_latency.csv", "latency_latency.png", "report.html"} <= names
+    page = (results / "studies" / "latency" / "report.html").read_text(encoding="utf-8")
+    assert "Success against the time that AR takes" in page
+    whole = pd.read_csv(results / "report" / "tables" / "latency.csv")
+    waits = whole[whole["label"] == "ar waits"]
+    assert waits["felt_latency_ms"].isna().all()
+    assert (whole[whole["label"] == "ar ar_ms=100 none"]["felt_latency_ms"] == 100.0).all()
+    assert set(whole["rollout.delay_compensation"]) == {"none", "chunk"}
+    data = load_study(StudyStore(results, "latency"))
+    still = dataclasses.replace(data, plan=dataclasses.replace(data.plan, cells=data.plan.cells[:1]))
+    assert latency_table(still) is None or len(latency_table(still)) == 0  # type: ignore[arg-type]

@@ -1,0 +1,427 @@
+"""A world that goes on while the policy decodes: what is executed meanwhile, for how long, and what compensates it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from examples.point_mass import SPEC, PointWorld
+from studies_synthetic import still_episode
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.config import compose
+from kerv_cli.decoding.cost import Profile
+from kerv_cli.decoding.record import DecodeRecord, Delay, EpisodeRecord, Round
+from kerv_cli.environments.insertion.spec import SPEC as INSERTION
+from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
+from kerv_cli.errors import KervError
+from kerv_cli.rollouts import policy as policies_of
+from kerv_cli.rollouts import run
+from kerv_cli.rollouts.clock import RealClock, displacement, predictor
+from kerv_cli.rollouts.episode import run_episode
+from kerv_cli.rollouts.latency import Constant, Measured, Profiled, steps_of
+from kerv_cli.settings import EVALUATION_SEED, RolloutSettings
+from kerv_cli.spaces import Observation
+from kerv_cli.studies.rows import Circumstances, decode_rows, episode_row
+
+HZ = SPEC.actions.control_hz
+TASK = "drawer-open-v3"
+
+
+class Numbered:
+    """Its chunks are numbered: action `i` of decode `n` is (n, i) in hundredths of the limits. It remembers what it was
+    shown and told."""
+
+    cameras = ()
+
+    def __init__(self, chunk: int = 4, seconds: Callable[[int], float] = lambda n: 0.0) -> None:
+        self.chunk, self.seconds = chunk, seconds
+        self.shown: list[Observation] = []
+        self.told: list[np.ndarray] = []
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode."""
+        self.shown, self.told = [], []
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The next numbered chunk."""
+        self.shown.append(observation)
+        number = len(self.shown)
+        actions = np.array([(number, i) for i in range(self.chunk)], np.float32) / 2000
+        seconds = self.seconds(number)
+        return DecodeRecord((), actions, 0, (), "ar", seconds, {})
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Remembers it."""
+        self.told.append(action)
+
+    def finish(self, success: bool) -> None:
+        """Nothing to learn."""
+
+
+def played(record: EpisodeRecord) -> list[tuple[int, int]]:
+    """The executed actions by their numbers; (0, 0) is standing still."""
+    return [(round(2000 * a), round(2000 * b)) for a, b in record.actions.tolist()]
+
+
+def point_episode(clock: RealClock | None, decoder: Any = None, horizon: int = 0) -> EpisodeRecord:
+    """In a world in which the numbers lead nowhere near the goal."""
+    with PointWorld(SPEC, "push-point", horizon=horizon) as world:
+        return run_episode(world, decoder or Numbered(), EVALUATION_SEED + 1, clock=clock)
+
+
+def constant(steps: float, compensation: str = "none") -> RealClock:
+    return RealClock(Constant(steps / HZ), SPEC.actions, compensation)
+
+
+@pytest.mark.parametrize("compensation", ["none", "hold", "linear", "kalman", "chunk", "position"])
+def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: str) -> None:
+    waiting, real = point_episode(None), point_episode(constant(0, compensation))
+    assert (waiting.actions == real.actions).all()
+    assert (waiting.path == real.path).all()
+    assert waiting.decode_steps == real.decode_steps
+    assert all(d.delay == Delay(0.0, 0, s) for d, s in zip(real.decodes, real.decode_steps, strict=True))
+    assert all(d.delay is None for d in waiting.decodes)
+
+
+@pytest.mark.parametrize("compensation", ["none", "kalman"])
+def test_without_latency_a_policy_is_bit_for_bit_the_same(policies: Path, compensation: str) -> None:
+    real = ["rollout.clock=real", "rollout.latency=constant", f"rollout.delay_compensation={compensation}"]
+    a, b = (episode_of(policies, "method=spec_vla", *words) for words in ([], real))
+    assert (a.actions == b.actions).all()
+    assert (a.path == b.path).all()
+    assert [d.tokens for d in a.decodes] == [d.tokens for d in b.decodes]
+
+
+def episode_of(results: Path, *overrides: str) -> EpisodeRecord:
+    words = ["world.horizon=12", "record=0", f"results={results}", "policy.target=nano-state", *overrides]
+    chosen = compose("rollout", words, RolloutSettings)
+    policies_of.check(chosen)
+    (record,) = run.run_task(chosen, TASK, [EVALUATION_SEED])
+    return record
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 4])
+def test_the_chunk_in_hand_is_executed_on(steps: int) -> None:
+    """k ≤ H: k old actions between an observation and the first action that it led to, and no pause after the first."""
+    record = point_episode(constant(steps))
+    assert played(record)[: steps + 8] == [(0, 0)] * steps + [(n, i) for n in (1, 2) for i in range(4)]
+    first, second, *_ = record.decodes
+    assert first.delay == Delay(steps / HZ, steps, 0, carried=0, held=steps)
+    assert second.delay == Delay(steps / HZ, steps, 4, carried=steps, held=0)
+    assert record.decode_steps[:3] == (steps, steps + 4, steps + 8)
+
+
+def test_a_chunk_that_is_used_up_is_held() -> None:
+    record = point_episode(constant(6))
+    assert played(record)[:24] == [(0, 0)] * 6 + [(n, i) for n in (1, 2, 3) for i in (0, 1, 2, 3, 3, 3)]
+    second = record.decodes[1].delay
+    assert second == Delay(6 / HZ, 6, 6, carried=4, held=2)
+
+
+def test_between_observation_and_first_action_lie_k_steps_whatever_the_chunk() -> None:
+    for chunk in (1, 2, 5):
+        for steps in (1, 2, 3, 7):
+            record = point_episode(constant(steps), Numbered(chunk))
+            begun = zip(record.decodes[:-1], record.decode_steps, strict=False)
+            for number, (decode, start) in enumerate(begun, 1):
+                assert decode.delay is not None
+                assert start - decode.delay.observed == steps == decode.delay.carried + decode.delay.held
+                assert played(record)[start] == (number, 0)
+
+
+def test_a_fake_clock_says_how_long_each_decode_took() -> None:
+    """Measured seconds, rounded up; a decode begins as early as the one before took long."""
+    seconds = {1: 0.11, 2: 0.31, 3: 0.05}
+    decoder = Numbered(4, lambda n: seconds.get(n, 0.2))
+    record = point_episode(RealClock(Measured(), SPEC.actions), decoder)
+    delays = [d.delay for d in record.decodes[:4] if d.delay is not None]
+    assert [d.steps for d in delays] == [2, 4, 1, 2]
+    assert [d.seconds for d in delays] == [0.11, 0.31, 0.05, 0.2]
+    assert [(d.observed, d.carried, d.held) for d in delays] == [(0, 0, 2), (4, 2, 2), (8, 1, 0), (12, 1, 1)]
+    assert len(decoder.told) == record.steps  # held actions are part of the history
+
+
+def test_an_episode_can_end_while_the_policy_decodes() -> None:
+    record = point_episode(constant(6), horizon=9)
+    assert record.steps == 9
+    assert record.decodes[-1].delay == Delay(0.6, 6, 6, carried=3, held=0)
+    assert record.decode_steps[-1] == 9
+    row = episode_row(record, Circumstances())
+    assert (row["delay_decodes"], row["delay_steps"], row["carried_steps"], row["held_steps"]) == (2, 12, 3, 6)
+    assert row["delay_seconds"] == pytest.approx(1.2)
+    assert [(r["observed"], r["delay_steps"], r["held"]) for r in decode_rows(record)] == [(0, 6, 6), (6, 6, 0)]
+    waited = decode_rows(point_episode(None))[0]
+    assert waited["delay_steps"] is waited["observed"] is waited["delay_seconds"] is None
+
+
+def test_rounding_up_ignores_float_noise_and_refuses_nonsense() -> None:
+    assert [steps_of(s, 80.0) for s in (0.0, 0.0001, 0.0125, 0.0126, 5 * 0.0125, 0.2)] == [0, 1, 1, 2, 5, 16]
+    for wrong in (-0.001, float("nan"), float("inf")):
+        with pytest.raises(KervError, match="cannot last"):
+            steps_of(wrong, 80.0)
+
+
+def test_chunk_drops_what_is_stale() -> None:
+    record = point_episode(constant(2, "chunk"))
+    assert played(record)[:8] == [(0, 0), (0, 0), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2), (3, 3)]
+    assert {d.delay.dropped for d in record.decodes if d.delay} == {2}
+    slow = point_episode(RealClock(Measured(), SPEC.actions, "chunk"), Numbered(4, lambda n: 0.6))
+    assert played(slow)[6:12] == [(1, 3)] * 6  # the last action of a chunk is always left
+    assert slow.decodes[0].delay == Delay(0.6, 6, 0, carried=0, held=6, dropped=3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "steps", "wanted"),
+    [
+        ("hold", 2, [(1, 2), (1, 3), (1, 3), (1, 3)]),
+        ("linear", 2, [(1, 2), (1, 3), (1, 4), (1, 5)]),
+        ("kalman", 2, [(1, 2), (1, 3), (1, 4), (1, 5)]),  # a chunk that is a line, from its first action on
+        ("linear", 6, [(1, 6), (1, 7), (1, 8), (1, 9)]),
+        ("hold", 6, [(1, 3)] * 4),
+    ],
+)
+def test_predictions_go_on_behind_the_chunk(kind: str, steps: int, wanted: list[tuple[int, int]]) -> None:
+    """Action i of a chunk is executed at the step that it is meant for; what lies behind its last is predicted."""
+    clock = constant(steps, kind)
+    decode = Numbered(4).decode(Observation(np.zeros(3), np.zeros(6)))
+    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
+    assert decode.delay is not None
+    assert (decode.delay.dropped, decode.delay.predicted) == (min(steps, 4), min(steps, 4))
+    line = [np.array([1, -i]) / 2000 for i in range(30, 0, -1)]  # what was executed before leads up to it
+    found = clock.chunk(decode, line if kind == "kalman" else [])
+    assert found.dtype == np.float32
+    assert found * 2000 == pytest.approx(np.array(wanted), abs=0.05)
+    assert (found[: 4 - min(steps, 4)] == decode.actions[min(steps, 4) :]).all()
+
+
+def test_strict_dofs_are_held_and_far_predictions_stay_finite() -> None:
+    space = METAWORLD.actions
+    clock = RealClock(Constant(3.0), space, "linear")
+    actions = np.array([[0.1, 0, 0, -1], [0.2, 0, 0, 1]], np.float32)
+    decode = DecodeRecord((), actions, 0, (), "ar", 0.0, {})
+    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
+    assert decode.delay is not None
+    assert decode.delay.steps == 240
+    found = clock.chunk(decode, [])
+    assert found == pytest.approx(np.array([[1.0, 0, 0, 1]] * 2))  # clipped to the limits; the gripper as it was last
+
+
+def test_one_action_is_no_line() -> None:
+    clock = constant(3, "kalman")
+    decode = Numbered(1).decode(Observation(np.zeros(3), np.zeros(6)))
+    decode = dataclasses.replace(decode, delay=clock.delay(decode, 0))
+    assert clock.chunk(decode, []) == pytest.approx(decode.actions)
+
+
+def test_a_compensated_episode_executes_what_the_clock_says() -> None:
+    record = point_episode(constant(2, "hold"))
+    assert played(record)[:10] == [(0, 0)] * 2 + [(n, i) for n in (1, 2) for i in (2, 3, 3, 3)]
+
+
+def test_the_decoder_is_shown_the_end_effector_where_it_will_be() -> None:
+    uniform = np.arange(12)[:, None] * np.array([0.002, 0.0, -0.001])
+    motion = predictor("kalman", np.zeros(3, dtype=bool))
+    assert displacement(motion, uniform, 5) == pytest.approx(5 * uniform[1])
+    assert displacement(motion, uniform[:2], 5) == pytest.approx(np.zeros(3))  # one displacement is no motion
+    decoder = Numbered(1)
+    record = point_episode(constant(3, "position"), decoder)
+    for number, shown in enumerate(decoder.shown[:6]):
+        delay = record.decodes[number].delay
+        assert delay is not None
+        path = record.path[: delay.observed + 1].astype(float)
+        ahead = displacement(motion, path, 3) if number else np.zeros(3)
+        assert shown.proprioception[:3] == pytest.approx(path[-1] + ahead, abs=1e-6)
+        assert (shown.state[:3] == shown.proprioception[:3]).all()
+        assert (shown.state[3:] == record.initial_state[3:]).all()
+        assert number < 4 or np.linalg.norm(ahead) > 1e-4
+
+
+def test_before_its_first_action_a_robot_stands_still() -> None:
+    assert METAWORLD.standstill(1.0).tolist() == [0.0, 0.0, 0.0, -1.0]
+    assert METAWORLD.standstill(0.0).tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert INSERTION.standstill(0.0).tolist() == [0.0] * 7  # a held peg stays held
+    assert INSERTION.standstill(1.0).tolist() == [0.0] * 6 + [1.0]
+    with METAWORLD.open_world("pick-place-v3") as world:
+        before = world.reset(EVALUATION_SEED).proprioception
+        for _ in range(20):
+            world.step(world.spec.standstill(1.0))
+        assert world.observation.proprioception == pytest.approx(before, abs=1e-2)
+
+
+# --- sources of latency
+
+PROFILE = Profile(
+    31,
+    {
+        "encode": ((1,), (0.005,)),
+        "prefill": ((31, 46), (0.008, 0.0095)),
+        "verify": ((1, 16), (0.002, 0.005)),
+        "draft": ((2, 6), (0.001, 0.005)),
+        "feed": ((1, 31), (0.0005, 0.002)),
+    },
+)
+
+
+def decode_of(rounds: Sequence[Round], propose: float = 0.0) -> DecodeRecord:
+    phases = {"propose": propose, "accept": 0.0005, "other": 0.0005, "verify": 9.0}
+    return DecodeRecord((0,) * 16, np.zeros((4, 4), np.float32), len(rounds), tuple(rounds), "ar", 9.5, phases, size=16)
+
+
+AR = decode_of([Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(16)])
+
+
+def test_a_profile_prices_the_records_forwards() -> None:
+    """All on another device but acceptance and the like, whose seconds are the record's own."""
+    assert Profiled(PROFILE).seconds(AR) == pytest.approx(0.005 + 0.008 + 15 * 0.002 + 0.001)
+    skipped = decode_of([Round("skip", "early", 0, (0,) * 16, (), 16, 16, 0, ())], propose=0.002)
+    assert Profiled(PROFILE).seconds(skipped) == pytest.approx(0.005 + 0.002 + 0.001)
+    one = decode_of([Round("verify", "merged", 0, (0,) * 15, (0,) * 16, 15, 16, 15, (9,))], propose=0.003)
+    assert Profiled(PROFILE).seconds(one) == pytest.approx(0.005 + 0.0095 + 0.003 + 0.001)
+    drafted = decode_of(
+        [
+            Round("prefill", "none", 0, (), (0,), 0, 1, 0, ()),
+            Round("verify", "drafter", 1, (0,) * 14, (0,) * 15, 14, 15, 14, (9,)),
+        ],
+        propose=5.0,  # the drafter's, which the profile has its own times for
+    )
+    wanted = 0.005 + 0.008 + 0.002 + (0.002 + 14 * 0.0002) + 13 * 0.001 + 0.001
+    assert Profiled(PROFILE).seconds(drafted) == pytest.approx(wanted)
+
+
+def profile_file(folder: Path, **phases: Any) -> Path:
+    document = {"profile": PROFILE.as_dict()}
+    document["profile"]["phases"] |= phases
+    path = folder / "bench" / "there.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(document))
+    return path
+
+
+@pytest.fixture
+def results(policies: Path, tmp_path: Path) -> Path:
+    """The policies, in a folder to which a bench can be added."""
+    (tmp_path / "artifacts").symlink_to(policies / "artifacts")
+    return tmp_path
+
+
+def test_ar_takes_what_was_asked_for_and_the_others_their_share(results: Path) -> None:
+    profile_file(results)
+    words = ("rollout.clock=real", "rollout.latency=profile", "rollout.profile=there", "rollout.ar_ms=43")
+    ar = episode_of(results, "method=ar", *words)
+    host = [sum(d.phases[name] for name in ("propose", "accept", "rectify", "other")) for d in ar.decodes]
+    felt = [d.delay.seconds for d in ar.decodes if d.delay is not None]
+    assert felt == pytest.approx([0.043 * (1 + h / 0.043) for h in host])  # the profile's AR takes 43 ms
+    double = episode_of(results, "method=ar", *words[:3], "rollout.ar_ms=86").decodes[0]
+    assert double.delay is not None
+    assert double.delay.seconds >= 2 * 0.043
+    assert steps_of(felt[0], 80.0) == ar.decodes[0].delay_steps
+
+
+def test_measured_latency_is_scaled_by_ars_median_here(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policies_of, "_ar_seconds", lambda *key: 0.02)
+    record = episode_of(policies, "method=ar", "rollout.clock=real", "rollout.ar_ms=100")
+    for decode in record.decodes:
+        assert decode.delay is not None
+        assert decode.delay.seconds == pytest.approx(5 * decode.seconds)
+
+
+def test_ar_is_measured_once_per_process(policies: Path) -> None:
+    chosen = compose("rollout", [f"results={policies}", "policy.target=nano-state"], RolloutSettings)
+    chosen.rollout = dataclasses.replace(chosen.rollout, clock="real", ar_ms=50)
+    policies_of._ar_seconds.cache_clear()
+    for _ in range(2):
+        clock = policies_of.clock_for(chosen, TASK)
+    assert policies_of._ar_seconds.cache_info().misses == 1
+    assert clock is not None
+    assert 0 < clock.latency.scale < 1000  # type: ignore[attr-defined]
+
+
+def test_a_profile_is_part_of_the_results_identity(results: Path) -> None:
+    words = [f"results={results}", "policy.target=nano-state", "rollout.clock=real", "rollout.latency=profile"]
+    chosen = compose("rollout", [*words, "rollout.profile=there"], RolloutSettings)
+    found = []
+    for seconds in (0.005, 0.006):
+        profile_file(results, encode={"rows": [1], "seconds": [seconds]})
+        found.append(policies_of.identity_of(chosen)["profile"])
+    assert found[0] != found[1]
+    assert "profile" not in policies_of.identity_of(dataclasses.replace(chosen, rollout=RolloutSettings().rollout))
+
+
+# --- what is refused: one line, exit code 2
+
+CONSTANT = "rollout.clock=real rollout.latency=constant"
+FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (f"{CONSTANT} rollout.latency_ms=-1", "rollout.latency_ms=-1.0: from 0 to 600000"),
+        (f"{CONSTANT} rollout.latency_ms=nan", "rollout.latency_ms=nan: from 0"),
+        (f"{CONSTANT} rollout.latency_ms=6250", "500 control steps, but an episode of metaworld has 500"),
+        (
+            f"{CONSTANT} rollout.latency_ms=50 rollout.delay_compensation=chunk",
+            "all 4 control steps of a chunk are stale",
+        ),
+        (f"{CONSTANT} rollout.latency_ms=13 rollout.delay_compensation=chunk chunk=2", "all 2 control steps"),
+        (f"{CONSTANT} rollout.delay_compensation=kalmann", "did you mean kalman"),
+        ("rollout.clock=reel", "did you mean real"),
+        ("rollout.clock=real rollout.latency=profile", "name a document of 'kerv bench"),
+        (FROM_PROFILE.replace("there", "nowhere"), "rollout.profile=nowhere: no such document"),
+        (f"{FROM_PROFILE} method=spec_vla", "has no phase 'draft', which this method needs"),
+        (f"{CONSTANT} rollout.latency_ms=20 policy=expert rollout.delay_compensation=chunk", "all 1 control steps"),
+        (f"{FROM_PROFILE} policy=expert", "it has no forwards"),
+        ("rollout.clock=real rollout.ar_ms=20 policy=expert", "it has no forwards"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(results: Path, words: str, message: str) -> None:
+    profile_file(results, draft={"rows": [], "seconds": []})
+    target = [] if "expert" in words else ["policy.target=nano-state"]
+    done = CliRunner().invoke(app, ["rollout", f"task={TASK}", f"results={results}", *target, *words.split()])
+    assert done.exit_code == 2, done.output
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("phases", "message"),
+    [
+        ({"encode": {"rows": [1], "seconds": [-0.1]}}, "impossible times of the phase 'encode'"),
+        ({"verify": {"rows": [1], "seconds": [float("nan")]}}, "impossible times of the phase 'verify'"),
+        ({"verify": {"rows": [2, 1], "seconds": [1, 1]}}, "impossible times of the phase 'verify'"),
+        ({"prefill": {"rows": [1, 2], "seconds": [1]}}, "has no phase 'prefill'"),
+        ({"prefill": {"rows": [1], "seconds": ["x"]}}, "impossible times of the phase 'prefill'"),
+        ({"prefill": 3}, "holds no latency profile"),
+    ],
+)
+def test_an_impossible_profile_is_refused(results: Path, phases: dict[str, Any], message: str) -> None:
+    profile_file(results, **phases)
+    words = [f"task={TASK}", f"results={results}", "policy.target=nano-state", *FROM_PROFILE.split()]
+    done = CliRunner().invoke(app, ["rollout", *words])
+    assert done.exit_code == 2, done.output
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_settings_without_effect_are_named(policies: Path) -> None:
+    from kerv_cli.effects import without_effect
+
+    def idle(*words: str) -> list[str]:
+        return list(without_effect(compose("rollout", words, RolloutSettings), words))
+
+    assert idle("rollout.ar_ms=20") == ["rollout.ar_ms=20"]
+    assert idle("rollout.clock=real", "rollout.latency_ms=20", "rollout.ar_ms=20") == ["rollout.latency_ms=20"]
+    assert idle("rollout.clock=real", "rollout.latency=constant", "rollout.ar_ms=20") == ["rollout.ar_ms=20"]
+
+
+def test_a_waiting_episode_has_no_delay_in_its_sums() -> None:
+    row = episode_row(still_episode("reach-v3", 1, True, [AR]), Circumstances())
+    assert [row[f"{name}_steps"] for name in ("delay", "carried", "held", "dropped")] == [0, 0, 0, 0]
+    assert (row["delay_decodes"], row["delay_seconds"]) == (0, 0.0)
