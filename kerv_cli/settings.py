@@ -509,7 +509,7 @@ class CalibrateRiskSettings(TaskSettings):
     epsilon: float = number(0.15, above=0, most=0.99)  # of the table that is printed
     delta: float = number(0.1, above=0, most=0.5)
     features: bool = False  # keep the pooled prompts, for `kerv train score`
-    world: WorldSettings = field(default_factory=WorldSettings)
+    world: RolloutWorldSettings = field(default_factory=RolloutWorldSettings)
 
     def check_together(self, prefix: str) -> None:
         """Raises UsageError without a source or a score."""

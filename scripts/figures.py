@@ -108,6 +108,9 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "retrieved": ("retrieved", lambda row: _number(row, "retrieval_share", ".0f", 100, " %")),
     "deviation": ("deviation", lambda row: _number(row, "deviation", ".4f")),
     # of an agreement table
+    "risk": ("realised risk", lambda row: _interval(row, "realised_risk", ".2f") if row.get("realised_risk") else ""),
+    "alarms": ("episodes with an alarm", lambda row: _number(row, "alarm_rate", ".0f", 100, " %")),
+    "to-alarm": ("audits to it", lambda row: _number(row, "audits_to_alarm", ".1f")),
     "again": ("again", _again),
     "ratio": ("difference, %", lambda row: f"{100 * (float(row['ratio']) - 1):+.1f}"),
     "overlap": ("intervals overlap", lambda row: {"True": "yes", "False": "no"}[row["overlap"]]),

@@ -21,6 +21,8 @@ from kerv_cli.decoding.risk_file import RiskManifest, RiskRecording, save_risk
 from kerv_cli.decoding.scores import Draft, Score
 from kerv_cli.decoding.verify_skip import Skip
 from kerv_cli.environments import resolve_tasks, spec_of
+from kerv_cli.environments.stress import build as build_stress
+from kerv_cli.environments.stress import check as check_stress
 from kerv_cli.errors import UsageError
 from kerv_cli.parts import part_of
 from kerv_cli.places import artifact
@@ -100,6 +102,7 @@ class RiskRun:
         self.tasks = resolve_tasks(settings.task)
         self.seeds = range(settings.seed, settings.seed + settings.episodes)
         spec_of(self.tasks[0]).seeds.check(self.seeds, "selection", f"seed={settings.seed}")
+        check_stress(settings.world.stress, spec_of(self.tasks[0]))
         for name in settings.sources:
             if not find("proposer", name, "source").traits.get("chains"):
                 raise UsageError(f"sources: '{name}' does not draft whole chunks from the prompt")
@@ -128,10 +131,11 @@ class RiskRun:
     def record(self, progress: Progress) -> None:
         """Runs the episodes, task by task."""
         done, total = 0, len(self.tasks) * len(self.seeds)
+        stress = build_stress(self.settings.world.stress)
         for task in self.tasks:
             decoder, recorder = self._decoder(task)
             for seed in self.seeds:
-                run_episode(open_world(task, self.settings.world), decoder, seed)
+                run_episode(open_world(task, self.settings.world, stress), decoder, seed)
                 progress(done := done + 1, total)
             self.rows += recorder.rows
             self.features += recorder.features
