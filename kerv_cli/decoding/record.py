@@ -16,9 +16,10 @@ PARALLEL = "parallel"
 """Mode of a round, and of its decode, in which the target decoded all tokens at once."""
 
 TRUSTED, GATE, AUDIT, OPENING, ALARM = "trusted", "gate", "audit", "opening", "alarm"
-NO_DRAFT, STREAK = "no draft", "streak"
+DOUBT, NO_DRAFT, STREAK = "doubt", "no draft", "streak"
 """Reasons of `Trust`: executed unverified; verified because the score is too low, at random, at an episode's start,
-after an alarm, because nothing was drafted, or because the verifications before do not allow more."""
+after an alarm, after a draft that was far off, because nothing was drafted, or because the verifications before do not
+allow more."""
 
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
@@ -65,8 +66,13 @@ class Trust:
 
     @property
     def audited(self) -> bool:
-        """Whether the gate trusted the draft and it was verified all the same: a sample of the risk."""
+        """Whether the gate trusted the draft and it was verified all the same."""
         return self.loss is not None and self.score >= self.level
+
+    @property
+    def sampled(self) -> bool:
+        """Whether it was verified at random: an unbiased sample of the risk of what is executed unverified."""
+        return self.loss is not None and self.reason == AUDIT
 
 
 @dataclass(frozen=True)

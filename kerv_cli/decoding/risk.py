@@ -10,7 +10,7 @@ import numpy as np
 from kerv_cli.decoding.audit import Audit
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks
 from kerv_cli.decoding.loss import chunk_loss, executed_loss, judged_tokens
-from kerv_cli.decoding.record import ALARM, AUDIT, GATE, NO_DRAFT, OPENING, TRUSTED, Trust
+from kerv_cli.decoding.record import ALARM, AUDIT, DOUBT, GATE, NO_DRAFT, OPENING, TRUSTED, Trust
 from kerv_cli.decoding.scores import Draft, Score
 from kerv_cli.decoding.verify_skip import Skip
 from kerv_cli.parts import RiskSkipSettings
@@ -66,7 +66,9 @@ class RiskSkip(Skip):
             return GATE
         if self.decodes < self.settings.opening:
             return OPENING
-        return AUDIT if drawn or self.suspicious else TRUSTED
+        if self.suspicious:
+            return DOUBT
+        return AUDIT if drawn else TRUSTED
 
     def verified(self, chunk: Chunk) -> None:
         """As `Skip.verified`: the loss, where the first verification judged this very draft."""

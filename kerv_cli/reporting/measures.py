@@ -150,7 +150,7 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
         "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
         "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
         **_latencies(episodes["decode_seconds"]),
-        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].sum() else math.nan,
+        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].any() else math.nan,
         "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
     }
     values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}

@@ -40,10 +40,10 @@ EPISODE_SCHEMA = pa.schema(
         ("unverified_tokens", pa.int64()),  # executed without a target token on their accepted path
         ("executed_tokens", pa.int64()),  # numbers handed over for execution: steps times DoFs
         ("retrieval_decodes", pa.int64()),
-        ("audits", pa.int64()),  # decodes that a gate trusted and that were verified all the same
+        ("audits", pa.int64()),  # drafts that a gate trusted and that were verified at random
         ("audit_loss", pa.float64()),  # their summed loss
         ("alarmed", pa.int64()),  # 1 where an alarm was raised
-        ("alarm_audits", pa.int64()),  # audits up to the first alarm, its own included
+        ("alarm_audits", pa.int64()),  # verified drafts that it trusted up to the first alarm
         ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
         ("deviation_count", pa.int64()),
         ("delay_decodes", pa.int64()),  # decodes during which the world went on
@@ -163,10 +163,11 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
 
 def _audit(decodes: Sequence[DecodeRecord]) -> dict[str, Any]:
     """Columns of an episode's audits."""
-    audits = [(d.trust.loss or 0.0, d.trust.alarm) for d in decodes if d.trust is not None and d.trust.audited]
-    first = next((count for count, (_, alarm) in enumerate(audits, 1) if alarm), 0)
-    losses = sum(loss for loss, _ in audits)
-    return {"audits": len(audits), "audit_loss": losses, "alarmed": int(first > 0), "alarm_audits": first}
+    gates = [d.trust for d in decodes if d.trust is not None]
+    sampled = [trust.loss or 0.0 for trust in gates if trust.sampled]
+    alarms = [trust.alarm for trust in gates if trust.audited]
+    first = next((count for count, alarm in enumerate(alarms, 1) if alarm), 0)
+    return {"audits": len(sampled), "audit_loss": sum(sampled), "alarmed": int(first > 0), "alarm_audits": first}
 
 
 def _delay_sums(record: EpisodeRecord) -> dict[str, float]:
