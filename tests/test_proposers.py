@@ -26,6 +26,7 @@ from kerv_cli.decoding.proposers import (
 from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
 from kerv_cli.drafting.datastore import Datastore, Manifest, prompt_key
 from kerv_cli.drafting.eagle import Drafter
+from kerv_cli.drafting.early import EarlyDraft
 from kerv_cli.drafting.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
 from kerv_cli.drafting.tree import TokenTree
 from kerv_cli.environments.metaworld.spec import SPEC
@@ -47,8 +48,8 @@ class KnownDraft:
         self.odds = random.random()
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def drafted(self, features: torch.Tensor, history: np.ndarray, radius: int) -> tuple[list[int], float]:
-        return self.tokens, self.odds
+    def drafted(self, features: torch.Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
+        return EarlyDraft(self.tokens, self.odds, torch.zeros(len(self.tokens), 255))
 
 
 def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:

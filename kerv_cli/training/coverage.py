@@ -21,10 +21,12 @@ def covered(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> De
     Raises:
         UnknownName: no such task. CheckpointError: the dataset has none of a task.
     """
+    if not tasks and starts == ALL:
+        return dataset
     wanted = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
     missing = [task for task in wanted if task not in dataset.manifest.tasks]
     if missing:
-        raise CheckpointError(f"{dataset.path} has no demonstrations of {missing[0]}")
+        raise CheckpointError(f"the demonstrations in {dataset.path} hold no episode of {missing[0]}")
     chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in wanted]
     if starts == HALF:
         chosen = _one_side(dataset, chosen)

@@ -108,7 +108,7 @@ class DatastoreBuild:
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         self.settings = settings
         dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
-        self.dataset = covered(dataset, settings.task, settings.starts)
+        self.dataset = covered(dataset, (), settings.starts)
         tasks = sorted(resolve_tasks(settings.task))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
