@@ -13,7 +13,7 @@ from scipy.stats import rankdata
 from kerv_cli.decoding.certification import certify, episode_means
 from kerv_cli.decoding.risk_file import Losses, RiskRecording
 from kerv_cli.files import atomic_path
-from kerv_cli.reporting.drawing import MUTED, STYLE, colour, entitle, figure_bytes, new_figure
+from kerv_cli.reporting.drawing import COLOURS, DASHES, MUTED, STYLE, colour, entitle, figure_bytes, new_figure
 
 REPEATS = 200
 BAD = 0.5  # a draft with a larger loss is one that should have been verified
@@ -76,12 +76,14 @@ def plot_coverage(recording: RiskRecording, path: Path) -> Path:
     """
     sources = list(recording.manifest.sources)
     with mpl.rc_context(STYLE):
-        figure = new_figure(5.6 * len(sources) + 1.0, 4.6)
+        figure = new_figure(5.6 * len(sources) + 2.4, 4.6)
         for panel, source in zip(figure.subplots(1, len(sources), squeeze=False).ravel(), sources, strict=True):
             found = recording.losses(source)
             for place, (name, scores) in enumerate(found.scores.items()):
                 share, risk = coverage(scores, found.losses)
-                panel.plot(100 * share, risk, color=colour(place), linewidth=1.8, label=name)
+                panel.plot(
+                    100 * share, risk, color=colour(place), linestyle=DASHES[place // 7], linewidth=1.8, label=name
+                )
             best = coverage(-found.losses, found.losses)
             panel.plot(100 * best[0], best[1], color=MUTED, linewidth=1.0, linestyle=":", label="by the loss itself")
             panel.set(
@@ -90,7 +92,7 @@ def plot_coverage(recording: RiskRecording, path: Path) -> Path:
                 ylabel="mean loss of the trusted",
                 ylim=(0, None),
             )
-            panel.legend(frameon=False)
+        figure.axes[-1].legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         episodes = sum(len(seeds) for seeds in recording.manifest.tasks.values())
         entitle(figure, "Risk over coverage", f"{episodes} episodes on selection seeds; lower is better")
         content = figure_bytes(figure, "png")
