@@ -82,7 +82,12 @@ def plot_coverage(recording: RiskRecording, path: Path) -> Path:
             for place, (name, scores) in enumerate(found.scores.items()):
                 share, risk = coverage(scores, found.losses)
                 panel.plot(
-                    100 * share, risk, color=colour(place), linestyle=DASHES[place // 7], linewidth=1.8, label=name
+                    100 * share,
+                    risk,
+                    color=colour(place),
+                    linestyle="-" if place < len(COLOURS) else DASHES[0],
+                    linewidth=1.8,
+                    label=name,
                 )
             best = coverage(-found.losses, found.losses)
             panel.plot(100 * best[0], best[1], color=MUTED, linewidth=1.0, linestyle=":", label="by the loss itself")
