@@ -54,6 +54,8 @@ def check_settings(settings: Any, what: str = "") -> None:
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]
         name, value = f"{prefix}{at.name}", getattr(settings, at.name)
+        if element is not None and not isinstance(value, list | dict):
+            raise UsageError(f"{name}={value}: a list or a mapping is wanted")
         if element is not None and not all(isinstance(x, element) for x in _elements(value)):
             raise UsageError(f"{name}={value}: every element must be of type {element.__name__}")
         for x in value if isinstance(value, list) else [value]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 from collections import Counter
@@ -18,7 +19,7 @@ from kerv_cli.drafting.datastore import Datastore
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.errors import CheckpointError, UnknownName
 from kerv_cli.parts import QdrantSearchSettings
-from kerv_cli.rollouts.policy import check, decoder_for, identity_of
+from kerv_cli.rollouts.policy import check, decoder_for, identity_of, unseen_tasks
 from kerv_cli.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings, RolloutSettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
@@ -160,3 +161,13 @@ def test_an_artifact_can_be_named(results: Path) -> None:
     assert Artifacts(str(results), by_path).check(["drafter"]) == files.check(["drafter"])
     with pytest.raises(UnknownName, match="did you mean drafter"):
         files.check(["draftr"])
+
+
+@pytest.mark.parametrize("settings", [[], [[]], {"task": 3}, {"task": [1]}, None])
+def test_a_provenance_that_says_nothing_of_tasks_is_no_warning(results: Path, settings: object) -> None:
+    path = results / "artifacts/target/nano-state/target.json"
+    described = json.loads(path.read_text())
+    described["provenance"]["settings"] = settings
+    path.write_text(json.dumps(described))
+    asked = RolloutSettings(results=str(results), policy=PolicySettings(target="nano-state"))
+    assert unseen_tasks(asked, ["reach-v3"]) == []

@@ -84,6 +84,7 @@ WRONG = [
     ("train_target", "target.width=33", "target.width=33 must be a multiple of 2 x target.heads=6"),
     ("train_target", "target.image_size=90", "target.image_size=90 must be a multiple of 8 x target.grid=4"),
     ("sweep", "study.block=0", "study.block=0"),
+    ("sweep", "study.settings=${oc.env:HOME}", ": a list or a mapping is wanted"),
     ("calibrate", "boundary_windows=[5,2]", "boundary_windows=2: from 3 to"),
 ]
 

@@ -149,8 +149,9 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
     for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
         try:
             described = read_target(find_target(settings.results, name))
-            parameters = described.provenance["parameters"] / 1e6
-            findings.append(Finding(f"policy {name}", True, f"{parameters:.1f} M parameters, {described.sha256[:12]}"))
+            found = described.provenance.get("parameters")
+            size = f"{found / 1e6:.1f} M parameters, " if isinstance(found, int | float) else ""
+            findings.append(Finding(f"policy {name}", True, f"{size}{described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
     return findings or [

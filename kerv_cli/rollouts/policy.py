@@ -68,11 +68,11 @@ def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
     """Those of the tasks that the policy's target was not trained on; none where it does not say what it was."""
     if is_expert(settings):
         return []
-    made = artifacts_of(settings).description.provenance
-    trained = made.get("settings", {}).get("task")
-    if not trained:
+    made = artifacts_of(settings).description.provenance.get("settings")
+    trained = made.get("task") if isinstance(made, Mapping) else None
+    if not trained or not isinstance(trained, list) or not all(isinstance(name, str) for name in trained):
         return []
-    known = set(resolve_tasks(list(trained)))
+    known = set(resolve_tasks(trained))
     return [task for task in tasks if task not in known]
 
 

@@ -260,7 +260,8 @@ class CalibrationRun:
             if earlier and kept:
                 sections[name] = kept
                 made = {key: value for key, value in earlier.provenance.items() if key != "kept"}
-                origins[name] = earlier.provenance.get("kept", {}).get(name, made)
+                before = earlier.provenance.get("kept")
+                origins[name] = before.get(name, made) if isinstance(before, dict) else made
             self.notes.append(f"{reasons.get(name, name)}; {'kept from the earlier run' if kept else 'left empty'}")
         return sections, origins
 
