@@ -42,7 +42,11 @@ format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
 
-.PHONY: help setup test demo lint format pages lock clean
+pages: setup ## fill the figures of README.md and results/README.md from results/tables
+	@$(BIN)/python scripts/figures.py README.md results/README.md
+
+lock: setup ## write requirements/*.txt from what is installed
+	@scripts/lock.sh $(BIN)/python
 
 clean: ## remove caches and built packages; keeps .venv and results
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis MUJOCO_LOG.TXT

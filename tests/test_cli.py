@@ -95,12 +95,14 @@ def test_an_empty_results_folder_says_what_to_run(tmp_path: Path) -> None:
     assert "kerv rollout" in one_line(kerv("view", f"results={tmp_path}"), 2)
 
 
-def test_no_graphics_gets_the_command_that_brings_them(policies: Path) -> None:
+def test_no_graphics_gets_the_command_that_brings_them(policies: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    shutil.copytree(policies, results)
     run = kerv(
         "rollout",
         "task=reach-v3",
         *FAST,
-        f"results={policies}",
+        f"results={results}",
         "policy.target=nano-vision",
         MUJOCO_GL="glfw",
         DISPLAY="",
