@@ -41,7 +41,7 @@ def works(*arguments: str) -> str:
 def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Read only: a rollout of two settings, one of a single one, and a training."""
     folder = tmp_path_factory.mktemp("runs") / "results"
-    shutil.copytree(policies, folder)
+    shutil.copytree(policies / "artifacts", folder / "artifacts")
     works("rollout", "-m", "method=spec_vla", "threshold.r=5,9", "episodes=2", *FAST, f"results={folder}")
     works("rollout", "method=ar", "episodes=2", *FAST, f"results={folder}")
     trained = folder / "artifacts/target/nano-state"
@@ -56,7 +56,7 @@ def listed(results: Path, *words: str) -> list[dict[str, Any]]:
 
 
 def test_a_grid_keeps_every_episode_and_prints_one_table(policies: Path, tmp_path: Path) -> None:
-    shutil.copytree(policies, tmp_path / "results")
+    shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
     told = works("rollout", "-m", "method=ar,spec_vla", "episodes=2", *FAST, f"results={tmp_path}/results")
     assert told.count("success %") == 1
     assert re.search(r"^ar +", told, re.MULTILINE)
@@ -65,7 +65,7 @@ def test_a_grid_keeps_every_episode_and_prints_one_table(policies: Path, tmp_pat
 
 
 def test_recordings_of_a_grid_have_names_of_their_own(policies: Path, tmp_path: Path) -> None:
-    shutil.copytree(policies, tmp_path / "results")
+    shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
     words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
     works("rollout", "-m", "method=spec_vla", "threshold.r=5,9", "episodes=1", *words, f"results={tmp_path}/results")
     (folder,) = (tmp_path / "results/rollouts").iterdir()
@@ -130,7 +130,7 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_pa
 def test_an_interrupted_rollout_goes_on_where_it_was(
     policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shutil.copytree(policies, tmp_path / "results")
+    shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
     command = ["rollout", "method=ar", "episodes=3", *FAST, f"results={tmp_path}/results"]
     original = CellRunner.__call__
 
@@ -193,7 +193,7 @@ def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture
 )
 def test_a_printed_command_runs_as_it_stands(arguments: tuple[str, ...], policies: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
-    shutil.copytree(policies, results)
+    shutil.copytree(policies / "artifacts", results / "artifacts")
     refused = kerv(*arguments, f"results={results}")
     assert refused.exit_code in (1, 2), refused.output
     printed = re.findall(r"['`](kerv [^'`]+)['`]", refused.stderr)
