@@ -8,22 +8,23 @@ from pathlib import Path
 
 import pytest
 
+from kerv_cli import registry
+
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+ENVIRONMENTS = dict(registry.parts("environment"))
+"""kerv's own, taken before test modules are imported."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def registered_environments() -> Iterator[None]:
-    """Environments that a module's recordings register are gone when the module ends.
+    """A module begins with kerv's own environments, and what it registers is gone when it ends.
 
-    Opening a dataset of a recording registers its environment for the process, and which modules share
-    a process is decided anew in every parallel run.
+    Opening a dataset of a recording, or importing an example, registers an environment for the process, and which
+    modules share a process is decided anew in every parallel run.
     """
-    from kerv_cli import registry
-
-    registry.load_plugins()
-    known = dict(registry.parts("environment"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._PARTS, "environment", known)
+        patch.setitem(registry._PARTS, "environment", dict(ENVIRONMENTS))
         yield
 
 
