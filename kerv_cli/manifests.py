@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from kerv_cli.errors import CheckpointError, KervError
-from kerv_cli.files import read_json
+from kerv_cli.files import read_json, sha256_of
 from kerv_cli.limits import check_settings
 
 T = TypeVar("T")
@@ -60,3 +60,14 @@ def read_file(kind: type[T], path: Path, what: str) -> T:
     if not isinstance(value, Mapping):
         raise CheckpointError(f"{path} is not {what}")
     return read(kind, value, str(path))
+
+
+def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
+    """Checks that the files in `folder` are those that its manifest names. files: name -> SHA-256; again: the remedy.
+
+    Raises:
+        CheckpointError: one is missing or changed.
+    """
+    for name, digest in files.items():
+        if sha256_of(folder / name) != digest:
+            raise CheckpointError(f"{folder / name} does not match its manifest: {again}")

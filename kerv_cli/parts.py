@@ -22,6 +22,7 @@ PART_GROUPS = (*METHOD_KINDS, "datastore")
 """Settings of a rollout whose choices are parts; YAML files in conf/<group>/ are further choices."""
 
 MOST_TOKENS = 65_536  # of a draft or its tree
+LOSS_SCALE = 0.1  # ε_a: mean abs difference of two chunks that counts as a whole loss, normalised action units
 MOST_BINS = 65_536
 MOST_DECODES = 1_000_000  # of an episode, in which a setting may count
 

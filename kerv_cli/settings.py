@@ -505,7 +505,7 @@ class CalibrateRiskSettings(TaskSettings):
     sources: list[str] = field(default_factory=lambda: ["early"])  # what drafts; the first one's drafts are executed
     scores: list[str] = field(default_factory=lambda: ["odds", "entropy", "familiarity", "steadiness"])
     unverified: float = number(0.8, 0, 1)  # share of the decodes in which the draft is executed, else verified first
-    scale: float = number(0.1, above=0, most=1e6)  # ε_a: mean abs difference that counts as a whole loss, normalised
+    scale: float = number(parts.LOSS_SCALE, above=0, most=1e6)  # ε_a, normalised action units
     epsilon: float = number(0.15, above=0, most=0.99)  # of the table that is printed
     delta: float = number(0.1, above=0, most=0.5)
     features: bool = False  # keep the pooled prompts, for `kerv train score`

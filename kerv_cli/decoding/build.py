@@ -30,11 +30,10 @@ from kerv_cli.decoding.risk_file import RiskRecording
 from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass, SkipLevels, StreakSkip, VerifySkip
 from kerv_cli.drafting.kinematics import MINIMUM, Predictor, build_predictor
 from kerv_cli.errors import UsageError
-from kerv_cli.parts import METHOD_KINDS, PREFILL, RetrievalProposerSettings, part_of
+from kerv_cli.parts import LOSS_SCALE, METHOD_KINDS, PREFILL, RetrievalProposerSettings, part_of
 from kerv_cli.registry import NoSettings, Part, find
 from kerv_cli.targets.protocol import Target
 
-SCALE = 0.1  # ε_a of `skip=risk` with a level of its own, normalised action units
 LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: kinematics.MINIMUM
 
 
@@ -270,7 +269,7 @@ def risk_skip(settings: Any, context: Context) -> RiskSkip:
     source = _drafts_chunks(context)
     score = find("score", settings.score).built(NoSettings(settings.score), context)
     if settings.level is not None:
-        return RiskSkip(settings, source, score, settings.level, SCALE)
+        return RiskSkip(settings, source, score, settings.level, LOSS_SCALE)
     recording: RiskRecording = context.artifact("risk")
     recording.check_size(source.name, settings.epsilon, settings.delta)
     level = recording.certified(source.name, settings.score, settings.epsilon, settings.delta).level

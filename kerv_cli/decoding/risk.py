@@ -16,6 +16,12 @@ from kerv_cli.decoding.verify_skip import Skip
 from kerv_cli.parts import RiskSkipSettings
 
 
+def episode_numbers(purpose: str, task: str, seed: int) -> np.random.Generator:
+    """Generator of an episode for one purpose; depends on purpose, task and seed alone."""
+    digest = hashlib.sha256(f"{purpose} {task} {seed}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8]))
+
+
 class RiskSkip(Skip):
     """Executes drafts unverified where their score reaches the certified level, and audits a random share of them.
 
@@ -37,8 +43,7 @@ class RiskSkip(Skip):
 
     def begin(self, task: str, seed: int) -> None:
         """As `Skip.begin`: which decodes are audited depends on task and seed alone."""
-        digest = hashlib.sha256(f"audit {task} {seed}".encode()).digest()
-        self.random = np.random.default_rng(int.from_bytes(digest[:8]))
+        self.random = episode_numbers("audit", task, seed)
         self.audit.reset()
         self.decodes, self.suspicious = 0, False
 

@@ -21,7 +21,7 @@ from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.decoding.certification import Certified, certify, episodes_needed
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import sha256_of, write_folder, write_json
-from kerv_cli.manifests import read_file
+from kerv_cli.manifests import check_files, read_file
 
 FORMAT = 1
 DECODES, FEATURES = "decodes.parquet", "features.npy"
@@ -57,7 +57,6 @@ class Losses:
     scores: dict[str, np.ndarray]
     losses: np.ndarray
     episodes: np.ndarray
-    tasks: np.ndarray
 
 
 class RiskRecording:
@@ -81,7 +80,7 @@ class RiskRecording:
         _, numbers = np.unique(tasks, return_inverse=True)
         _, episodes = np.unique(np.stack([numbers, seeds]), axis=1, return_inverse=True)
         scores = {name: columns[f"score.{name}"].to_numpy() for name in self.manifest.scores}
-        return Losses(scores, columns["loss"].to_numpy(), episodes.reshape(-1), tasks)
+        return Losses(scores, columns["loss"].to_numpy(), episodes.reshape(-1))
 
     def certified(self, source: str, score: str, epsilon: float, delta: float) -> Certified:
         """The lowest level of `score` from which on drafts of `source` may be executed unverified.
@@ -156,9 +155,7 @@ def read_risk(folder: Path, request: Request) -> RiskManifest:
     if not path.is_file():
         raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
     manifest = read_file(RiskManifest, path, f"a recording of format {FORMAT}: {AGAIN}")
-    for name, digest in manifest.files.items():
-        if sha256_of(folder / name) != digest:
-            raise CheckpointError(f"{folder / name} does not match its manifest: {AGAIN}")
+    check_files(folder, manifest.files, AGAIN)
     own = request.description
     manifest.target.check_same(MadeFor(own.sha256, own.actions, own.chunk), f"the risk in {folder}", "recorded", AGAIN)
     return manifest

@@ -33,8 +33,7 @@ from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.environments import spec_of
 from kerv_cli.errors import CheckpointError, UnknownName
-from kerv_cli.files import sha256_of
-from kerv_cli.manifests import read_file
+from kerv_cli.manifests import check_files, read_file
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.protocol import ReadableTarget
@@ -237,9 +236,7 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         raise CheckpointError(f"no datastore in {folder}: {AGAIN}")
     manifest = read_file(Manifest, path, f"a datastore's manifest of format {FORMAT}: {AGAIN}")
-    for name, digest in manifest.files.items():
-        if sha256_of(folder / name) != digest:
-            raise CheckpointError(f"{folder / name} does not match its manifest: {AGAIN}")
+    check_files(folder, manifest.files, AGAIN)
     check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, folder)
     return manifest
 

@@ -5,7 +5,6 @@ Training observations would flatter a draft: a drafter or a datastore is at home
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +16,7 @@ from kerv_cli.decoding.build import Context, compose
 from kerv_cli.decoding.chunk import Chunk, DraftsChunks
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.loss import chunk_loss, target_tokens
+from kerv_cli.decoding.risk import episode_numbers
 from kerv_cli.decoding.risk_file import RiskManifest, RiskRecording, save_risk
 from kerv_cli.decoding.scores import Draft, Score
 from kerv_cli.decoding.verify_skip import Skip
@@ -61,8 +61,7 @@ class Recorder(Skip):
 
     def begin(self, task: str, seed: int) -> None:
         """As `Skip.begin`."""
-        digest = hashlib.sha256(f"risk {task} {seed}".encode()).digest()
-        self.random = np.random.default_rng(int.from_bytes(digest[:8]))
+        self.random = episode_numbers("risk", task, seed)
         self.episode, self.decodes = {"task": task, "seed": seed}, 0
 
     def take(self, chunk: Chunk) -> bool:
