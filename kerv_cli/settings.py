@@ -273,6 +273,7 @@ class TrainSettings:
     init: str | None = None  # target that gives the initial weights; its chunk may be shorter or longer
     freeze: list[str] = field(default_factory=list)  # modules of the target that keep the weights of `init`
     label_sigma: float = number(1.0, 0, 1000)  # bins; neighbouring bins share probability (Gaussian); 0: one-hot
+    balance: float = number(0.0, 0, 1)  # 0: every sample is drawn as often as any other; 1: every task
     scene_weight: float = number(1.0, 0, 1e6)  # weight of the position loss (vision only)
     scene_steps: int = number(0, 0, 10**9)  # first steps that train only the vision encoder, on positions
     held_out: float = number(0.1, above=0, most=0.5)  # share of episodes kept for validation
@@ -302,6 +303,8 @@ class DemosSettings(TaskSettings):
     episodes: int = number(100, 1, 100_000)  # per task
     seed: int = number(0, 0, 2**31 - 1)
     perturbed: float = number(0.5, 0, 1)
+    policy: PolicySettings = field(default_factory=PolicySettings)  # what acts; the expert labels (DAgger)
+    expert_share: float = number(0.3, 0, 1)  # of a target's chunks: those that the expert executes
     frame_stride: int = number(2, 1, 10_000)
     world: WorldSettings = field(default_factory=WorldSettings)
 

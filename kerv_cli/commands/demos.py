@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from kerv_cli.commands.common import (
     Overrides,
     ShowConfig,
@@ -14,11 +16,15 @@ from kerv_cli.commands.common import (
     progress_bar,
 )
 
+if TYPE_CHECKING:
+    from kerv_cli.settings import DemosSettings
+    from kerv_cli.training.dagger import TargetActs
+
 
 @edge
 def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
-    """Record successful expert episodes, plain and perturbed, as a dataset. `kerv demos export …` writes one as a
-    LeRobot dataset, `kerv demos import …` reads one."""
+    """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a target
+    visits, labelled by the expert. `kerv demos export …` writes a LeRobot dataset, `kerv demos import …` reads one."""
     if overrides and overrides[0] in OTHERS:
         OTHERS[overrides[0]](overrides[1:], cfg)
         return
@@ -38,6 +44,7 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
     from kerv_cli.environments.camera import CameraConfig
     from kerv_cli.environments.demos.recording import DemoConfig, record
 
+    actor = _actor(settings)
     config = DemoConfig(
         tasks=tasks,
         episodes=settings.episodes,
@@ -47,16 +54,34 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         frame_stride=settings.frame_stride,
         workers=settings.runtime.workers,
         horizon=settings.world.horizon,
+        policy=actor.sha256 if actor else "",
+        expert_share=settings.expert_share if actor else 0.0,
     )
     try:
         with progress_bar("demonstrations") as advance:
-            manifest = record(config, folder, advance)
+            manifest = record(config, folder, advance, actor)
     except KeyboardInterrupt:
         raise Interrupted(
             f"interrupted: finished episodes are kept in {folder}, the same command goes on there"
         ) from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
+
+
+def _actor(settings: DemosSettings) -> TargetActs | None:
+    """What moves the robot in the expert's place; None: the expert itself."""
+    from kerv_cli.settings import EXPERT, PolicySettings
+
+    target = settings.policy.target
+    if settings.policy.kind != EXPERT:
+        from kerv_cli.training.dagger import TargetActs
+
+        return TargetActs.of(settings.results, target, settings.world)
+    if target != PolicySettings().target:
+        from kerv_cli.errors import UsageError
+
+        raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
+    return None
 
 
 def _export(words: list[str], cfg: bool) -> None:

@@ -71,13 +71,15 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
 
     def on_step(step: int, now: dict[str, float]) -> None:
         nonlocal begun
-        if not begun and step > 1:
+        if not begun and step > 1 and run.ranks.first:
             typer.echo(f"resuming at step {step - 1}", err=True)
         begun = True
         advance(step, run.settings.train.steps, _line(now))
 
     with progress_bar(training) as advance:
         metrics = run.train(on_step)
+    if not run.ranks.first:
+        return
     from kerv_cli.reporting.curves import save_curves
 
     plot = save_curves(run.folder)

@@ -30,6 +30,7 @@ from kerv_cli.places import artifact
 from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.spaces import Observation, ObservationSpace
+from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.observations import check_frames, check_spaces, instruction_of
 from kerv_cli.training.predictor_fit import (
     Windows,
@@ -105,7 +106,7 @@ class CalibrationRun:
 
     def __init__(self, settings: CalibrateSettings) -> None:
         self.settings = settings
-        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.dataset = open_demos(settings.results, settings.demos)
         self.tasks = resolve_tasks(settings.task)
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.described = self.artifacts.description

@@ -25,7 +25,6 @@ from kerv_cli.drafting.datastore import (
     prompt_key,
 )
 from kerv_cli.environments import resolve_tasks
-from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.files import read_json, sha256_of, write_folder, write_json
@@ -36,6 +35,7 @@ from kerv_cli.settings import BuildDatastoreSettings
 from kerv_cli.spaces import ObservationSpace
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import covered
+from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_spaces, read_chunks, read_observations
 from kerv_cli.training.recorded import prompts_of, steps_of
@@ -107,7 +107,7 @@ class DatastoreBuild:
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         self.settings = settings
-        dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        dataset = open_demos(settings.results, settings.demos)
         self.dataset = covered(dataset, (), settings.starts)
         tasks = sorted(resolve_tasks(settings.task))
         self.device, _ = set_up(settings.runtime)

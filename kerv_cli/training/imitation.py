@@ -39,6 +39,7 @@ class Samples(Observations):
 
     chunks: Tensor  # (n, H, D) float32, the expert's clean actions, environment units
     episodes: Tensor  # (n,) int64, index of the sample's episode
+    tasks: Tensor  # (n,) int64, index of the sample's task
 
 
 def load_samples(
@@ -62,9 +63,19 @@ def load_samples(
         episode = dataset.load(index)
         seen = read_observations(episode, settings, dataset.manifest.observation, words)
         chunks = torch.from_numpy(read_chunks(episode, seen.steps.numpy(), settings.chunk)).float()
-        parts.append(Samples(**vars(seen), chunks=chunks, episodes=torch.full((len(seen),), number)))
+        of_all = (torch.full((len(seen),), n) for n in (number, task_names.index(episode.task)))
+        parts.append(Samples(**vars(seen), chunks=chunks, **dict(zip(("episodes", "tasks"), of_all, strict=True))))
         on_episode(number + 1, len(chosen))
     return Samples.joined(parts)
+
+
+def balanced(tasks: Tensor, balance: float) -> Tensor | None:
+    """(n,) float64: weight of each sample, by the index of its task (n,). A task of share p among the samples is drawn
+    in proportion to p^(1 − balance); None where that changes nothing."""
+    if balance == 0:
+        return None
+    shares = torch.bincount(tasks).double() / len(tasks)
+    return shares[tasks] ** -balance
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
@@ -214,4 +225,5 @@ def imitation_job(
             metrics["score"] += 10 * metrics["closed_loop_success"]
         return metrics
 
-    return Job(run.target, len(run.training), run.loss, validate, save)
+    weights = balanced(run.training.tasks, run.settings.balance)
+    return Job(run.target, len(run.training), run.loss, validate, save, weights)

@@ -22,7 +22,8 @@ from kerv_cli.files import atomic_path
 from kerv_cli.manifests import read
 from kerv_cli.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
-from kerv_cli.training.interruption import until_interrupted
+from kerv_cli.training.interruption import Stop, until_interrupted
+from kerv_cli.training.ranks import ALONE, Ranks
 
 Metrics = dict[str, float]
 
@@ -31,13 +32,23 @@ Metrics = dict[str, float]
 class Job:
     """A module and its optimisation. samples: number of training samples. loss(batch indices, step) -> scalar loss and
     logged numbers. validate(module) -> metrics of the EMA weights with a `score`, higher is better. save(module,
-    metrics) writes the best one."""
+    metrics) writes the best one. weights (samples,) float64: how often each sample is drawn, relative to the others;
+    None: all alike."""
 
     module: nn.Module
     samples: int
     loss: Callable[[Tensor, int], tuple[Tensor, Metrics]]
     validate: Callable[[nn.Module], Metrics]
     save: Callable[[nn.Module, Metrics], None]
+    weights: Tensor | None = None
+
+    def batch(self, size: int, generator: torch.Generator) -> Tensor:
+        """(size,) int64: samples drawn with replacement."""
+        if self.weights is None:
+            return torch.randint(self.samples, (size,), generator=generator)
+        borders = self.weights.double().cumsum(0)
+        drawn = torch.rand(size, generator=generator, dtype=torch.float64) * borders[-1]
+        return torch.searchsorted(borders, drawn, right=True).clamp_(max=self.samples - 1)
 
 
 @dataclass(frozen=True)
@@ -53,10 +64,10 @@ class Progress:
 
 class Loop:
     """Runs a `Job`. folder: holds `resume.safetensors` and `log.csv`. identity: hash of everything that determines the
-    run; another run is never resumed."""
+    run; another run is never resumed. ranks: this process's place among those that train together."""
 
-    def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str) -> None:
-        self.job, self.settings, self.folder, self.identity = job, settings, folder, identity
+    def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str, ranks: Ranks = ALONE) -> None:
+        self.job, self.settings, self.folder, self.identity, self.ranks = job, settings, folder, identity, ranks
         self.step, self.best = 0, -math.inf
         self.history: list[Metrics] = []
         decay = [p for p in job.module.parameters() if p.dim() >= 2]
@@ -66,7 +77,8 @@ class Loop:
         self.ema = {k: v.detach().clone() for k, v in job.module.state_dict().items()}
 
     def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
-        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint.
+        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint; of no other
+        rank than the first.
 
         Raises:
             CheckpointError: as `restore`. KervError: training diverged. StorageError: writing failed. Interrupted:
@@ -76,19 +88,20 @@ class Loop:
         settings = self.settings
         with until_interrupted() as stop:
             while self.step < settings.steps:
-                metrics = self.update()
+                metrics, stopping = self.update(stop)
                 self.step += 1
                 on_step(self.step, metrics)
-                if self.step % settings.validate_every == 0 or self.step == settings.steps:
+                if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
                     self.check(metrics)
                     on_step(self.step, self.history[-1])
-                if stop.requested and self.step < settings.steps:
-                    self.store()
+                if stopping and self.step < settings.steps:
+                    if self.ranks.first:
+                        self.store()
                     raise Interrupted(f"interrupted: step {self.step} is saved, the same command goes on from there")
-        return max(self.history, key=lambda m: m["score"])
+        return max(self.history, key=lambda m: m["score"]) if self.ranks.first else {}
 
-    def update(self) -> Metrics:
-        """One optimiser step -> loss and logged numbers.
+    def update(self, stop: Stop) -> tuple[Metrics, bool]:
+        """One optimiser step -> loss and logged numbers, and whether any rank was asked to stop.
 
         Raises:
             KervError: the loss is not finite.
@@ -97,19 +110,20 @@ class Loop:
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
-        indices = torch.randint(self.job.samples, (settings.batch,), generator=generator)
+        indices = self.ranks.share(self.job.batch(settings.batch, generator))
         loss, metrics = self.job.loss(indices, self.step)
-        if not math.isfinite(loss.item()):
-            raise KervError(f"training diverged at step {self.step} (loss {loss.item()}): lower train.lr")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        mean, stopping = self.ranks.averaged(self.job.module.parameters(), (loss.item(), float(stop.requested)))
+        if not math.isfinite(mean):
+            raise KervError(f"training diverged at step {self.step} (loss {mean}): lower train.lr")
         nn.utils.clip_grad_norm_(self.job.module.parameters(), settings.clip)
         self.optimiser.step()
         decay = min(settings.ema, (1 + self.step) / (10 + self.step))
         live = self.job.module.state_dict()
         with torch.no_grad():
             torch._foreach_lerp_([self.ema[k] for k in live], list(live.values()), 1 - decay)
-        return {"loss": loss.item(), **metrics}
+        return {"loss": mean, **metrics}, stopping > 0
 
     def check(self, training: Metrics) -> None:
         """Validates the EMA weights, saves the best, writes the resume file. training: numbers of the last step.

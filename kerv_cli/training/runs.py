@@ -26,6 +26,7 @@ from kerv_cli.settings import TrainDrafterSettings, TrainSettings, TrainTargetSe
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import covered
+from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.distillation import Distillation, StatesByLength, TeacherStates, teach
 from kerv_cli.training.early_distillation import EarlyDistillation, teach_early
 from kerv_cli.training.imitation import (
@@ -40,6 +41,7 @@ from kerv_cli.training.imitation import (
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
 from kerv_cli.training.observations import check_spaces, split
+from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.recorded import teach_recorded
 
 Progress = Callable[[int, int], None]
@@ -49,7 +51,9 @@ def determining(train: TrainSettings) -> dict[str, Any]:
     """The optimisation settings that identify a run. Steps and validation intervals may change on resuming; `init` is
     identified by its weights' hash instead of its name."""
     free = ("steps", "validate_every", "closed_loop", "init", "half")
-    return {k: v for k, v in asdict(train).items() if k not in free}
+    later = {"balance": 0.0}  # settings that older runs do not know, with what they did
+    found = {k: v for k, v in asdict(train).items() if k not in free}
+    return {k: v for k, v in found.items() if k not in later or v != later[k]}
 
 
 def identity_of(**parts: Any) -> str:
@@ -66,6 +70,7 @@ class Run(ABC):
     dataset: DemoDataset
     folder: Path
     device: str
+    ranks: Ranks
 
     @abstractmethod
     def job(self) -> Job:
@@ -88,7 +93,16 @@ class Run(ABC):
         train, job = self.settings.train, self.job()
         identity = identity_of(train=determining(train), demos=self.dataset.sha256, **self.identity())
         job.module.train()
-        return Loop(job, train, self.folder, identity).run(on_step)
+        return Loop(job, train, self.folder, identity, self.ranks).run(on_step)
+
+    def begin(self) -> None:
+        """Chooses the device, and joins the other processes where torchrun started several.
+
+        Raises:
+            UsageError: no such device, or a batch that cannot be divided among them.
+        """
+        device, _ = set_up(self.settings.runtime)
+        self.device, self.ranks = join(device, self.settings.train.batch)
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Writes the weights with their provenance; metrics: of their validation."""
@@ -139,7 +153,7 @@ class TargetRun(Run):
             )
         self.folder = artifact(settings.results, "target", settings.name)
         self.init = self.find_init()
-        self.dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        self.dataset = open_demos(settings.results, settings.demos)
         self.check_demos()
         self.samples: Samples | None = None
         self.begun: CompactTarget | None = None
@@ -195,7 +209,7 @@ class TargetRun(Run):
         Raises:
             CheckpointError: one of them is damaged or of another environment.
         """
-        self.device, _ = set_up(self.settings.runtime)
+        self.begin()
         if self.init is not None:
             self.begun, described = load_target(self.init)
             self.origin = {"init": described.sha256}
@@ -255,7 +269,7 @@ class DrafterRun(Run):
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
         self.folder = self.place()
-        dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+        dataset = open_demos(settings.results, settings.demos)
         self.dataset = covered(dataset, settings.task, settings.starts)
         described = read_target(self.target_folder)
         check_spaces(self.dataset, described.actions, described.observation, "the target")
@@ -281,7 +295,7 @@ class DrafterRun(Run):
         Raises:
             CheckpointError: target or demonstrations are damaged.
         """
-        self.device, _ = set_up(self.settings.runtime)
+        self.begin()
         self.target, self.described = load_target(self.target_folder, self.device)
         self.teach(progress)
 

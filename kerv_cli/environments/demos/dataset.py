@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +141,31 @@ class DemoDataset:
             if not entry.path.is_file() or entry.path.stat().st_size != entry.bytes:
                 raise CheckpointError(f"{entry.path} is missing or cut short: run 'kerv demos' again to restore it")
         return cls(path, manifest, entries)
+
+    @classmethod
+    def joined(cls, parts: Sequence[DemoDataset]) -> DemoDataset:
+        """All episodes of `parts`, in order. The manifest is the first one's, with the tasks and the hash of all.
+
+        Raises:
+            CheckpointError: they are of different environments or cameras.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        first = parts[0].manifest
+        for part in parts[1:]:
+            for what, ours, theirs in (
+                ("environment", first.environment, part.manifest.environment),
+                ("action space", first.actions, part.manifest.actions),
+                ("observations", first.observation, part.manifest.observation),
+                ("camera", first.config["camera"], part.manifest.config["camera"]),
+            ):
+                if ours != theirs:
+                    raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they do not add up")
+        combined = hashlib.sha256("\n".join(part.sha256 for part in parts).encode()).hexdigest()
+        config = {**first.config, "joined": [part.manifest.config for part in parts[1:]]}
+        episodes = [entry for part in parts for entry in part.episodes]
+        tasks = {name: entry for part in reversed(parts) for name, entry in part.manifest.tasks.items()}
+        return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
 
     def load(self, index: int) -> DemoEpisode:
         """Reads the episode of entry `index` of `episodes`.

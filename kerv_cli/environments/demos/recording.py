@@ -1,7 +1,8 @@
 """Demonstrations: scripted experts, recorded to disk with clean labels, and read back.
 
 By default half of the episodes are executed with noise, so that they visit states off the expert's path; their labels
-are still the expert's clean actions at those states. Only successful episodes are kept.
+are still the expert's clean actions at those states. Only successful episodes are kept. With an *actor*, e.g. a policy,
+that one moves the robot and the expert only labels what it visits (DAgger, Ross et al. 2011); every episode is kept.
 
 On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:06d>.safetensors`,
 `failed/<task>/<seed:06d>.json` and, when the recording is complete, `manifest.json`.
@@ -15,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,8 @@ class DemoConfig:
         tail: labels recorded beyond success, so that an action chunk that starts near the end has true labels.
         workers: processes; the result does not depend on them.
         horizon: control steps within which the expert must succeed; 0: the environment's.
+        policy: hash of the actor's weights; empty: the expert acts.
+        expert_share: probability that the expert acts for one of the actor's chunks.
     """
 
     tasks: tuple[str, ...]
@@ -67,6 +70,8 @@ class DemoConfig:
     tail: int = 8
     workers: int = 2
     horizon: int = 0
+    policy: str = ""
+    expert_share: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
@@ -81,6 +86,7 @@ class DemoConfig:
             f"frame_stride must be 1 or more, not {self.frame_stride}": self.frame_stride >= 1,
             f"tail must lie between 0 and {most - 1}, not {self.tail}": 0 <= self.tail < most,
             f"workers must be 1 or more, not {self.workers}": self.workers >= 1,
+            f"expert_share must lie between 0 and 1, not {self.expert_share}": 0.0 <= self.expert_share <= 1.0,
         }
         wrong = [message for message, holds in checks.items() if not holds]
         if wrong:
@@ -99,25 +105,58 @@ class DemoConfig:
         return min(self.first_seed + 2 * self.episodes + _EXTRA_ATTEMPTS, self.spec.seeds.training.stop)
 
 
-def run_expert(world: World, seed: int, config: DemoConfig) -> DemoEpisode | None:
-    """Runs one episode; None when the expert did not succeed within the horizon, or so late that the simulator's own
-    horizon leaves no room for the tail."""
+class Actor(Protocol):
+    """Moves the robot of a recording in the expert's place."""
+
+    def reset(self, world: World, seed: int) -> None:
+        """Begins an episode in a world that was reset."""
+
+    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The action (D,) to execute now; label: the expert's."""
+
+
+MakeActor = Callable[[DemoConfig], Actor]
+"""Makes the actor of a recording, in the process that records; must be picklable."""
+
+
+class NoisyExpert:
+    """The expert as its own actor, with noise where the seed says so."""
+
+    def __init__(self, config: DemoConfig) -> None:
+        self.config = config
+        self.perturb: Perturbation | None = None
+
+    def reset(self, world: World, seed: int) -> None:
+        """See `Actor.reset`."""
+        config, noise = self.config, (self.config.noise_low, self.config.noise_high)
+        noisy = is_perturbed(seed, config.perturbed)
+        arguments = (world.task, seed, world.spec.actions, noise, config.burst_probability)
+        self.perturb = Perturbation(*arguments) if noisy else None
+
+    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Actor.act`."""
+        return self.perturb(label) if self.perturb else label
+
+
+def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None = None) -> DemoEpisode | None:
+    """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
+    late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
     expert = world.spec.expert(world.task)
-    perturbed = is_perturbed(seed, config.perturbed)
-    noise = (config.noise_low, config.noise_high)
-    space = world.spec.actions
-    perturb = Perturbation(world.task, seed, space, noise, config.burst_probability) if perturbed else None
+    mover: Actor = actor or NoisyExpert(config)
     observation = world.reset(seed)
+    mover.reset(world, seed)
     states, labels, executed, frames, frame_steps = [], [], [], [], []
     last_step = min(config.horizon, world.horizon - config.tail)
     while not world.success:
         if world.steps >= last_step:
-            return None
+            if actor is None:
+                return None
+            break
         if world.steps % config.frame_stride == 0:
             frames.append(world.frame())
             frame_steps.append(world.steps)
         label = expert(observation)
-        action = perturb(label) if perturb else label
+        action = mover.act(label)
         states.append(observation.state)
         labels.append(label)
         executed.append(action)
@@ -126,7 +165,7 @@ def run_expert(world: World, seed: int, config: DemoConfig) -> DemoEpisode | Non
     return DemoEpisode(
         task=world.task,
         seed=seed,
-        perturbed=perturbed,
+        perturbed=actor is not None or is_perturbed(seed, config.perturbed),
         steps=len(states),
         frames=np.stack(frames),
         frame_steps=np.array(frame_steps, dtype=np.int64),
@@ -145,7 +184,12 @@ def _tail_labels(world: World, expert: Expert, observation: Observation, tail: i
     return labels
 
 
-def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None = None) -> DemoManifest:
+def record(
+    config: DemoConfig,
+    out: Path,
+    on_progress: Callable[[int, int], None] | None = None,
+    make_actor: MakeActor | None = None,
+) -> DemoManifest:
     """Records demonstrations into the folder `out`; an interrupted recording resumes.
 
     A seed whose expert fails is replaced by the next one beyond the range, up to `config.seed_limit`. Which episodes
@@ -155,6 +199,7 @@ def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None
         config: of the recording.
         out: the dataset's folder.
         on_progress: called with (episodes done, episodes wanted).
+        make_actor: makes the actor that moves the robot in the expert's place.
 
     Returns:
         The manifest, as written to `out/manifest.json`. Where an expert failed too often, its `missing` is the number
@@ -171,7 +216,7 @@ def record(config: DemoConfig, out: Path, on_progress: Callable[[int, int], None
     identity = _identity(config)
     _claim_folder(out, identity)
     try:
-        kept, failed = _collect(config, out, on_progress)
+        kept, failed = _collect(config, out, on_progress, make_actor)
     finally:
         _release_world()
     manifest = {**identity, **_summary(config, kept, failed)}
@@ -184,13 +229,16 @@ _Failures = dict[str, list[int]]  # task -> seeds
 
 
 def _collect(
-    config: DemoConfig, out: Path, on_progress: Callable[[int, int], None] | None
+    config: DemoConfig,
+    out: Path,
+    on_progress: Callable[[int, int], None] | None,
+    make_actor: MakeActor | None,
 ) -> tuple[_Entries, _Failures]:
     kept: _Entries = {task: [] for task in config.tasks}
     failed: _Failures = {task: [] for task in config.tasks}
     wanted = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
     while any(wanted.values()):
-        for task, outcomes in _run_jobs(config, out, _jobs(wanted)):
+        for task, outcomes in _run_jobs(config, out, _jobs(wanted), make_actor):
             kept[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
             if on_progress is not None:
@@ -215,6 +263,8 @@ def _next_seeds(config: DemoConfig, kept: int, tried: range) -> range:
 def _identity(config: DemoConfig) -> dict[str, Any]:
     settings = asdict(config)
     del settings["workers"]
+    if not config.policy:
+        del settings["policy"], settings["expert_share"]  # as recordings without an actor always were
     spec = config.spec
     versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
     identity = {
@@ -257,33 +307,38 @@ def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[st
 _Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, None where the expert failed
 
 
-def _run_jobs(config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]]) -> Iterator[tuple[str, _Outcomes]]:
+def _run_jobs(
+    config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]], make_actor: MakeActor | None
+) -> Iterator[tuple[str, _Outcomes]]:
     if config.workers == 1 or len(jobs) == 1:
-        yield from (_record_seeds(config, out, task, seeds) for task, seeds in jobs)
+        yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return
     from joblib import Parallel, delayed, parallel_config
 
     # loky starts fresh interpreters: a fork after this process has drawn would deadlock in the GL driver.
     with parallel_config(backend="loky", n_jobs=min(config.workers, len(jobs)), inner_max_num_threads=1):
-        work = (delayed(_record_seeds)(config, out, task, seeds) for task, seeds in jobs)
+        work = (delayed(_record_seeds)(config, out, task, seeds, make_actor) for task, seeds in jobs)
         yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
 
 
 _world: World | None = None
 
 
-def _record_seeds(config: DemoConfig, out: Path, task: str, seeds: Sequence[int]) -> tuple[str, _Outcomes]:
+def _record_seeds(
+    config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
+) -> tuple[str, _Outcomes]:
     """Runs in a worker: records each seed that has no file yet."""
-    return task, {seed: _record_seed(config, out, task, seed) for seed in seeds}
+    actor = make_actor(config) if make_actor else None
+    return task, {seed: _record_seed(config, out, task, seed, actor) for seed in seeds}
 
 
-def _record_seed(config: DemoConfig, out: Path, task: str, seed: int) -> dict[str, Any] | None:
+def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Actor | None) -> dict[str, Any] | None:
     path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
     if failure.exists():
         return None
     episode = _valid_episode(path, task, seed, config.spec)
     if episode is None:
-        episode = run_expert(_world_for(task, config), seed, config)
+        episode = run_expert(_world_for(task, config), seed, config, actor)
         if episode is None:
             write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
             return None

@@ -1,0 +1,95 @@
+"""DAgger: a target moves the robot, the expert labels the states that it visits (Ross, Gordon, Bagnell 2011)."""
+
+from __future__ import annotations
+
+import functools
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kerv_cli.decoding.build import is_parallel
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.verify_skip import ParallelPass
+from kerv_cli.environments.demos.recording import DemoConfig
+from kerv_cli.environments.spec import World
+from kerv_cli.errors import UsageError
+from kerv_cli.places import find_target
+from kerv_cli.settings import WorldSettings
+from kerv_cli.targets.checkpoint import load_target, read_target
+
+
+class TargetActor:
+    """A target decodes chunks autoregressively (a parallel one in its one pass) and executes them whole. For a share of
+    the chunks, drawn by task and seed, the expert acts instead; then the target decodes anew."""
+
+    def __init__(self, target: Any, expert_share: float) -> None:
+        self.decoder = Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
+        self.chunk, self.share = target.chunk, expert_share
+        self.in_hand: deque[NDArray[np.float64]] = deque()
+        self.expert_steps = 0
+        self.executed: NDArray[np.float32] | None = None
+
+    def reset(self, world: World, seed: int) -> None:
+        """See `Actor.reset`."""
+        self.world = world
+        self.random = np.random.default_rng([seed, *world.task.encode()])
+        self.in_hand.clear()
+        self.expert_steps, self.executed = 0, None
+        self.decoder.reset(world.task, seed, world.end_effector)
+
+    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Actor.act`."""
+        if self.executed is not None:
+            self.decoder.observe(self.executed, self.world.end_effector)
+        if not self.in_hand and not self.expert_steps:
+            self._decide()
+        if self.expert_steps:
+            self.expert_steps -= 1
+            action = label
+        else:
+            action = self.in_hand.popleft()
+        self.executed = np.asarray(action, dtype=np.float32)
+        return np.asarray(action, dtype=np.float64)
+
+    def _decide(self) -> None:
+        if self.random.random() < self.share:
+            self.expert_steps = self.chunk
+        else:
+            self.in_hand = deque(self.decoder.decode(self.world.observe(self.decoder.cameras)).actions)
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(folder: Path) -> Any:
+    torch.set_num_threads(1)
+    return load_target(folder)[0]
+
+
+@dataclass(frozen=True)
+class TargetActs:
+    """Makes the actor of a recording. folder, sha256: of the target."""
+
+    folder: Path
+    sha256: str
+
+    @classmethod
+    def of(cls, results: str, name: str, world: WorldSettings) -> TargetActs:
+        """The target of that name.
+
+        Raises:
+            UsageError: no such target, or one that was trained on frames of another size. CheckpointError: damaged.
+        """
+        folder = find_target(results, name)
+        described = read_target(folder)
+        size = described.settings.get("image_size", world.camera.size)
+        if described.cameras and size != world.camera.size:
+            raise UsageError(f"world.camera.size={world.camera.size}: policy={name} was trained on {size} pixels")
+        return cls(folder, described.sha256)
+
+    def __call__(self, config: DemoConfig) -> TargetActor:
+        """The actor, in the process that records."""
+        return TargetActor(_loaded(self.folder), config.expert_share)

@@ -1,0 +1,16 @@
+"""Which demonstrations a command learns from: one dataset, or several that add up."""
+
+from __future__ import annotations
+
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.places import artifact
+
+
+def open_demos(results: str, names: str) -> DemoDataset:
+    """The dataset of that name; several, e.g. `mt50+mt50-dagger`, are joined in that order.
+
+    Raises:
+        UsageError: no folder name. CheckpointError: one is missing, unfinished or damaged, or they do not add up.
+    """
+    found = [artifact(results, "demos", name) for name in names.split("+")]
+    return DemoDataset.joined([DemoDataset.open(folder) for folder in found])

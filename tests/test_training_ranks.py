@@ -1,0 +1,150 @@
+"""Training on several processes, balanced batches, datasets that add up, and DAgger."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.demos.recording import DemoConfig, record, run_expert
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.settings import TrainSettings, WorldSettings
+from kerv_cli.training.dagger import TargetActs
+from kerv_cli.training.demonstrations import open_demos
+from kerv_cli.training.imitation import balanced
+from kerv_cli.training.loop import Job
+from kerv_cli.training.ranks import Ranks, join
+from kerv_cli.training.runs import determining
+
+SHORT = CameraConfig()
+SIZES = ("target.width=16", "target.layers=1", "target.heads=2", "target.feed_forward=16")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two small datasets of real demonstrations: `few` of one task, `more` of another."""
+    folder = tmp_path_factory.mktemp("ranks")
+    for name, task in (("few", "drawer-close-v3"), ("more", "reach-v3")):
+        record(DemoConfig((task,), 4, camera=SHORT, frame_stride=8, workers=1), folder / "artifacts/demos" / name)
+    return folder
+
+
+def test_the_shares_of_all_ranks_are_the_batch() -> None:
+    batch = torch.arange(12)
+    parts = [Ranks(rank, 3).share(batch) for rank in range(3)]
+    assert sorted(torch.cat(parts).tolist()) == batch.tolist()
+    assert {len(part) for part in parts} == {4}
+
+
+def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    with pytest.raises(UsageError, match=r"train.batch=64 cannot be divided among 3 processes"):
+        join("cpu", 64)
+    with pytest.raises(UsageError, match="would share it"):
+        join("cuda:1", 63)
+
+
+def test_two_processes_train_what_one_does(results: Path) -> None:
+    words = ["train", "target", "task=drawer-close-v3", "demos=few", *SIZES, "train.steps=4", "train.batch=8"]
+    words += ["train.validate_every=2", "train.bf16=false", "train.warmup=1", f"results={results}"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    script = Path(sys.executable).parent / "kerv"
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", str(script)]
+    outputs = {}
+    for name, command in (("one", [sys.executable, str(script)]), ("two", launcher)):
+        done = subprocess.run([*command, *words, f"name={name}"], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        outputs[name] = done.stdout
+    assert outputs["two"].count("best checkpoint") == 1  # the first rank alone reports
+    one, two = (pd.read_csv(results / "artifacts/target" / name / "log.csv") for name in ("one", "two"))
+    assert list(one["step"]) == [2, 4]
+    np.testing.assert_allclose(one.drop(columns="train_loss"), two.drop(columns="train_loss"), rtol=1e-3, atol=1e-4)
+
+
+def test_balanced_tasks_are_drawn_alike() -> None:
+    tasks = torch.tensor([0] * 900 + [1] * 100)
+    generator = torch.Generator().manual_seed(0)
+
+    def share(balance: float) -> float:
+        job = Job(torch.nn.Linear(1, 1), 1000, lambda i, s: (torch.zeros(()), {}), lambda m: {}, lambda m, x: None)
+        job = Job(**(vars(job) | {"weights": balanced(tasks, balance)}))
+        return float(tasks[job.batch(20_000, generator)].double().mean())
+
+    assert share(0.0) == pytest.approx(0.1, abs=0.01)
+    assert share(1.0) == pytest.approx(0.5, abs=0.02)
+    assert share(0.5) == pytest.approx(0.25, abs=0.02)  # 1 : 3, the root of 1 : 9
+
+
+def test_runs_from_before_balance_are_the_same_runs() -> None:
+    assert "balance" not in determining(TrainSettings())
+    assert determining(TrainSettings(balance=0.5))["balance"] == 0.5
+
+
+def test_datasets_add_up(results: Path) -> None:
+    few, more, both = (open_demos(str(results), name) for name in ("few", "more", "few+more"))
+    assert [e.path for e in both.episodes] == [e.path for e in (*few.episodes, *more.episodes)]
+    assert set(both.manifest.tasks) == {"drawer-close-v3", "reach-v3"}
+    assert len({few.sha256, more.sha256, both.sha256, open_demos(str(results), "more+few").sha256}) == 4
+    assert both.load(5).task == "reach-v3"
+
+
+def test_datasets_of_other_cameras_do_not_add_up(results: Path, tmp_path: Path) -> None:
+    other = DemoConfig(("reach-v3",), 1, camera=CameraConfig(size=48), frame_stride=50, workers=1)
+    record(other, tmp_path / "other")
+    with pytest.raises(CheckpointError, match="another camera"):
+        DemoDataset.joined([open_demos(str(results), "few"), DemoDataset.open(tmp_path / "other")])
+
+
+def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
+    acts = TargetActs.of("results", "mt10-state", WorldSettings())
+    tasks, share = ("reach-v3",), 0.5
+    config = DemoConfig(tasks, 2, camera=SHORT, frame_stride=20, workers=1, horizon=60, expert_share=share)
+    config = DemoConfig(**(vars(config) | {"policy": acts.sha256}))
+    record(config, tmp_path / "visited", make_actor=acts)
+    dataset = DemoDataset.open(tmp_path / "visited")
+    assert dataset.manifest.config["policy"] == acts.sha256
+    assert [entry.seed for entry in dataset.episodes] == [0, 1]  # no seed is replaced, whether it succeeds or not
+    episode = dataset.load(0)
+    same = (episode.labels[: episode.steps] == episode.executed).all(1)
+    assert 0 < same.mean() < 1  # the expert's chunks, and the target's
+    world = SPEC.open_world("reach-v3", SHORT)
+    again = run_expert(world, 0, config, acts(config))
+    assert again is not None
+    np.testing.assert_array_equal(again.executed, episode.executed)
+    expert, observation = world.spec.expert("reach-v3"), world.reset(0)
+    for action, label in zip(episode.executed, episode.labels, strict=False):
+        np.testing.assert_allclose(expert(observation), label, atol=1e-6)
+        observation = world.step(action)
+    world.close()
+
+
+def test_an_actors_failed_episode_is_kept(tmp_path: Path) -> None:
+    class Still:
+        def reset(self, world: object, seed: int) -> None: ...
+
+        def act(self, label: np.ndarray) -> np.ndarray:
+            return np.zeros(4)
+
+    config = DemoConfig(("reach-v3",), 1, camera=SHORT, frame_stride=50, workers=1, horizon=20, policy="still")
+    world = SPEC.open_world("reach-v3", SHORT)
+    episode = run_expert(world, 0, config, Still())
+    world.close()
+    assert episode is not None
+    assert (episode.steps, len(episode.labels)) == (20, 20 + config.tail)
+    assert not episode.executed.any()
+
+
+def test_a_target_of_another_frame_size_is_refused() -> None:
+    settings = WorldSettings()
+    settings.camera.size = 48
+    with pytest.raises(UsageError, match=r"world.camera.size=48"):
+        TargetActs.of("results", "mt10-vision", settings)
