@@ -62,6 +62,9 @@ def _idle(settings: RolloutSettings) -> dict[str, str]:
     if "datastore" not in needed:
         idle["datastore"] = f"method {settings.method} reads no datastore"
     idle |= _idle_timing(settings.rollout)
+    batch = settings.rollout.batch
+    if batch > 1:
+        idle |= dict.fromkeys(("record", "record_size"), f"rollout.batch={batch}: episodes of a batch are not recorded")
     if not settings.record:
         idle["record_size"] = "record=0 saves no recording"
     return idle

@@ -54,9 +54,14 @@ class TimingSettings:
     # an autoregressive decode of the same target takes so long, all others in proportion; 0: as measured or profiled
     ar_ms: float = number(0.0, 0, 600_000)
     delay_compensation: str = choice("none", "none", "chunk", "hold", "linear", "kalman", "position")
+    batch: int = number(1, 1, 1024)  # episodes whose decodes are computed together; above 1: for success, without times
 
     def check_together(self, prefix: str) -> None:
-        """Raises UsageError for latency=profile without a profile."""
+        """Raises UsageError for latency=profile without a profile, and for a batch in a world that feels its time."""
+        if self.batch > 1 and self.clock == REAL:
+            raise UsageError(
+                f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use one of them"
+            )
         if self.clock == REAL and self.latency == PROFILE and not self.profile:
             raise UsageError(
                 f"{prefix}latency=profile: name a document of 'kerv bench', {prefix}profile=mt10-vision-float32"

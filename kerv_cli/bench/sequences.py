@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from kerv_cli.decoding.cost import DECODE_TIMES, DecodeSequence, sequence_of
 from kerv_cli.errors import UsageError
-from kerv_cli.studies.plan import Cell
+from kerv_cli.studies.plan import Cell, batch_of
 from kerv_cli.studies.store import StudyStore
 
 _COLUMNS = ["task", "seed", "index", "rounds", *DECODE_TIMES]
@@ -33,7 +33,7 @@ def read_study(store: StudyStore, tokens: int, decodes: int) -> list[Recorded]:
     """The settings of a study, `decodes` decodes of each, evenly over tasks and seeds; the baseline first.
 
     Raises:
-        UsageError: no such study, no complete cell, or chunks shorter than `tokens`.
+        UsageError: no such study, no complete cell, chunks shorter than `tokens`, or decodes without times.
         CheckpointError: a damaged plan or cell.
     """
     plan = store.read_plan()
@@ -50,6 +50,10 @@ def read_study(store: StudyStore, tokens: int, decodes: int) -> list[Recorded]:
 
 def _setting(label: str, cells: Sequence[Cell], found: Mapping[str, Any], tokens: int, decodes: int) -> Recorded:
     stored = [found[cell.id] for cell in cells]
+    if (batch := batch_of(cells[0].settings)) > 1:
+        raise UsageError(
+            f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
+        )
     frames = [pq.read_table(cell.folder / "decodes.parquet", columns=_COLUMNS).to_pandas() for cell in stored]
     rows = pd.concat(frames).sort_values(["task", "seed", "index"])
     rows[list(DECODE_TIMES)] = rows[list(DECODE_TIMES)].fillna(0.0)  # phases that a decode has not

@@ -23,7 +23,7 @@ from kerv_cli.commands.common import (
 from kerv_cli.errors import KervError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     import pandas as pd
 
@@ -178,6 +178,16 @@ class _Remembering:
         run = self._kept(self.runner, cell)
         return lambda seed: self._kept(run, seed)
 
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+        """As `CellRunner.together`."""
+        try:
+            for cell, seed, ended in self.runner.together(cells):
+                self.error = ended if isinstance(ended, KervError) else self.error
+                yield cell, seed, ended
+        except KervError as error:
+            self.error = error
+            raise
+
     def _kept(self, call: Callable[[A], B], argument: A) -> B:
         try:
             return call(argument)
@@ -211,6 +221,8 @@ def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> No
 def _single(data: StudyData) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.decoding.record import PHASES
+    from kerv_cli.reporting.measures import is_timed
+    from kerv_cli.studies.plan import batch_of
 
     episodes = data.episodes
     cell = data.plan.cells[0]
@@ -224,11 +236,16 @@ def _single(data: StudyData) -> None:
     print_table(headers, rows, f"{cell.label}, observation {seen}{stress}, seeds {seeds}")
     decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
     seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+    if not is_timed(episodes):
+        typer.echo(f"not timed: {batch_of(cell.settings)} episodes at a time, for success alone")
+        return
     rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
     print_table(("phase", "ms per decode", "share"), rows, "time by phase")
 
 
 def _figures(episodes: pd.DataFrame) -> list[str]:
+    from kerv_cli.reporting.measures import is_timed
+
     steps, rounds = episodes["steps"].sum(), episodes["verifications"].sum()
     per_round = [f"{episodes[name].sum() / rounds:.2f}" if rounds else "–" for name in ("committed", "accepted")]
     return [
@@ -236,5 +253,5 @@ def _figures(episodes: pd.DataFrame) -> list[str]:
         f"{steps / len(episodes):.0f}",
         f"{episodes['forwards'].sum() / steps:.2f}",
         *per_round,
-        f"{1000 * (episodes['seconds'] / episodes['steps']).mean():.2f}",
+        f"{1000 * (episodes['seconds'] / episodes['steps']).mean():.2f}" if is_timed(episodes) else "–",
     ]

@@ -24,6 +24,9 @@ allow more."""
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
 
+UNTIMED = dict.fromkeys(PHASES, math.nan)
+"""Phases of a decode that was computed together with others and has no time of its own."""
+
 
 @dataclass(frozen=True)
 class Round:
@@ -102,7 +105,7 @@ class DecodeRecord:
     forwards: int  # target forwards, prefill included
     rounds: tuple[Round, ...]
     mode: str  # proposer of the first round that drafted; "skip": not verified; PARALLEL; "ar": no draft; "expert"
-    seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends
+    seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends; NaN: not timed
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
     size: int = 0  # N; 0: as many as `tokens`
@@ -168,14 +171,19 @@ class EpisodeRecord:
     gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
     initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that begin alike
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
-    wall_seconds: float = 0.0  # whole episode, simulation and rendering included
+    wall_seconds: float = 0.0  # whole episode, simulation and rendering included; its share where several ran at once
     # object, goal, … -> (T + 1, 3) metres, only where logged
     places: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def seconds(self) -> float:
-        """Inference time of the episode."""
+        """Inference time of the episode; NaN where it was not timed."""
         return sum(d.seconds for d in self.decodes)
+
+    @property
+    def timed(self) -> bool:
+        """Whether its decodes have times; those of a batch have none."""
+        return not math.isnan(self.seconds)
 
     @property
     def forwards(self) -> int:

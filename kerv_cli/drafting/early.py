@@ -8,6 +8,7 @@ costs one small pass.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,15 @@ class EarlyDrafter(nn.Module):
         logits = self(features.to(weight.dtype), actions, known)
         tokens = choose(logits, radius, self.strict)
         return EarlyDraft(tokens[0].tolist(), float(acceptance_odds(logits, tokens, radius, self.strict)[0]), logits[0])
+
+    @torch.inference_mode()
+    def tokens_of(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> list[list[int]]:
+        """features (B, F) and the executed actions of B episodes, as in `drafted` -> their drafts of all N tokens."""
+        weight = self.head.weight
+        shown = [padded(history, self.settings.history, self.actions.dofs) for history in histories]
+        actions, known = (torch.from_numpy(np.stack(x)).to(weight) for x in zip(*shown, strict=True))
+        tokens: list[list[int]] = choose(self(features.to(weight), actions, known), radius, self.strict).tolist()
+        return tokens
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, chu
 
 
 def _seconds(episodes: pd.DataFrame, phase: str) -> float:
-    return float(episodes[f"seconds.{phase}"].sum())
+    return float(episodes[f"seconds.{phase}"].sum(skipna=False))  # NaN where an episode was not timed
 
 
 def is_autoregressive(settings: Mapping[str, Any]) -> bool:

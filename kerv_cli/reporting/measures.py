@@ -43,9 +43,9 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
     """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
 
     success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
-    (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs and where no
-    target decodes. mcnemar_p is NaN without pairs. same_run: all pairs were measured in one run. same_block: share of
-    the pairs that were measured in one block, in turn.
+    (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs, where no
+    target decodes and where an episode of either side was not timed. mcnemar_p is NaN without pairs. same_run: all
+    pairs were measured in one run. same_block: share of the pairs that were measured in one block, in turn.
 
     MACRO takes each measure within every difficulty group and then the unweighted mean of the groups; the speedup is
     the ratio of the two macro means. Paired counts and p are those of all pairs in either case.
@@ -60,12 +60,12 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
     counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
     difference = stats.paired_difference(counts)
     once = episodes[episodes["repeat"] == 0]
-    decodes = _decodes(episodes)
+    timed = _decodes(episodes) and is_timed(pairs, "time_method") and is_timed(pairs, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
         **_columns("success", _success(once, macro)),
-        **_columns("speedup", _speedup(pairs, "time", macro) if decodes else stats.NO_ESTIMATE),
-        **_columns("episode_speedup", _speedup(pairs, "seconds", macro) if decodes else stats.NO_ESTIMATE),
+        **_columns("speedup", _speedup(pairs, "time", macro) if timed else stats.NO_ESTIMATE),
+        **_columns("episode_speedup", _speedup(pairs, "seconds", macro) if timed else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
         **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
@@ -131,6 +131,11 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
 def _decodes(episodes: pd.DataFrame) -> bool:
     """Whether a target decodes at all; a scripted expert has no decoding time to compare."""
     return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
+
+
+def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
+    """Whether all episodes have times; those of a batch have none (docs/measuring.md)."""
+    return bool(episodes[column].notna().all())
 
 
 def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:

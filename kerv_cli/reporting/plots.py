@@ -33,8 +33,8 @@ _CONTINUES = "… "
 
 
 def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
-    """Name suffix -> figure: measures against the axis, and inference time by phase; without an axis the measures by
-    setting, and success against speedup. A study of stress has one figure, `stress_figure`.
+    """Name suffix -> figure: measures against the axis, and inference time by phase where it was measured; without an
+    axis the measures by setting, and success against speedup. A study of stress has one figure, `stress_figure`.
 
     Args:
         table: `study_table`.
@@ -48,7 +48,8 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
     numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
     with mpl.rc_context(STYLE):
         figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
-        figures["_phases"] = _phases(rows)
+        if rows["time_per_step_ms"].notna().any():
+            figures["_phases"] = _phases(rows)
         for figure in figures.values():
             entitle(figure, title, _about(rows, averaging))
         if not numbers:
@@ -276,7 +277,8 @@ def _phases(rows: pd.DataFrame) -> Figure:
             panel.barh(places, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
         left = left + widths
     for place, total in enumerate(rows["time_per_step_ms"]):
-        panel.text(total, place, f"  {total:.3g}", va="center", fontsize=9)
+        told = f"  {total:.3g}" if is_number(total) else "  not timed"
+        panel.text(total if is_number(total) else 0.0, place, told, va="center", fontsize=9)
     _name_rows(panel, rows["label"])
     panel.set(title="Inference time by phase", xlabel="ms per control step")
     panel.margins(x=0.08)

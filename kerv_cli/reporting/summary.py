@@ -51,6 +51,9 @@ class SummaryTable:
         yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {against}")
         if frame["speedup"].str.endswith(APART).any():
             yield Text(f"{APART} not all of its pairs were measured in one run")
+        untimed = list(dict.fromkeys(self.table.loc[self.table["time_per_step_ms"].isna(), "label"]))
+        if untimed:
+            yield Text(f"not timed, for success alone: {', '.join(map(str, untimed))}")
         if "ceiling" in frame:
             yield Text("ceiling: speedup if every chunk were accepted whole at once")
 
@@ -96,13 +99,18 @@ def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) ->
     return {
         "setting": str(row["label"]),
         "success %": _interval(row, "success", 100.0, 0),
-        "speedup": "1" if reference else _interval(row, "speedup", 1.0, 2) + _apart(row),
+        "speedup": _one(row) if reference else _interval(row, "speedup", 1.0, 2) + _apart(row),
         **({"ceiling": number(row["ceiling"])} if limited else {}),
         "ms / step": number(row["time_per_step_ms"]),
         **{name: _percent(row[key]) if key in _PERCENT else number(row[key]) for key, name in columns.items()},
         "lost/won": "" if reference or not row["pairs"] else f"{row['only_baseline']}/{row['only_method']}",
         "p": "" if reference or not row["pairs"] else _p(row["mcnemar_p"]),
     }
+
+
+def _one(row: Mapping[str, Any]) -> str:
+    """The speedup of the baseline, where it has a time at all."""
+    return "1" if is_number(row["time_per_step_ms"]) else "–"
 
 
 def _apart(row: Mapping[str, Any]) -> str:

@@ -10,17 +10,18 @@ import dataclasses
 import functools
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.rollouts.policy import artifacts_of
-from kerv_cli.rollouts.run import Runner, is_recorded
+from kerv_cli.rollouts.run import Runner, is_recorded, run_batch
+from kerv_cli.rollouts.together import Wanted
 from kerv_cli.settings import RolloutSettings, settings_from
 
 _TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
@@ -53,6 +54,8 @@ class CellLike(Protocol):
     def settings(self) -> dict[str, Any]:
         """RolloutSettings as plain values."""
 
+
+C = TypeVar("C", bound=CellLike)
 
 OnStep = Callable[[CellLike, int, int], None]
 """Told the cell, the seed and the number of control steps executed, after each of them."""
@@ -89,6 +92,18 @@ class CellRunner:
             return dataclasses.replace(record, frames={}, places={})
 
         return episode
+
+    def together(self, cells: Sequence[C]) -> Iterator[tuple[C, int, EpisodeRecord | Exception]]:
+        """Runs the episodes of cells whose settings differ in the task alone, `rollout.batch` at a time; yields each as
+        it ends: its cell, its seed, and its record or the error that its world raised."""
+        settings = settings_from(cells[0].settings)
+        by_id = {cell.id: cell for cell in cells}
+        wanted = [Wanted((cell.id, seed), cell.task, seed) for cell in cells for seed in cell.seeds]
+        for ended in run_batch(settings, wanted):
+            name, seed = ended.wanted.key
+            if self.on_step is not None:
+                self.on_step(by_id[name], seed, settings.world.horizon)
+            yield by_id[name], seed, ended.result
 
 
 def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:

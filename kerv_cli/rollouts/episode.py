@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import deque
-from typing import Protocol
+from collections.abc import Generator
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from kerv_cli.rollouts.clock import RealClock
 from kerv_cli.spaces import Observation
 
 
-class ActionDecoder(Protocol):
-    """The interface of a decoder to an episode."""
+class Follower(Protocol):
+    """What an episode tells, whoever decodes its observations."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -26,14 +27,18 @@ class ActionDecoder(Protocol):
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Begins an episode: clears histories."""
 
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """The present observation, with the images of `cameras` -> the actions to execute and their record."""
-
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """Told after each executed action (D,), in environment units; end_effector (3,) is its position now, metres."""
 
     def finish(self, success: bool) -> None:
         """Told at the end of the episode."""
+
+
+class ActionDecoder(Follower, Protocol):
+    """The interface of a decoder to an episode."""
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The present observation, with the images of `cameras` -> the actions to execute and their record."""
 
 
 class _Trace:
@@ -69,8 +74,8 @@ class _Execution:
     """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
     the first one the robot stands still."""
 
-    def __init__(self, world: World, decoder: ActionDecoder, trace: _Trace) -> None:
-        self.world, self.decoder, self.trace = world, decoder, trace
+    def __init__(self, world: World, follower: Follower, trace: _Trace) -> None:
+        self.world, self.follower, self.trace = world, follower, trace
         self.in_hand: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
 
@@ -79,7 +84,7 @@ class _Execution:
         if self.in_hand:
             self.last = self.in_hand.popleft()
         self.trace.add(self.last)
-        self.decoder.observe(self.trace.actions[-1], self.trace.path[-1])
+        self.follower.observe(self.trace.actions[-1], self.trace.path[-1])
 
     def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
         """A new chunk replaces the one in hand."""
@@ -111,21 +116,42 @@ def run_episode(
     Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
     record keeps, one per control step; None: none. clock: of a world that goes on during decodes; None: it waits.
     """
+    steps = episode(world, decoder, seed, camera, clock)
+    decode: Any = None
+    while True:
+        try:
+            observation = steps.send(decode)
+        except StopIteration as end:
+            record: EpisodeRecord = end.value
+            return record
+        decode = decoder.decode(observation)
+
+
+def episode(
+    world: World, follower: Follower, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
+) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
+    """As `run_episode`, decoded by whoever runs it: yields each observation, is sent its decode and returns the
+    record."""
     began = time.perf_counter()
     world.reset(seed)
-    decoder.reset(world.task, seed, world.end_effector)
+    follower.reset(world.task, seed, world.end_effector)
     trace = _Trace(world, camera)
-    execution = _Execution(world, decoder, trace)
+    execution = _Execution(world, follower, trace)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     if clock is not None:
         clock.reset()
     while not world.done:
-        decodes.append(_decode(execution, clock))
+        observation = world.observe(follower.cameras)
+        decode = yield observation if clock is None else clock.observed(observation, trace.path)
+        if clock is not None:
+            delay = clock.delay(decode, len(trace.actions))
+            decode = dataclasses.replace(decode, delay=execution.during(delay))
+        decodes.append(decode)
         decode_steps.append(len(trace.actions))
         execution.take(decodes[-1], clock)
         execution.until(0 if clock is None else clock.expected)
-    decoder.finish(world.succeeded)
+    follower.finish(world.succeeded)
     return EpisodeRecord(
         environment=world.spec.name,
         space=world.spec.actions,
@@ -144,14 +170,3 @@ def run_episode(
         places={name: np.asarray(path, dtype=np.float32) for name, path in trace.places.items()},
         wall_seconds=time.perf_counter() - began,
     )
-
-
-def _decode(execution: _Execution, clock: RealClock | None) -> DecodeRecord:
-    """Decodes the present observation; with a clock the world goes on for as long as that takes."""
-    world, decoder, trace = execution.world, execution.decoder, execution.trace
-    observation = world.observe(decoder.cameras)
-    if clock is None:
-        return decoder.decode(observation)
-    decode = decoder.decode(clock.observed(observation, trace.path))
-    delay = clock.delay(decode, len(trace.actions))
-    return dataclasses.replace(decode, delay=execution.during(delay))

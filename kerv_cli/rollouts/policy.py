@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from kerv_cli.artifacts import Artifacts
+from kerv_cli.decoding.batched import BatchDecoder, check_batch
 from kerv_cli.decoding.build import check as check_method
 from kerv_cli.decoding.build import compose, needs
 from kerv_cli.decoding.decoder import Decoder
@@ -102,6 +103,7 @@ def check(settings: RolloutSettings) -> None:
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     check_method(method, settings.chunk, target.chunk, target.parallel)
+    check_batch(method, settings.method, settings.rollout.batch)
     timing.check_method(settings, spec, target)
     wanted = needs(method)
     hashes = artifacts.check(wanted)
@@ -124,6 +126,8 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 
 def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     timing.check_expert(settings, spec)
+    if settings.rollout.batch > 1:
+        raise UsageError(f"policy=expert with rollout.batch={settings.rollout.batch}: it decodes nothing, leave it out")
     if settings.deviation_every > 0:
         raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
     if settings.chunk:
@@ -188,6 +192,17 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
             decoder = Sampled(decoder, reference, settings.deviation_every)
     warm_up(decoder, task, spec, settings.world.camera.size)
     return decoder
+
+
+def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
+    """The decoder of one setting for several episodes, of any tasks.
+
+    Raises:
+        UsageError, CheckpointError: as `check`.
+    """
+    artifacts = artifacts_of(settings)
+    decoder = compose(settings.parts(), artifacts.target, artifacts.load, chunk=settings.chunk)
+    return BatchDecoder(decoder, settings.deviation_every)
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:

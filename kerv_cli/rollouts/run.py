@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
+from kerv_cli.decoding.batched import BatchDecoder
 from kerv_cli.decoding.build import is_parallel
 from kerv_cli.decoding.decoder import Decoder, Parts
 from kerv_cli.decoding.record import EpisodeRecord
@@ -20,8 +21,11 @@ from kerv_cli.environments.stress import NO_STRESS, Stress
 from kerv_cli.environments.stress import build as build_stress
 from kerv_cli.environments.world import EpisodeWorld
 from kerv_cli.rollouts.episode import ActionDecoder, run_episode
-from kerv_cli.rollouts.policy import clock_for, decoder_for
+from kerv_cli.rollouts.policy import batch_decoder_for, clock_for, decoder_for
+from kerv_cli.rollouts.together import Ended, Wanted, run_together
 from kerv_cli.settings import CameraSettings, RolloutSettings, WorldSettings
+
+K = TypeVar("K", bound=Hashable)
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:
@@ -29,7 +33,10 @@ def camera_config(settings: CameraSettings) -> CameraConfig:
     return CameraConfig(**dataclasses.asdict(settings))
 
 
-_WORLDS = 4  # kept open per process: fifty would take 1.2 GB
+TOGETHER = 16
+"""Episodes that a training's validation decodes together. Their worlds take 1.5 GB where they are drawn."""
+
+_WORLDS = 4  # kept open per process: one that is drawn takes about 90 MB
 _opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the most recently used one is last
 
 
@@ -42,7 +49,15 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
     _opened.move_to_end(key)
     while len(_opened) > _WORLDS:
         _opened.popitem(last=False)[1].close()
-    world = _opened[key]
+    return _stressed(_opened[key], stress)
+
+
+def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
+    """As `open_world`, but a world of its own, which whoever asked for it closes."""
+    return _stressed(spec_of(task).open_world(task, camera_config(settings.camera), settings.horizon), stress)
+
+
+def _stressed(world: World, stress: Stress) -> World:
     if isinstance(world, EpisodeWorld):
         world.stress = stress
     return world
@@ -106,6 +121,19 @@ class Watched:
         self.decoder.finish(success)
 
 
+def run_batch(settings: RolloutSettings, wanted: Iterable[Wanted[K]]) -> Iterator[Ended[K]]:
+    """Runs episodes of one setting on any tasks, `rollout.batch` at a time; see `run_together`. None is recorded.
+
+    Raises:
+        UsageError, CheckpointError: the setting cannot run; see `policy.check`.
+    """
+
+    def opened(task: str) -> World:
+        return new_world(task, settings.world, build_stress(settings.world.stress))
+
+    return run_together(batch_decoder_for(settings), wanted, settings.rollout.batch, opened)
+
+
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
     """Runs one setting on one task, seed by seed; `is_recorded` says which episodes keep frames."""
     runner = Runner(settings, task)
@@ -114,14 +142,21 @@ def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iter
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
-    """Whether the episode of a seed keeps its frames: the first `settings.record`, or all for a negative number."""
+    """Whether the episode of a seed keeps its frames: the first `settings.record`, or all for a negative number; none
+    of a batch."""
+    if settings.rollout.batch > 1:
+        return False
     return settings.record < 0 or seed - settings.seed < settings.record
 
 
 def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to:
-    autoregressively or in parallel. Closes the worlds."""
-    decoder = Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
-    outcomes = [run_episode(open_world(task, settings), decoder, seed).success for task in tasks for seed in seeds]
-    close_worlds()
+    """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to,
+    autoregressively or in parallel, TOGETHER at a time."""
+    decoder = BatchDecoder(Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None))
+    wanted = [Wanted(None, task, seed) for task in tasks for seed in seeds]
+    outcomes = []
+    for ended in run_together(decoder, wanted, TOGETHER, lambda task: new_world(task, settings)):
+        if isinstance(ended.result, Exception):
+            raise ended.result
+        outcomes.append(ended.result.success)
     return float(np.mean(outcomes))

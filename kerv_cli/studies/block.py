@@ -7,10 +7,10 @@ import math
 import os
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import KervError, StorageError
@@ -24,10 +24,19 @@ RunEpisode = Callable[[int], EpisodeRecord]
 """Runs the episode of a seed."""
 
 Prepare = Callable[[Cell], RunEpisode]
-"""Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls."""
+"""Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls. One
+that can run the cells of a batch is a `Together` too."""
 
 Gauge = Callable[[str], float]
 """Seconds of a fixed workload on a device. Picklable."""
+
+
+@runtime_checkable
+class Together(Protocol):
+    """Runs the episodes of several cells at once."""
+
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+        """Cells of one setting -> each episode as it ends: its cell, its seed, and its record or its error."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,7 @@ class BlockRun:
         except StorageError as error:
             return {self.block.cells[0].id: failed(error)}
         try:
-            return self._take_turns()
+            return self._take_turns() if self.block.batch == 1 else self._together()
         finally:
             release(self.store.claims, self.block.cells, self.name)
 
@@ -96,6 +105,29 @@ class BlockRun:
                     results[turns.pop(place).cell.id] = result
                     if result.storage:
                         return results
+        return results
+
+    def _together(self) -> dict[str, CellResult]:
+        """Runs the cells of a batch; a cell is written as soon as its last episode has ended."""
+        results: dict[str, CellResult] = {}
+        cells = [cell for cell in self.block.cells if not self.store.has_cell(cell.id)]
+        results |= {cell.id: CellResult(reused=True) for cell in self.block.cells if cell not in cells}
+        turns = {cell.id: _Turn(cell, self) for cell in cells}
+        try:
+            if not isinstance(self.prepare, Together):
+                raise TypeError(f"{type(self.prepare).__name__} runs one episode at a time, not {self.block.batch}")
+            note_running(self.store.claims, self.block.cells[0], self.name)
+            for order, (cell, seed, ended) in enumerate(self.prepare.together(cells) if cells else ()):
+                if cell.id in results:
+                    continue  # another of its episodes failed
+                note_running(self.store.claims, cell, self.name)
+                result = turns[cell.id].add(seed, ended, order)
+                if result is not None:
+                    results[cell.id] = result
+                    if result.storage:
+                        return results
+        except Exception as error:  # noqa: BLE001 - what the decodes have in common failed
+            results = dict.fromkeys(turns, failed(error)) | results
         return results
 
 
@@ -134,6 +166,24 @@ class _Turn:
             self.seconds += time.perf_counter() - clock
             return self._write() if len(self.records) == len(self.cell.seeds) else None
         except Exception as error:  # noqa: BLE001 - as above
+            return failed(error)
+
+    def add(self, seed: int, ended: EpisodeRecord | Exception, order: int) -> CellResult | None:
+        """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
+        try:
+            if isinstance(ended, Exception):
+                raise ended
+            now = datetime.now(UTC).timestamp()
+            started = datetime.fromtimestamp(now - ended.wall_seconds, UTC).isoformat(timespec="milliseconds")
+            self.records.append(ended)
+            self.circumstances.append(Circumstances(self.work.name, order, started))
+            self.seconds += ended.wall_seconds
+            if len(self.records) < len(self.cell.seeds):
+                return None
+            both = sorted(zip(self.records, self.circumstances, strict=True), key=lambda pair: pair[0].seed)
+            self.records, self.circumstances = [record for record, _ in both], [at for _, at in both]
+            return self._write()
+        except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
             return failed(error)
 
     @property

@@ -45,5 +45,5 @@ def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_secon
     means = {label: seconds[label] / count for label, count in episodes.items()}
     total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
     source = f"measured on {stored} stored episodes" if stored else f"a guess of {prior_seconds:g} s per episode"
-    at_once = max(1, min(workers, len(blocks_of(todo))))
+    at_once = max(1, min(workers, len(blocks_of(todo, workers))))
     return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), bool(stored), source)

@@ -81,6 +81,7 @@ class _Sweep:
         self.prepare, self.store, self.on_event, self.gauge = prepare, store, on_event, gauge
         self.outcome = events.Outcome()
         self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+        self.workers = runtime.workers
         self.status = {"workers": runtime.workers, "executor": runtime.executor, "git_commit": git_commit()}
         self.waiting: deque[Block] = deque()
         self.elsewhere: list[Block] = []  # another sweep computes them
@@ -89,7 +90,7 @@ class _Sweep:
     def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
         """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
         damaged: dict[str, tuple[Cell, CellResult]] = {}
-        for block in blocks_of(cells):
+        for block in blocks_of(cells, self.workers):
             adopt(self.store, block)
         for cell in (cell for block in blocks_of(cells) for cell in block.cells):
             try:
@@ -98,7 +99,7 @@ class _Sweep:
             except CheckpointError as error:
                 damaged[cell.id] = cell, failed(error)
         settled = {*damaged, *(cell.id for cell in self.outcome.reused)}
-        left = [block.without(settled) for block in blocks_of(cells)]
+        left = [block.without(settled) for block in blocks_of(cells, self.workers)]
         return [block for block in left if block is not None], list(damaged.values())
 
     def run(self, blocks: Sequence[Block], executor: Executor) -> None:

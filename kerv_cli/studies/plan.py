@@ -24,6 +24,9 @@ MOST_CELLS = 100_000
 MOST_SEEDS = 10_000
 """Seeds of a cell, at most `study.block` of them."""
 
+FULL_BATCHES = 16
+"""A block of a batch has so many times as many episodes as run at once: at its end places stay empty."""
+
 OBSERVATION = "observation"
 """Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
@@ -52,7 +55,10 @@ class Cell:
 @dataclass(frozen=True)
 class Block:
     """Cells of one task, the same seeds and one repeat: the unit that an executor runs. Its settings take turns in one
-    process, episode by episode, so that compared episodes are measured one after the other."""
+    process, episode by episode, so that compared episodes are measured one after the other.
+
+    Cells of a batch are of one setting instead, of any tasks and seeds; `task` and `seeds` are those of the first.
+    """
 
     cells: tuple[Cell, ...]  # at least one; each id once
 
@@ -70,6 +76,18 @@ class Block:
     def repeat(self) -> int:
         """Which of the study's repeats, from 0."""
         return self.cells[0].repeat
+
+    @property
+    def batch(self) -> int:
+        """Episodes that run at the same time."""
+        return batch_of(self.cells[0].settings)
+
+    @property
+    def title(self) -> str:
+        """What it is, in a few words."""
+        if self.batch == 1:
+            return f"{self.name}: {len(self.cells)} settings in turn"
+        return f"{self.cells[0].label} from {self.name} on: {_episodes(self.cells)} episodes, {self.batch} at a time"
 
     @property
     def name(self) -> str:
@@ -134,6 +152,11 @@ def stress_of(settings: Mapping[str, Any]) -> dict[str, Any]:
     stress = settings["world"].get("stress", {})
     level = int(stress.get("level", 0))
     return {"kind": stress["kind"] if level else "none", "level": level}
+
+
+def batch_of(settings: Mapping[str, Any]) -> int:
+    """Episodes that run at the same time in plain RolloutSettings; with more than one they have no times."""
+    return int(settings.get("rollout", {}).get("batch", 1))
 
 
 def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
@@ -210,14 +233,37 @@ def _seed_blocks(settings: RolloutSettings, size: int) -> Iterator[range]:
     return (range(first, min(first + size, end)) for first in range(settings.seed, end, size))
 
 
-def blocks_of(cells: Iterable[Cell]) -> list[Block]:
+def blocks_of(cells: Iterable[Cell], workers: int = 1) -> list[Block]:
     """The cells grouped by task, seeds, repeat and threads (a process has one number of them), in the order of their
-    first cells; each id once."""
+    first cells; each id once. Those of a batch are grouped by setting, into as many blocks as there are workers or
+    more."""
     found: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in unique_cells(cells):
-        key = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
+        key: tuple[Any, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
+        if batch_of(cell.settings) > 1:
+            key = (json.dumps([without(cell.settings, {"task"}), cell.identity], sort_keys=True), cell.repeat)
         found.setdefault(key, []).append(cell)
-    return [Block(tuple(group)) for group in found.values()]
+    return [Block(tuple(part)) for group in found.values() for part in _parts(group, workers)]
+
+
+def _parts(group: Sequence[Cell], workers: int) -> Iterator[list[Cell]]:
+    """The cells of one block; those of a batch in parts of as many episodes as keep every worker's batch full."""
+    batch = batch_of(group[0].settings)
+    if batch == 1:
+        yield list(group)
+        return
+    most = min(FULL_BATCHES * batch, -(-_episodes(group) // workers))
+    part: list[Cell] = []
+    for cell in group:
+        if part and _episodes(part) + len(cell.seeds) > most:
+            yield part
+            part = []
+        part.append(cell)
+    yield part
+
+
+def _episodes(cells: Iterable[Cell]) -> int:
+    return sum(len(cell.seeds) for cell in cells)
 
 
 def unique_cells(cells: Iterable[Cell]) -> list[Cell]:

@@ -107,7 +107,7 @@ class ProgressDisplay:
     def _refresh(self) -> None:
         if self._bar is None:
             return
-        names = [f"{name}: {len(block.cells)} settings in turn" for name, block in self._running.items()]
+        names = [block.title for block in self._running.values()]
         more = f" +{len(names) - 1}" if len(names) > 1 else ""
         now = escape(names[0] + more if names else "cells")
         done = self._finished + sum(self._parts.values())

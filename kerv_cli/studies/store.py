@@ -200,6 +200,7 @@ class StudyStore:
             "episodes": len(records),
             "successes": sum(r.success for r in records),
             "wall_seconds": sum(r.wall_seconds for r in records),
+            "timed": all(r.timed for r in records),
             "started": circumstances[0].started,
             **status,
             "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},

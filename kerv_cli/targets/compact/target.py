@@ -11,7 +11,7 @@ privileged, to separate decoding from perception.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -190,6 +190,16 @@ class CompactTarget(Packable):
     def encode(self, observation: Observation) -> Tensor:
         """The prompt's embeddings (1, P, E); errors as `inputs`."""
         return self.encode_batch(self.inputs(observation))[0]
+
+    def encode_many(self, observations: Sequence[Observation]) -> Tensor:
+        """The prompts' embeddings (B, P, E); errors as `inputs`. One image after the other where packed weights encode
+        it: measured as fast as a batch of eight, faster than a larger one."""
+        if self.packed is not None:
+            return torch.cat([self.encode(observation) for observation in observations])
+        found = [self.inputs(observation) for observation in observations]
+        images = [one.images for one in found if one.images is not None]
+        rows = (torch.cat([getattr(one, name) for one in found]) for name in ("proprioception", "states", "words"))
+        return self.encode_batch(Inputs(torch.cat(images) if images else None, *rows))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Prompt embeddings (B, P, E), and the positions of the places (B, K, 3) in metres that their scene tokens

@@ -1,0 +1,416 @@
+"""Episodes whose decodes are computed together: tokens as one by one, no times, and no speedups made of them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from examples.own_target import MockTarget
+from studies_synthetic import episode, threshold_settings, threshold_study
+from test_episode import settings
+from test_parallel import some_observation, target
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.bench.sequences import read_study
+from kerv_cli.decoding.batched import BatchDecoder, Lane
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import EarlyProposer
+from kerv_cli.decoding.record import UNTIMED, EpisodeRecord
+from kerv_cli.decoding.thresholds import Fixed
+from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass
+from kerv_cli.drafting.early import EarlyDrafter
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.errors import KervError, UsageError
+from kerv_cli.reporting.plots import study_figures
+from kerv_cli.reporting.summary import summary_frame
+from kerv_cli.reporting.tables import load_study, study_table
+from kerv_cli.rollouts import policy as policies_of
+from kerv_cli.rollouts import run
+from kerv_cli.rollouts.cells import CellRunner
+from kerv_cli.rollouts.together import Wanted, run_together
+from kerv_cli.settings import DrafterSettings, RuntimeSettings
+from kerv_cli.spaces import Observation
+from kerv_cli.studies.block import RunEpisode
+from kerv_cli.studies.execute import execute
+from kerv_cli.studies.plan import Cell, blocks_of, make_cell
+from kerv_cli.studies.store import StudyStore
+
+HOME = np.zeros(3)
+
+
+def shown(count: int) -> list[Observation]:
+    """Observations with instructions of one word to four."""
+    words = ["pull", "pull the", "pull the drawer", "pull the drawer open"]
+    return [
+        Observation(o.proprioception, o.state, words[i % 4], {})
+        for i, o in enumerate(map(some_observation, range(count)))
+    ]
+
+
+def decoded(decoder: Decoder, observations: Sequence[Observation], history: int = 0) -> tuple[list[Any], list[Any]]:
+    """The records of a decoder's decodes, one by one and together, after `history` executed actions."""
+    together = BatchDecoder(decoder)
+    lanes, alone = [], []
+    for place, observation in enumerate(observations):
+        lane = together.lane()
+        for follower in (decoder, lane):
+            follower.reset("", 0, HOME)
+            for step in range(history):
+                follower.observe(np.full(4, 0.05 * place - 0.1 * step), HOME)
+        alone.append(decoder.decode(observation))
+        lanes.append(lane)
+    return alone, together.decode(lanes, observations)
+
+
+def same(alone: Sequence[Any], together: Sequence[Any]) -> None:
+    for one, other in zip(alone, together, strict=True):
+        assert one.tokens == other.tokens
+        assert (one.actions == other.actions).all()
+        assert (one.forwards, one.rounds, one.mode) == (other.forwards, other.rounds, other.mode)
+        assert (one.size, one.skipped, one.unverified) == (other.size, other.skipped, other.unverified)
+        assert math.isnan(other.seconds)
+        assert not math.isnan(one.seconds)
+        assert other.phases.keys() == one.phases.keys()
+        assert all(map(math.isnan, other.phases.values()))
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("batch", [1, 2, 7])
+def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, batch: int) -> None:
+    policy = target()
+    if packed:
+        policy.requires_grad_(False)
+        policy.pack()
+        assert policy.trunk.packed is not None
+    alone, together = decoded(Decoder(policy), shown(batch))
+    assert len({one.tokens for one in alone}) > batch / 2
+    same(alone, together)
+
+
+def test_a_shorter_chunk_and_a_smaller_batch_after_a_larger_one() -> None:
+    policy = target()
+    for count in (3, 1, 2):
+        same(*decoded(Decoder(policy, chunk=1), shown(count)))
+
+
+def test_parallel_passes_of_a_batch_are_those_of_its_rows() -> None:
+    policy = target("target.parallel=true")
+    same(*decoded(Decoder(policy, Parts(skip=ParallelPass(policy))), shown(5)))
+
+
+@pytest.mark.parametrize(("radius", "history"), [(0, 0), (9, 1), (9, 30)])
+def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, history: int) -> None:
+    policy = target()
+    torch.manual_seed(3)
+    drafter = EarlyDrafter.beside(DrafterSettings(width=32, layers=1), policy).eval()
+    torch.nn.init.normal_(drafter.head.weight, std=1.0)
+    draft = EarlyProposer(drafter, policy)
+    parts = Parts(prefill_draft=draft, skip=AlwaysSkip(draft), threshold=Fixed(radius))
+    alone, together = decoded(Decoder(policy, parts), shown(4), history)
+    same(alone, together)
+    assert len({one.tokens for one in alone}) == 4
+    assert {one.mode for one in together} == {"skip"}
+
+
+def test_prompts_of_different_lengths_are_decoded_apart() -> None:
+    policy = MockTarget()
+    seen = [Observation(np.array([0.1 * i]), np.zeros(0), "on " * (i % 3)) for i in range(6)]
+    assert len({policy.encode(one).shape[1] for one in seen}) == 3
+    alone = Decoder(policy)
+    together = BatchDecoder(alone)
+    found = together.decode([together.lane() for _ in seen], seen)
+    for one, record in zip(seen, found, strict=True):
+        alone.reset("", 0, HOME)
+        assert alone.decode(one).tokens == record.tokens
+
+
+# --- episodes
+
+
+class Stub:
+    """A world that ends after `seed % 7` steps. opened, closed: of all of them, by task."""
+
+    opened: list[str]
+    closed: list[str]
+
+    def __init__(self, task: str) -> None:
+        self.spec, self.task, self.instruction, self.horizon = SPEC, task, "pull", 9
+        self.steps, self.success, self.succeeded, self.length = 0, False, False, 0
+        Stub.opened.append(task)
+
+    def reset(self, seed: int) -> None:
+        if seed == 13:
+            raise RuntimeError("the table broke")
+        self.steps, self.length = 0, seed % 7
+
+    def step(self, action: np.ndarray) -> None:
+        self.steps += 1
+
+    def observe(self, cameras: Sequence[str]) -> Observation:
+        return some_observation(self.steps)
+
+    def close(self) -> None:
+        Stub.closed.append(self.task)
+
+    @property
+    def done(self) -> bool:
+        return self.steps >= self.length
+
+    end_effector, gripper, initial_state = HOME, 1.0, HOME
+
+
+@pytest.fixture
+def stubs() -> type[Stub]:
+    Stub.opened, Stub.closed = [], []
+    return Stub
+
+
+class Forwards(BatchDecoder):
+    """Notes how many episodes each decode had."""
+
+    def decode(self, lanes: Sequence[Lane], observations: Sequence[Observation]) -> list[Any]:
+        self.sizes.append(len(lanes))
+        return super().decode(lanes, observations)
+
+
+def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs: type[Stub]) -> None:
+    decoder = Forwards(Decoder(target(), chunk=1))
+    decoder.sizes = []
+    wanted = [Wanted((task, seed), task, seed) for task in ("a", "b", "c") for seed in range(1, 7)]
+    ended = list(run_together(decoder, wanted, 4, stubs))
+    assert sorted(one.wanted.key for one in ended) == sorted(one.key for one in wanted)
+    for one in ended:
+        assert isinstance(one.result, EpisodeRecord)
+        assert (one.result.task, one.result.seed) == one.wanted.key
+        assert one.result.steps == one.wanted.seed
+        assert not one.result.timed
+        assert one.result.wall_seconds > 0
+    assert sum(decoder.sizes) == 3 * sum(range(1, 7))
+    assert decoder.sizes[:10] == [4] * 10
+    assert sorted(decoder.sizes, reverse=True) == decoder.sizes  # full until nothing waits
+    assert sorted(stubs.opened) == sorted(stubs.closed)
+    assert len(stubs.opened) <= 3 + 3
+
+
+def test_a_world_that_fails_ends_its_own_episode(stubs: type[Stub]) -> None:
+    wanted = [Wanted(seed, "a", seed) for seed in (10, 11, 12, 13, 15)]
+    decoder = BatchDecoder(Decoder(target(), chunk=1))
+    ended = {one.wanted.key: one.result for one in run_together(decoder, wanted, 2, stubs)}
+    assert str(ended.pop(13)) == "the table broke"
+    assert {seed: record.steps for seed, record in ended.items()} == {10: 3, 11: 4, 12: 5, 15: 1}
+    assert sorted(stubs.opened) == sorted(stubs.closed)
+
+
+def test_stopping_early_closes_the_worlds(stubs: type[Stub]) -> None:
+    running = run_together(BatchDecoder(Decoder(target(), chunk=1)), [Wanted(0, "a", 1), Wanted(1, "b", 6)], 2, stubs)
+    next(running)
+    running.close()
+    assert sorted(stubs.opened) == sorted(stubs.closed) == ["a", "b"]
+
+
+# --- real episodes
+
+
+@pytest.mark.parametrize("policy", ["nano-state", "nano-vision"])
+def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, policy: str) -> None:
+    words = [f"policy.target={policy}", "deviation_every=2"]
+    tasks, seeds = ("drawer-open-v3", "reach-v3"), range(100_000, 100_002)
+    alone = {
+        (task, record.seed): record
+        for task in tasks
+        for record in run.run_task(settings(policies, *words), task, seeds)
+    }
+    wanted = [Wanted(None, task, seed) for task in tasks for seed in seeds]
+    together = [ended.result for ended in run.run_batch(settings(policies, *words, "rollout.batch=3"), wanted)]
+    assert len(together) == len(alone)
+    for record in together:
+        assert isinstance(record, EpisodeRecord)
+        one = alone[record.task, record.seed]
+        assert [d.tokens for d in record.decodes] == [d.tokens for d in one.decodes]
+        assert [d.deviation for d in record.decodes] == [d.deviation for d in one.decodes] == [None, 0.0, None]
+        assert (record.success, record.steps, record.decode_steps) == (one.success, one.steps, one.decode_steps)
+        assert (record.actions == one.actions).all()
+        assert (record.path == one.path).all()
+        assert (record.initial_state == one.initial_state).all()
+
+
+def test_what_cannot_be_batched_is_refused(policies: Path) -> None:
+    target, batch = "policy.target=nano-state", "rollout.batch=8"
+    with pytest.raises(UsageError, match="method=spec_vla: ar, early_unverified and parallel alone"):
+        policies_of.check(settings(policies, target, batch, "method=spec_vla"))
+    with pytest.raises(UsageError, match="threshold=schedule: its radius follows one episode"):
+        policies_of.check(settings(policies, target, batch, "method=early_unverified", "threshold=schedule"))
+    with pytest.raises(UsageError, match="policy=expert with rollout"):
+        policies_of.check(settings(policies, batch, "policy=expert"))
+    with pytest.raises(UsageError, match="clock=real: decodes of a batch have no times"):
+        settings(policies, target, batch, "rollout.clock=real")
+    policies_of.check(settings(policies, target, batch, "threshold=schedule"))  # nothing is drafted
+
+
+# --- studies
+
+
+def batched(cell: Cell, batch: int = 4) -> Cell:
+    plain = {**cell.settings, "rollout": {**cell.settings["rollout"], "batch": batch}}
+    return make_cell(cell.label, cell.overrides, plain, cell.identity, cell.task, cell.seeds, cell.repeat)
+
+
+def untimed(cell: Cell, seed: int) -> EpisodeRecord:
+    record = episode(cell, seed)
+    return replace(record, decodes=tuple(replace(d, seconds=math.nan, phases=dict(UNTIMED)) for d in record.decodes))
+
+
+class Prepared:
+    """Runs cells in turn, and those of a batch together, the last seed first."""
+
+    def __init__(self, broken: str = "") -> None:
+        self.broken, self.groups = broken, []
+
+    def __call__(self, cell: Cell) -> RunEpisode:
+        return lambda seed: episode(cell, seed)
+
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+        self.groups.append(len(cells))
+        if self.broken == "all":
+            raise KervError("no such policy")
+        for cell in reversed(cells):
+            for seed in reversed(cell.seeds):
+                yield cell, seed, KervError("it fell") if cell.task == self.broken else untimed(cell, seed)
+
+
+TASKS = ["reach-v3", "push-v3", "drawer-open-v3"]
+
+
+def ar_cells() -> list[Cell]:
+    return [batched(cell) for cell in threshold_study(TASKS, episodes=7) if cell.label == "ar"]
+
+
+def test_a_batch_is_another_cell_and_has_no_times(tmp_path: Path) -> None:
+    cells = ar_cells()
+    assert not {cell.id for cell in cells} & {cell.id for cell in threshold_study(TASKS, episodes=7)}
+    store, run_cells = StudyStore(tmp_path, "threshold"), Prepared()
+    outcome = execute(cells[:2], run_cells, store)
+    assert len(outcome.done) == 2
+    outcome = execute(cells, run_cells, store)
+    assert (len(outcome.reused), len(outcome.done), run_cells.groups) == (2, 4, [2, 4])
+    stored = store.read_cell(cells[0].id)
+    assert stored.status["timed"] is False
+    assert stored.status["wall_seconds"] > 0
+    assert list(stored.episodes["seed"]) == list(cells[0].seeds)
+    assert stored.episodes["seconds"].isna().all()
+    assert stored.episodes["seconds.prefill"].isna().all()
+    assert stored.episodes["order"].is_unique
+    assert (stored.episodes["forwards"] > 0).all()
+
+
+def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers() -> None:
+    cells, timed = ar_cells(), threshold_study(TASKS, episodes=7)
+    (block,) = blocks_of(cells)
+    assert {cell.task for cell in block.cells} == set(TASKS)
+    assert "21 episodes, 4 at a time" in block.title
+    assert len(blocks_of(cells, workers=3)) == 3
+    many = [batched(cell, 2) for cell in threshold_study(TASKS, episodes=60) if cell.label == "ar"]
+    assert max(sum(len(cell.seeds) for cell in part.cells) for part in blocks_of(many)) == 30
+    mixed = blocks_of([*cells, *timed])
+    assert {block.batch for block in mixed} == {1, 4}
+    assert all(len({cell.settings["rollout"]["batch"] for cell in block.cells}) == 1 for block in mixed)
+
+
+def test_a_failure_in_a_batch_is_its_cells_own_unless_all_fail(tmp_path: Path) -> None:
+    cells, store = ar_cells(), StudyStore(tmp_path, "threshold")
+    outcome = execute(cells, Prepared(broken="all"), store)
+    assert [failure.reason for failure in outcome.failed] == ["no such policy"] * len(cells)
+    outcome = execute(cells, Prepared(broken="push-v3"), store)
+    assert {(failure.cell.task, failure.reason) for failure in outcome.failed} == {("push-v3", "it fell")}
+    assert {cell.task for cell in outcome.done} == {"reach-v3", "drawer-open-v3"}
+    assert len(execute(cells, Prepared(), store, RuntimeSettings()).done) == 2
+
+
+@pytest.mark.parametrize("which", ["baseline", "method", "both"])
+def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) -> None:
+    cells = [
+        batched(cell) if which == "both" or (which == "baseline") == (cell.label == "ar") else cell
+        for cell in threshold_study(TASKS)
+    ]
+    store = StudyStore(tmp_path, "threshold")
+    store.write_plan(threshold_settings(), cells)
+    execute(cells, Prepared(), store)
+    table = study_table(load_study(store))
+    methods = table[table["label"] != "ar"]
+    for name in ("speedup", "speedup_low", "episode_speedup", "ceiling"):
+        assert methods[name].isna().all()
+    assert table.loc[table["rollout.batch"] > 1, "time_per_step_ms"].isna().all()
+    assert table.loc[table["rollout.batch"] > 1, "latency_p50_ms"].isna().all()
+    assert table.loc[table["rollout.batch"] == 1, "time_per_step_ms"].notna().all()
+    assert (methods["pairs"] > 0).all()
+    assert methods["success"].notna().all()
+    printed = summary_frame(table).set_index("setting")
+    assert (printed.loc[methods["label"], "speedup"] == "–").all()
+    assert printed.loc["ar", "speedup"] == ("1" if which == "method" else "–")
+    assert study_figures(table, "threshold.r", "threshold")
+
+
+def test_replay_refuses_decodes_without_host_times(tmp_path: Path) -> None:
+    cells, store = ar_cells(), StudyStore(tmp_path, "threshold")
+    store.write_plan(threshold_settings(), cells)
+    execute(cells, Prepared(), store)
+    with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
+        read_study(store, 4, 10)
+
+
+# --- the command
+
+
+def test_a_rollout_in_batches_prints_success_and_goes_on_where_it_was(
+    policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = tmp_path / "results"
+    shutil.copytree(policies / "artifacts", results / "artifacts")
+    words = ["policy=state", "policy.target=nano-state", "task=reach-v3,push-v3", "world.horizon=8"]
+    command = ["rollout", "method=ar", "episodes=3", "rollout.batch=4", *words, f"results={results}"]
+    original = CellRunner.together
+
+    def interrupted(self: CellRunner, cells: Sequence[Any]) -> Iterator[Any]:
+        yield from itertools.islice(original(self, cells), 2)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(CellRunner, "together", interrupted)
+    stopped = CliRunner().invoke(app, command)
+    assert stopped.exit_code == 130
+    assert "2 of 6 episodes are kept" in stopped.stderr
+    monkeypatch.setattr(CellRunner, "together", original)
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 0, again.output
+    assert "2 of 6 episodes are there" in again.stderr
+    assert "not timed: 4 episodes at a time" in again.stdout
+    assert "time by phase" not in again.stdout
+    for name in ("reach-v3", "push-v3", "all"):
+        assert re.search(rf"{name} .*/[36] .*–", again.stdout), again.stdout
+    assert not list(results.glob("rollouts/*/rollouts/*.rrd"))
+    alone = CliRunner().invoke(app, [*command, "rollout.batch=1", "--json"])
+    together = CliRunner().invoke(app, [*command, "--json"])
+    both = [json.loads(run.stdout) for run in (alone, together)]
+    for a, b in zip(both[0]["tasks"], both[1]["tasks"], strict=True):
+        assert [a[name] for name in ("task", "successes", "steps", "decodes", "forwards_per_step")] == [
+            b[name] for name in ("task", "successes", "steps", "decodes", "forwards_per_step")
+        ]
+        assert a["time_per_step_ms"] > 0
+        assert b["time_per_step_ms"] is None
+
+
+def test_a_batch_refuses_a_method_in_one_line(policies: Path) -> None:
+    words = ["policy=state", "policy.target=nano-state", f"results={policies}", "method=naive_sd", "rollout.batch=4"]
+    run = CliRunner().invoke(app, ["rollout", *words])
+    assert run.exit_code == 2
+    assert "rollout.batch=4 with method=naive_sd: ar, early_unverified and parallel alone" in run.stderr
