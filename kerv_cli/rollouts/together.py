@@ -50,7 +50,7 @@ def run_together(
     to different tasks as long as there are enough of them, because a world costs more than a reset.
     """
     waiting = _Waiting(wanted)
-    places = [_Place(decoder.lane(), open_world) for _ in range(min(batch, waiting.count))]
+    places: list[_Place[K]] = [_Place(decoder.lane(), open_world) for _ in range(min(batch, waiting.count))]
     try:
         while True:
             for place in places:
