@@ -4,7 +4,7 @@ however many settings of a study share them."""
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,19 +29,56 @@ class Request:
     target: Target | None = None  # loaded, where the artifact is to be loaded for it
 
 
+NOUNS = {"early": "early drafter", "score": "learned score"}
+"""Kinds of artifacts that messages call otherwise."""
+
+
+@dataclass(frozen=True)
+class MadeFrom:
+    """What an artifact was made from: kind -> hash of the target or artifact that it names as a source.
+
+    what: the artifact in messages. made: e.g. trained. again: the remedy.
+    """
+
+    what: str
+    made: str
+    again: str
+    hashes: Mapping[str, str]
+
+    def check_same(self, used: Mapping[str, str]) -> None:
+        """Refuses the artifact beside other sources than its own. used: kind -> hash of what is in use; a source of a
+        kind that is not in use does not matter.
+
+        Raises:
+            CheckpointError: one of its sources is in use with another hash.
+        """
+        for kind, digest in self.hashes.items():
+            if used.get(kind, digest) != digest:
+                raise CheckpointError(
+                    f"{self.what} was {self.made} for {NOUNS.get(kind, kind)} {digest[:12]}, not for "
+                    f"{used[kind][:12]}: {self.again}"
+                )
+
+
+def no_sources(path: Path) -> MadeFrom:
+    """Of a kind that is made from target and demonstrations alone."""
+    return MadeFrom("", "", "", {})
+
+
 @dataclass(frozen=True)
 class Artifact:
     """One kind of artifact.
 
     place: (results, name or None, the target's folder) -> its path; None names the one beside the target. check: (path,
     request) -> its hash, or CheckpointError where it is missing, damaged or another target's. load: (path, request) ->
-    the loaded artifact.
+    the loaded artifact. sources: path of a checked one -> the other artifacts that it was made from.
     """
 
     kind: str
     place: Callable[[str, str | None, Path], Path]
     check: Callable[[Path, Request], str]
     load: Callable[[Path, Request], Any]
+    sources: Callable[[Path], MadeFrom] = no_sources
 
 
 def artifact_folder(kind: str) -> Callable[[str, str | None, Path], Path]:
@@ -70,10 +107,7 @@ class MadeFor:
         self.actions.check_same(target.actions, what, "the target", statistics=True)
         if self.chunk != target.chunk:
             raise CheckpointError(f"{what} was {made} for chunks of {self.chunk} steps, not of {target.chunk}: {again}")
-        if self.sha256 != target.sha256:
-            raise CheckpointError(
-                f"{what} was {made} for target {self.sha256[:12]}, not for {target.sha256[:12]}: {again}"
-            )
+        MadeFrom(what, made, again, {"target": self.sha256}).check_same({"target": target.sha256})
 
 
 class Artifacts:
@@ -108,11 +142,15 @@ class Artifacts:
         """Kind -> hash, of the target and of `kinds`.
 
         Raises:
-            CheckpointError: one is missing, damaged, or was made for another target.
+            CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
+                one among `kinds`.
         """
-        request = Request(self.description, self.search)
+        request, wanted = Request(self.description, self.search), tuple(kinds)
         found = {"target": self.description.sha256}
-        return found | {kind: _kind(kind).check(self.place(kind), request) for kind in kinds}
+        found |= {kind: _kind(kind).check(self.place(kind), request) for kind in wanted}
+        for kind in wanted:
+            _kind(kind).sources(self.place(kind)).check_same(found)
+        return found
 
     def load(self, kind: str) -> Any:
         """The artifact, for the loaded target; one object per process.

@@ -13,14 +13,23 @@ from typing import Any
 import pytest
 from test_calibration import TASKS, write_dataset
 
-from kerv_cli.artifacts import Artifacts
+from kerv_cli.artifacts import Artifacts, MadeFor
 from kerv_cli.config import compose
+from kerv_cli.decoding.risk_file import RiskManifest, save_risk
 from kerv_cli.drafting.datastore import Datastore
 from kerv_cli.drafting.eagle import Drafter
+from kerv_cli.drafting.early import EarlyDrafter, save_early
+from kerv_cli.drafting.learned_score import LearnedScore, save_score
 from kerv_cli.errors import CheckpointError, UnknownName
 from kerv_cli.parts import QdrantSearchSettings
 from kerv_cli.rollouts.policy import check, decoder_for, identity_of, unseen_tasks
-from kerv_cli.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings, RolloutSettings
+from kerv_cli.settings import (
+    BuildDatastoreSettings,
+    CalibrateSettings,
+    DrafterSettings,
+    PolicySettings,
+    RolloutSettings,
+)
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
@@ -171,3 +180,86 @@ def test_a_provenance_that_says_nothing_of_tasks_is_no_warning(results: Path, se
     path.write_text(json.dumps(described))
     asked = RolloutSettings(results=str(results), policy=PolicySettings(target="nano-state"))
     assert unseen_tasks(asked, ["reach-v3"]) == []
+
+
+# --- one rule for every artifact that names a source
+
+OTHER = "f" * 64
+
+
+def renamed_source(results: Path, kind: str, source: str) -> None:
+    """The artifact `kind` as if it had been made from another `source`, nothing else changed."""
+    path = results / "artifacts" / kind / "nano-state" / FILES[kind]
+    described = json.loads(path.read_text())
+    if source == "target" and isinstance(described["target"], dict):
+        described["target"]["sha256"] = OTHER
+    elif source == "target":
+        described["target"] = OTHER
+    else:
+        described["made_from"] = {source: OTHER}
+    path.write_text(json.dumps(described))
+
+
+FILES = {
+    "drafter": "drafter.json",
+    "early": "early.json",
+    "datastore": "manifest.json",
+    "calibration": "calibration.json",
+    "risk": "risk.json",
+    "score": "score.json",
+}
+
+
+@pytest.fixture(scope="module")
+def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `whole`, with an early drafter, a recorded risk and a learned score of it."""
+    results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
+    target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
+    drafter = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
+    early = save_early(results / "artifacts/early/nano-state", drafter, described.sha256, {})
+    made_for = MadeFor(described.sha256, described.actions, described.chunk)
+    store = Artifacts(str(results), PolicySettings(target="nano-state")).check(["datastore"])["datastore"]
+    model, read = LearnedScore(["odds"], 4), {"early": early, "datastore": store}
+    score = save_score(results / "artifacts/score/nano-state", model, made_for, ("early", early), read, {})
+    rows = [{"source": "early", "task": "reach-v3", "seed": 50_000, "index": 0, "loss": 0.0, "score.odds": 0.0}]
+    manifest = RiskManifest(
+        made_for, {"early": early}, 0.1, {"reach-v3": [50_000]}, ["odds"], {}, made_from={**read, "score": score}
+    )
+    save_risk(results / "artifacts/risk/nano-state", manifest, rows)
+    return results
+
+
+@pytest.mark.parametrize(
+    ("kind", "source"),
+    [
+        *((kind, "target") for kind in FILES),
+        *(("score", source) for source in ("early", "datastore")),
+        *(("risk", source) for source in ("early", "datastore", "score")),
+    ],
+)
+def test_an_artifact_of_another_source_is_refused(complete: Path, tmp_path: Path, kind: str, source: str) -> None:
+    results = Path(shutil.copytree(complete, tmp_path / "results"))
+    files = Artifacts(str(results), PolicySettings(target="nano-state"))
+    assert set(files.check(FILES)) == {"target", *FILES}
+    renamed_source(results, kind, source)
+    message = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build)"
+    with pytest.raises(CheckpointError, match=message) as refused:
+        files.check(FILES)
+    assert "\n" not in str(refused.value)
+    if source != "target":
+        files.check([name for name in FILES if name != source])  # what is not in use does not matter
+
+
+def test_a_score_and_a_risk_of_before_name_the_early_drafter(complete: Path, tmp_path: Path) -> None:
+    results = Path(shutil.copytree(complete, tmp_path / "results"))
+    for kind, key in (("score", "source_sha256"), ("risk", "sources")):
+        path = results / "artifacts" / kind / "nano-state" / FILES[kind]
+        described = json.loads(path.read_text())
+        del described["made_from"]
+        path.write_text(json.dumps(described))
+        files = Artifacts(str(results), PolicySettings(target="nano-state"))
+        files.check([kind, "early", "datastore"])
+        described[key] = {"early": OTHER} if kind == "risk" else OTHER
+        path.write_text(json.dumps(described))
+        with pytest.raises(CheckpointError, match=f"for early drafter {OTHER[:12]}"):
+            files.check([kind, "early"])

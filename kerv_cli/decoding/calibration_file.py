@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from kerv_cli.artifacts import Artifact, MadeFor, Request
+from kerv_cli.artifacts import Artifact, MadeFor, MadeFrom, Request
 from kerv_cli.decoding.boundary import LEAST, BoundaryRanges
 from kerv_cli.drafting.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 from kerv_cli.errors import CheckpointError
@@ -154,11 +154,8 @@ class Calibration:
         """
         if self.skip is None:
             raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
-        if self.skip.datastore != datastore:
-            raise CheckpointError(
-                f"the calibration's skip levels are those of datastore {self.skip.datastore[:12]}, not of "
-                f"{datastore[:12]}: {AGAIN}"
-            )
+        section = MadeFrom("the calibration's skip section", "fitted", AGAIN, {"datastore": self.skip.datastore})
+        section.check_same({"datastore": datastore})
         if task not in self.skip.tasks:
             raise CheckpointError(
                 f"the calibration has no skip level for {task}, only for {', '.join(self.skip.tasks)}: {AGAIN}"

@@ -8,7 +8,7 @@ a method is built, so that ε and δ are settings of the method.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,11 +17,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
 from kerv_cli.decoding.certification import Certified, certify, episodes_needed
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import sha256_of, write_folder, write_json
 from kerv_cli.manifests import check_files, read_file
+from kerv_cli.registry import find
 
 FORMAT = 1
 DECODES, FEATURES = "decodes.parquet", "features.npy"
@@ -33,7 +34,8 @@ ROW = [("source", pa.string()), ("task", pa.string()), ("seed", pa.int64()), ("i
 @dataclass(frozen=True)
 class RiskManifest:
     """Description of a recording. sources: what drafted -> hash of its artifact, empty where it has none. scale: ε_a.
-    tasks: task -> seeds, all of them selection seeds. scores: columns. files: name -> SHA-256."""
+    tasks: task -> seeds, all of them selection seeds. scores: columns. files: name -> SHA-256. made_from: what sources
+    and scores read, kind of artifact -> hash; absent from older recordings."""
 
     target: MadeFor
     sources: dict[str, str]
@@ -42,12 +44,24 @@ class RiskManifest:
     scores: list[str]
     files: dict[str, str]
     provenance: dict[str, Any] = field(default_factory=dict)
+    made_from: dict[str, str] = field(default_factory=dict)
     format: Literal[1] = 1
     kind: Literal["risk"] = "risk"
 
     def __post_init__(self) -> None:
         if not self.scale > 0 or not set(self.files) <= {DECODES, FEATURES}:
             raise ValueError("the scale is not above 0, or another file is named")
+
+    @property
+    def artifacts(self) -> dict[str, str]:
+        """Kind -> hash of what was made use of. An older recording names what drafted alone, the early drafter."""
+        return self.made_from or {name: digest for name, digest in self.sources.items() if digest}
+
+    def read_by(self, source: str, scores: Sequence[str]) -> dict[str, str]:
+        """Those of `artifacts` that a source's drafts and these scores read."""
+        parts = [find("proposer", source), *(find("score", name) for name in scores)]
+        wanted = {kind for part in parts for kind in part.needs(None)}
+        return {kind: digest for kind, digest in self.artifacts.items() if kind in wanted}
 
 
 @dataclass(frozen=True)
@@ -113,26 +127,23 @@ class RiskRecording:
                 f"needed, without any loss: {AGAIN} with more episodes"
             )
 
-    def check_sources(self, hashes: Mapping[str, str]) -> None:
-        """Refuses another artifact than the one whose drafts were recorded. hashes: artifact kind -> hash.
 
-        Raises:
-            CheckpointError: it is another one.
-        """
-        for source, digest in self.manifest.sources.items():
-            if digest and hashes.get(source, digest) != digest:
-                raise CheckpointError(
-                    f"the recorded risk is that of {source} {digest[:12]}, not of {hashes[source][:12]}: {AGAIN}"
-                )
+Draw = Callable[[RiskRecording, Path], object]
+"""Draws pictures of a recording into a folder."""
 
 
 def save_risk(
-    folder: Path, manifest: RiskManifest, rows: Sequence[Mapping[str, Any]], features: np.ndarray | None = None
+    folder: Path,
+    manifest: RiskManifest,
+    rows: Sequence[Mapping[str, Any]],
+    features: np.ndarray | None = None,
+    draw: Draw | None = None,
 ) -> RiskRecording:
-    """Writes manifest and decodes atomically -> the recording. features: (n, F) float16, pooled
-    prompts of the first source's decodes."""
+    """Writes manifest, decodes and pictures atomically, in place of all that the folder held -> the recording.
+    features: (n, F) float16, pooled prompts of the first source's decodes."""
     schema = pa.schema([*ROW, ("loss", pa.float64()), *((f"score.{name}", pa.float64()) for name in manifest.scores)])
     table = pa.Table.from_pylist(list(rows), schema=schema)
+    recording = RiskRecording(manifest, table)
 
     def fill(temporary: Path) -> None:
         pq.write_table(table, temporary / DECODES, compression="zstd")
@@ -140,9 +151,11 @@ def save_risk(
             np.save(temporary / FEATURES, features)
         files = {path.name: sha256_of(path) for path in sorted(temporary.iterdir())}
         write_json(temporary / "risk.json", asdict(replace(manifest, files=files)))
+        if draw is not None:
+            draw(recording, temporary)
 
     write_folder(folder, fill, replace=True)
-    return RiskRecording(manifest, table)
+    return recording
 
 
 def read_risk(folder: Path, request: Request) -> RiskManifest:
@@ -154,11 +167,19 @@ def read_risk(folder: Path, request: Request) -> RiskManifest:
     path = folder / "risk.json"
     if not path.is_file():
         raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
-    manifest = read_file(RiskManifest, path, f"a recording of format {FORMAT}: {AGAIN}")
+    manifest = _read(folder)
     check_files(folder, manifest.files, AGAIN)
     own = request.description
     manifest.target.check_same(MadeFor(own.sha256, own.actions, own.chunk), f"the risk in {folder}", "recorded", AGAIN)
     return manifest
+
+
+def _read(folder: Path) -> RiskManifest:
+    return read_file(RiskManifest, folder / "risk.json", f"a recording of format {FORMAT}: {AGAIN}")
+
+
+def _sources(folder: Path) -> MadeFrom:
+    return MadeFrom(f"the risk in {folder}", "recorded", AGAIN, _read(folder).artifacts)
 
 
 def _check(folder: Path, request: Request) -> str:
@@ -170,4 +191,4 @@ def _load(folder: Path, request: Request) -> RiskRecording:
     return RiskRecording(read_risk(folder, request), pq.read_table(folder / DECODES))
 
 
-ARTIFACT = Artifact("risk", artifact_folder("risk"), _check, _load)
+ARTIFACT = Artifact("risk", artifact_folder("risk"), _check, _load, _sources)

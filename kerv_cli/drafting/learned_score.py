@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
 
@@ -57,7 +57,8 @@ class LearnedScore(nn.Module):
 
 @dataclass(frozen=True)
 class ScoreDescription(Description):
-    """A learned score's JSON. target: hash of the weights whose prompts it reads. source: what drafted, by its hash."""
+    """A learned score's JSON. target: hash of the weights whose prompts it reads. source: what drafted, by its hash.
+    made_from: artifacts that drafts and inputs read, kind -> hash; absent from older scores."""
 
     inputs: list[str]
     features: int
@@ -67,12 +68,23 @@ class ScoreDescription(Description):
     chunk: int
     actions: ActionSpace
     provenance: dict[str, Any]
+    made_from: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def artifacts(self) -> dict[str, str]:
+        """As `made_from`; an older score names what drafted alone, the early drafter."""
+        return self.made_from or ({self.source: self.source_sha256} if self.source_sha256 else {})
 
 
 def save_score(
-    folder: Path, model: LearnedScore, made_for: MadeFor, source: tuple[str, str], made: dict[str, Any]
+    folder: Path,
+    model: LearnedScore,
+    made_for: MadeFor,
+    source: tuple[str, str],
+    made_from: Mapping[str, str],
+    made: dict[str, Any],
 ) -> str:
-    """Writes the score -> SHA-256 of its weights. source: name and hash of what drafted."""
+    """Writes the score -> SHA-256 of its weights. source: name and hash of what drafted. made_from: kind -> hash."""
     described = {
         "inputs": list(model.inputs),
         "features": model.features,
@@ -81,6 +93,7 @@ def save_score(
         "source_sha256": source[1],
         "chunk": made_for.chunk,
         "actions": made_for.actions.as_dict(),
+        "made_from": dict(made_from),
         "provenance": made,
     }
     return save_module(folder, "score", model, described)
@@ -96,6 +109,11 @@ def read_score(folder: Path, request: Request) -> ScoreDescription:
     return own
 
 
+def _sources(folder: Path) -> MadeFrom:
+    own = read_description(folder, "score", ScoreDescription)
+    return MadeFrom(f"the score in {folder}", "trained", AGAIN, own.artifacts)
+
+
 def _load(folder: Path, request: Request) -> LearnedScore:
     own = read_score(folder, request)
     model = LearnedScore(own.inputs, own.features)
@@ -103,4 +121,6 @@ def _load(folder: Path, request: Request) -> LearnedScore:
     return model.eval()
 
 
-ARTIFACT = Artifact("score", artifact_folder("score"), lambda f, request: read_score(f, request).sha256, _load)
+ARTIFACT = Artifact(
+    *("score", artifact_folder("score"), lambda folder, request: read_score(folder, request).sha256, _load, _sources)
+)

@@ -106,9 +106,7 @@ def check(settings: RolloutSettings) -> None:
     check_batch(method, settings.method, settings.rollout.batch)
     timing.check_method(settings, spec, target)
     wanted = needs(method)
-    hashes = artifacts.check(wanted)
-    if "risk" in wanted:
-        artifacts.load("risk").check_sources(hashes)
+    artifacts.check(wanted)
     if "calibration" in wanted and method["threshold"].kind in ("kinematic", "change"):
         calibration = artifacts.load("calibration")
         for task in tasks if method["threshold"].k_s is None else ():

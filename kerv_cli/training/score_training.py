@@ -74,7 +74,8 @@ class ScoreRun:
         metrics = {name: value for name, value in metrics.items() if math.isfinite(value)}  # no AUC without bad drafts
         made = {"command": "kerv train score", "settings": asdict(s), "metrics": metrics, **provenance("cpu")}
         manifest = self.recording.manifest
-        save_score(self.folder, model, manifest.target, (self.source, manifest.sources[self.source]), made)
+        source, read = (self.source, manifest.sources[self.source]), manifest.read_by(self.source, s.inputs)
+        save_score(self.folder, model, manifest.target, source, read, made)
         return metrics
 
     def _inputs(self) -> Tensor:
