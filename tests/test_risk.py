@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,8 @@ from kerv_cli.decoding.risk import RiskSkip
 from kerv_cli.decoding.scores import Draft
 from kerv_cli.parts import RiskSkipSettings
 from kerv_cli.reporting.risk import auc, coverage
+from kerv_cli.rollouts.episode import run_episode
+from kerv_cli.training import risk_recording
 
 # --- the certificate
 
@@ -264,8 +268,6 @@ def kerv(*words: str) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
-    import shutil
-
     from kerv_cli.drafting.early import EarlyDrafter, save_early
     from kerv_cli.settings import DrafterSettings
     from kerv_cli.targets.checkpoint import load_target
@@ -311,7 +313,8 @@ def test_a_recording_certifies_a_gate_and_names_what_is_missing(recorded: Path) 
 def test_another_drafter_than_the_recorded_one_is_refused(recorded: Path) -> None:
     code, output = rollout(recorded, "skip.epsilon=0.9", "skip.delta=0.5", "policy.early=other")
     assert code == 1
-    assert "the recorded risk is that of early" in output
+    assert "was recorded for early drafter" in output
+    assert "not for" in output
 
 
 @pytest.mark.parametrize(
@@ -337,8 +340,6 @@ def test_training_and_evaluation_seeds_are_not_calibrated_on(recorded: Path) -> 
 
 
 def test_a_damaged_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
-    import shutil
-
     results = tmp_path / "copy"
     shutil.copytree(recorded, results)
     path = results / "artifacts/risk/nano-state/decodes.parquet"
@@ -346,6 +347,38 @@ def test_a_damaged_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
     code, output = rollout(results, "skip.epsilon=0.9", "skip.delta=0.5")
     assert code == 1
     assert "does not match its manifest" in output
+
+
+def test_an_interrupted_recording_goes_on_and_ends_as_an_undisturbed_one(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interrupted in the third of four episodes, the second one's record damaged; all the while the older recording
+    stays in place."""
+    folder = recorded / "artifacts/risk/nano-state"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    command = ("calibrate", "risk", *common(recorded), "episodes=2", "features=true", "world.horizon=24")
+    ran: list[tuple[str, int]] = []
+
+    def counted(world: Any, decoder: Any, seed: int) -> Any:
+        ran.append((world.task, seed))
+        if len(ran) == 3:
+            raise KeyboardInterrupt
+        return run_episode(world, decoder, seed)
+
+    monkeypatch.setattr(risk_recording, "run_episode", counted)
+    code, output = kerv(*command)
+    assert code == 130
+    assert "interrupted: finished episodes are kept" in output
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    kept = sorted(folder.glob("records/*/*/*.safetensors"))
+    assert [path.stem for path in kept] == ["050100", "050101"]
+    kept[1].write_bytes(kept[1].read_bytes()[:-1] + b"\xff")
+    assert "1 of them are recorded" in kerv(*command, "--plan")[1]
+    assert "of them" not in kerv(*command, "unverified=0.5", "--plan")[1]  # another run's episodes are not taken
+    code, output = kerv(*command)
+    assert code == 0, output
+    assert ran[3:] == [("reach-v3", 50_101), ("push-v3", 50_100), ("push-v3", 50_101)]
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
 def test_the_learned_score_is_trained_and_used(recorded: Path) -> None:
@@ -358,6 +391,17 @@ def test_the_learned_score_is_trained_and_used(recorded: Path) -> None:
     gate = ("skip.score=learned", "skip.epsilon=0.9", "skip.delta=0.5", "policy.risk=second")
     code, output = rollout(recorded, *gate)
     assert code == 0, output
+    made = json.loads((recorded / "artifacts/risk/second/risk.json").read_text())
+    assert set(made["made_from"]) == {"early", "score"}
+    code, output = rollout(recorded, *gate, "skip.level=0", "policy.early=other")
+    assert code == 1
+    assert "was trained for early drafter" in output
+    third = ("policy.target=nano-state", f"results={recorded}", "steps=21", "policy.score=third")
+    code, output = kerv("train", "score", *third)
+    assert code == 0, output
+    code, output = rollout(recorded, *gate, "policy.score=third")
+    assert code == 1
+    assert "was recorded for learned score" in output
 
 
 def test_decodes_keep_why_they_were_verified(recorded: Path) -> None:

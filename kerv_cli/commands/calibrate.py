@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from kerv_cli.decoding.calibration_file import Calibration
 
 
-RISK = "risk"
+RISK, PLOT = "risk", "coverage.png"
 
 
 @edge
@@ -123,6 +123,7 @@ def _skip(calibration: Calibration) -> None:
 
 
 def _risk(overrides: list[str], cfg: bool, plan: bool) -> None:
+    from kerv_cli.errors import Interrupted
     from kerv_cli.settings import CalibrateRiskSettings
 
     settings = common.composed("calibrate_risk", overrides, CalibrateRiskSettings, cfg)
@@ -132,11 +133,15 @@ def _risk(overrides: list[str], cfg: bool, plan: bool) -> None:
     run = RiskRun(settings)
     if plan:
         common.print_plan(run.plan())
-    with progress_bar("episodes") as advance:
-        run.record(advance)
-    recording = run.finish()
+    try:
+        with progress_bar("episodes") as advance:
+            run.record(advance)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            f"interrupted: finished episodes are kept in {run.folder}, the same command goes on there"
+        ) from None
+    recording = run.finish(lambda recording, folder: plot_coverage(recording, folder / PLOT))
     title = f"levels with a risk of at most {settings.epsilon:g}, certified at 1 - {settings.delta:g}"
     columns = ("source", "score", "level", "trusted", "risk", "p", "holds in", "AUC", "episodes")
     print_table(columns, coverage_table(recording, settings.epsilon, settings.delta), title)
-    plot = plot_coverage(recording, run.folder / "coverage.png")
-    typer.echo(f"{run.folder}\n{plot}")
+    typer.echo(f"{run.folder}\n{run.folder / PLOT}")

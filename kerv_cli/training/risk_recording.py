@@ -6,7 +6,7 @@ Training observations would flatter a draft: a drafter or a datastore is at home
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -17,32 +17,34 @@ from kerv_cli.decoding.chunk import Chunk, DraftsChunks
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.decoding.loss import chunk_loss, target_tokens
 from kerv_cli.decoding.risk import episode_numbers
-from kerv_cli.decoding.risk_file import RiskManifest, RiskRecording, save_risk
+from kerv_cli.decoding.risk_file import Draw, RiskManifest, RiskRecording, save_risk
 from kerv_cli.decoding.scores import Draft, Score
 from kerv_cli.decoding.verify_skip import Skip
 from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.stress import build as build_stress
 from kerv_cli.environments.stress import check as check_stress
-from kerv_cli.errors import UsageError
+from kerv_cli.errors import KervError, UsageError
 from kerv_cli.parts import part_of
 from kerv_cli.places import artifact
-from kerv_cli.provenance import provenance
+from kerv_cli.provenance import provenance, versions
 from kerv_cli.registry import NoSettings, find
 from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.run import close_worlds, open_world
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import CalibrateRiskSettings, RolloutSettings, as_plain
+from kerv_cli.studies.code import code_hash
 from kerv_cli.targets.protocol import ReadableTarget
+from kerv_cli.training.risk_records import RiskRecords, Row
 
 Progress = Callable[[int, int], None]
-Row = dict[str, Any]
 
 
 class Recorder(Skip):
     """Compares every source's draft with the target, by a forward of its own, and executes the first source's in a
     random share of the decodes; the others are verified. Not for timing.
 
-    rows: a row of the recording per decode and source. features: pooled prompts (F,), one per decode, where wanted.
+    rows: of this episode, a row of the recording per decode and source. features: its pooled prompts (F,), one per
+    draft of the first source, where wanted.
     """
 
     def __init__(
@@ -60,9 +62,10 @@ class Recorder(Skip):
         self.decodes = 0
 
     def begin(self, task: str, seed: int) -> None:
-        """As `Skip.begin`."""
+        """As `Skip.begin`: the rows are those of this episode."""
         self.random = episode_numbers("risk", task, seed)
         self.episode, self.decodes = {"task": task, "seed": seed}, 0
+        self.rows, self.features = [], []
 
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`."""
@@ -89,7 +92,8 @@ class Recorder(Skip):
 
 
 class RiskRun:
-    """`kerv calibrate risk`: call `record`, then `finish`, which writes.
+    """`kerv calibrate risk`: call `record`, then `finish`, which writes. Every episode is kept on disk as soon as it
+    has ended, so that the same command goes on behind an interruption; `finish` removes what was kept.
 
     Raises:
         UsageError: no such task, source or score; seeds that are not for selection. CheckpointError: no such target, or
@@ -116,28 +120,48 @@ class RiskRun:
         self.folder = self.artifacts.place("risk")
         if settings.name is not None:
             self.folder = artifact(settings.results, "risk", settings.name)
-        self.rows: list[Row] = []
-        self.features: list[np.ndarray] = []
+        self.records = RiskRecords(self.folder, self._identity(), settings.sources, settings.scores)
+
+    def _identity(self) -> dict[str, Any]:
+        """Everything that determines an episode's rows, besides its task and seed."""
+        s, runtime = self.settings, self.settings.runtime
+        return {
+            "artifacts": self.hashes,
+            "recorded": [s.sources, s.scores, s.unverified, s.scale, s.features],
+            "world": asdict(s.world),
+            "runtime": [runtime.device, runtime.dtype, runtime.threads],
+            "code": code_hash(),
+            "versions": versions(),
+        }
 
     def plan(self) -> str:
         """One line for --plan."""
         s, episodes = self.settings, len(self.tasks) * len(self.seeds)
+        left = sum(len(self.records.missing(task, self.seeds)) for task in self.tasks)
+        kept = f", {episodes - left} of them are recorded" if left < episodes else ""
         return (
-            f"{self.folder}: {episodes} episodes on selection seeds {self.seeds.start} to {self.seeds.stop - 1}, about "
-            f"{episodes * 1.5 / 60:.0f} min (a guess); drafts of {', '.join(s.sources)}, scores {', '.join(s.scores)}"
+            f"{self.folder}: {episodes} episodes on selection seeds {self.seeds.start} to {self.seeds.stop - 1}{kept}, "
+            f"about {left * 1.5 / 60:.0f} min (a guess); drafts of {', '.join(s.sources)}, scores {', '.join(s.scores)}"
         )
 
     def record(self, progress: Progress) -> None:
-        """Runs the episodes, task by task."""
-        done, total = 0, len(self.tasks) * len(self.seeds)
+        """Runs the episodes that are not on disk yet, task by task.
+
+        Raises:
+            StorageError: writing failed.
+        """
+        missing = {task: self.records.missing(task, self.seeds) for task in self.tasks}
+        total = len(self.tasks) * len(self.seeds)
+        done = total - sum(map(len, missing.values()))
         stress = build_stress(self.settings.world.stress)
-        for task in self.tasks:
+        for task, seeds in missing.items():
+            if not seeds:
+                continue
             decoder, recorder = self._decoder(task)
-            for seed in self.seeds:
+            for seed in seeds:
                 run_episode(open_world(task, self.settings.world, stress), decoder, seed)
+                self.records.write(task, seed, recorder.rows, recorder.features)
                 progress(done := done + 1, total)
-            self.rows += recorder.rows
-            self.features += recorder.features
             close_worlds()
 
     def _decoder(self, task: str) -> tuple[Decoder, Recorder]:
@@ -156,12 +180,21 @@ class RiskRun:
         decoder = compose(method, target, self.artifacts.load, task)
         return Decoder(target, replace(decoder.parts, skip=recorder)), recorder
 
-    def finish(self) -> RiskRecording:
-        """Writes the recording -> what was written.
+    def finish(self, draw: Draw | None = None) -> RiskRecording:
+        """Writes the recording in one step -> what was written. draw: adds pictures to its folder.
 
         Raises:
-            StorageError: writing failed.
+            StorageError: writing failed. KervError: an episode is not on disk any more.
         """
+        rows: list[Row] = []
+        features: list[np.ndarray] = []
+        for task in self.tasks:
+            for seed in self.seeds:
+                found = self.records.read(task, seed)
+                if found is None:
+                    raise KervError(f"the record of {task}, seed {seed}, is gone from {self.records.folder}: run again")
+                rows += found[0]
+                features += found[1]
         described = self.artifacts.description
         made = {
             "command": "kerv calibrate risk",
@@ -170,14 +203,19 @@ class RiskRun:
         }
         manifest = RiskManifest(
             target=MadeFor(described.sha256, described.actions, described.chunk),
-            sources={name: self.hashes.get(name, "") for name in self.settings.sources},
+            sources={name: self._drafts_from(name) for name in self.settings.sources},
             scale=self.settings.scale,
             tasks={task: list(self.seeds) for task in self.tasks},
             scores=list(self.settings.scores),
             files={},
             provenance=made,
+            made_from={kind: digest for kind, digest in self.hashes.items() if kind != "target"},
         )
-        return save_risk(self.folder, manifest, self.rows, np.array(self.features) if self.features else None)
+        return save_risk(self.folder, manifest, rows, np.array(features) if features else None, draw)
+
+    def _drafts_from(self, source: str) -> str:
+        """Hash of the artifact that a source drafts from; empty where it needs none."""
+        return next((self.hashes[kind] for kind in find("proposer", source).needs(None)), "")
 
 
 def _own(name: str) -> Any:
