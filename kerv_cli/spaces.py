@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import CheckpointError, KervError
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,19 @@ class ActionSpace:
             found += [(first, first + group.size)] * group.size
             first += group.size
         return tuple(found)
+
+    def dofs_of(self, name: str) -> slice:
+        """The DoFs of a kinematic group.
+
+        Raises:
+            KervError: no such group.
+        """
+        first = 0
+        for group in self.groups:
+            if group.name == name:
+                return slice(first, first + group.size)
+            first += group.size
+        raise KervError(f"the actions have no group '{name}'")
 
     def segments(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
         """Chunk indices [first, last) of every group between `start` and `stop`, and whether all its DoFs are strict.

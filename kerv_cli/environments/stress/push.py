@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from kerv_cli.environments.stress.base import Array, Draws, Spells, Stress, level_of, unit_vector
-from kerv_cli.errors import KervError
 from kerv_cli.spaces import ActionSpace
 
 SECONDS = 0.1
@@ -22,7 +21,7 @@ class Push(Stress):
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         """As `Stress.begin`."""
-        group = _dofs_of(space, "position")
+        group = space.dofs_of("position")
         self._random = Draws(task, seed, self.kind, self.level).random()
         self._spells = Spells.per_second(level_of(LEVELS, self.level), SECONDS, space.control_hz)
         self._at = group
@@ -40,12 +39,3 @@ class Push(Stress):
         executed = action.copy()
         executed[self._at] = self._pushed
         return executed
-
-
-def _dofs_of(space: ActionSpace, name: str) -> slice:
-    first = 0
-    for group in space.groups:
-        if group.name == name:
-            return slice(first, first + group.size)
-        first += group.size
-    raise KervError(f"the actions have no group '{name}'")
