@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,10 +85,15 @@ def made_up_episode(task: str, seed: int, tail: int = 8) -> DemoEpisode:
     )
 
 
-def write_dataset(folder: Path, episodes: int = 6, make: Callable[[str, int], DemoEpisode] = made_up_episode) -> None:
+def write_dataset(
+    folder: Path,
+    episodes: int = 6,
+    make: Callable[[str, int], DemoEpisode] = made_up_episode,
+    names: Sequence[str] = TASKS,
+) -> None:
     """A complete dataset, without a simulator."""
     tasks: dict[str, Any] = {}
-    for task in TASKS:
+    for task in names:
         entries = []
         for seed in range(episodes):
             path = episode_path(folder, task, seed)
