@@ -40,7 +40,7 @@ class RiskRecords:
         """
         from safetensors.numpy import save
 
-        tensors = {
+        tensors: dict[str, np.ndarray] = {
             "source": np.array([self.sources.index(row["source"]) for row in rows], dtype=np.int64),
             "index": np.array([row["index"] for row in rows], dtype=np.int64),
             "loss": np.array([row["loss"] for row in rows], dtype=np.float64),

@@ -322,7 +322,8 @@ class DrafterRun(Run):
     def identity(self) -> dict[str, Any]:
         """Shapes and the target's weights."""
         s = self.settings
-        covering = {"task": list(resolve_tasks(s.task)), "starts": s.starts} if s.task or s.starts != "all" else {}
+        tasks = list(resolve_tasks(s.task)) if s.task else []
+        covering = {"task": tasks, "starts": s.starts} if tasks or s.starts != "all" else {}
         return {"drafter": asdict(s.drafter), "target": self.described.sha256, **covering}
 
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
