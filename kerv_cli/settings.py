@@ -286,7 +286,7 @@ class TrainSettings:
     closed_loop: int = number(0, 0, 100_000)  # episodes per task and validation, closed loop
     seed: int = number(0, 0, 2**31 - 1)
     bf16: bool = True  # autocast the training forward to bfloat16
-    half: bool = False  # weights on disk in float16: half the size, for shipping
+    stored: str = choice("float32", "float32", "float16", "int8")  # weights on disk: for shipping, a half or a quarter
 
 
 @dataclass

@@ -157,20 +157,26 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
         assert (folder / "log.csv").read_bytes() == (tmp_path / "whole/log.csv").read_bytes()
 
 
-def test_weights_can_be_stored_in_half_precision(tmp_path: Path) -> None:
-    settings = TargetSettings(observation="state", width=32, layers=1, heads=2, feed_forward=48, scene_tokens=2)
+def test_weights_can_be_stored_in_fewer_bits(tmp_path: Path) -> None:
+    settings = TargetSettings(observation="state", width=64, layers=1, heads=2, feed_forward=96, scene_tokens=2)
     target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld"))
     sizes = {}
-    for half in (False, True):
-        digest = save_target(tmp_path / str(half), target, "metaworld", {}, half)
-        loaded, description = load_target(tmp_path / str(half))
-        assert description.sha256 == digest == sha256_of(tmp_path / str(half) / "model.safetensors")
-        sizes[half] = (tmp_path / str(half) / "model.safetensors").stat().st_size
+    for stored in ("float32", "float16", "int8"):
+        digest = save_target(tmp_path / stored, target, "metaworld", {}, stored)
+        loaded, description = load_target(tmp_path / stored)
+        assert description.sha256 == digest == sha256_of(tmp_path / stored / "model.safetensors")
+        sizes[stored] = (tmp_path / stored / "model.safetensors").stat().st_size
         for name, tensor in loaded.state_dict().items():
             wanted = target.state_dict()[name]
             assert tensor.dtype == torch.float32
-            assert torch.equal(tensor, wanted.half().float() if half else wanted)
-    assert sizes[True] < 0.6 * sizes[False]
+            if stored == "int8" and wanted.dim() >= 2:
+                rows = wanted.flatten(1)
+                off = (tensor.flatten(1) - rows).abs().amax(1)
+                assert (off <= 1.01 * rows.abs().amax(1) / 254 + 1e-6).all(), name
+            else:
+                assert torch.equal(tensor, wanted if stored == "float32" else wanted.half().float())
+    assert sizes["float16"] < 0.6 * sizes["float32"]
+    assert sizes["int8"] < 0.6 * sizes["float16"]
 
 
 WITHOUT_VIEWER = """

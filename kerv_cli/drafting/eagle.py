@@ -21,7 +21,7 @@ from kerv_cli.drafting.public import PublicShape, load_public
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
-from kerv_cli.targets.checkpoint import Description, read_description, save_module
+from kerv_cli.targets.checkpoint import FLOAT32, Description, read_description, save_module
 from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.compact.trunk import Cache, LayerStack
 from kerv_cli.targets.protocol import Cache as AnyCache
@@ -165,7 +165,12 @@ class DrafterDescription(Description):
 
 
 def save_drafter(
-    folder: Path, drafter: Drafter, target: Target, target_sha256: str, provenance: dict[str, Any], half: bool = False
+    folder: Path,
+    drafter: Drafter,
+    target: Target,
+    target_sha256: str,
+    provenance: dict[str, Any],
+    stored: str = FLOAT32,
 ) -> str:
     """Writes the drafter and its description, which names its target by hash -> sha256 of the drafter's weights."""
     description = {
@@ -174,7 +179,7 @@ def save_drafter(
         "actions": target.actions.as_dict(),
         "provenance": provenance,
     }
-    return save_module(folder, "drafter", drafter, description, half)
+    return save_module(folder, "drafter", drafter, description, stored)
 
 
 def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> DrafterDescription:

@@ -22,7 +22,7 @@ from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
-from kerv_cli.targets.checkpoint import Description, TargetDescription, read_description, save_module
+from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
 from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.protocol import ReadableTarget
 
@@ -182,7 +182,7 @@ class EarlyDescription(Description):
 
 
 def save_early(
-    folder: Path, early: EarlyDrafter, target_sha256: str, provenance: dict[str, Any], half: bool = False
+    folder: Path, early: EarlyDrafter, target_sha256: str, provenance: dict[str, Any], stored: str = FLOAT32
 ) -> str:
     """Writes the early drafter and its description, which names its target by hash -> sha256 of its own weights."""
     description = {
@@ -192,7 +192,7 @@ def save_early(
         "actions": early.actions.as_dict(),
         "provenance": provenance,
     }
-    return save_module(folder, "early", early, description, half)
+    return save_module(folder, "early", early, description, stored)
 
 
 def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:

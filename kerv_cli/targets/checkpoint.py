@@ -23,6 +23,10 @@ if TYPE_CHECKING:  # torch is imported where weights are read or written: a desc
 
 FORMAT = 2
 WEIGHTS = "model.safetensors"
+FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"
+"""How weights are stored."""
+SCALE = ".scale"
+"""Behind the name of a matrix of integers: its scales, a row each."""
 WEIGHTS_ELSEWHERE = "weights"
 """Trait of a target's part: `module:function`, called with (folder, description), for weights that do not lie in the
 target's own folder."""
@@ -115,14 +119,42 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
     return tensors
 
 
-def save_module(folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], half: bool = False) -> str:
-    """Writes the weights and, last, `<kind>.json` -> sha256 of the weights. half: store floats as float16, which
-    `load_state` converts back to float32."""
+def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
+    """The tensors as they are stored. float16: all floats. int8: every matrix as integers of −127 to 127 and a float16
+    scale per row, `<name>{SCALE}`: a row's greatest number / 127; other floats as float16."""
+    import torch
+
+    if stored == FLOAT32:
+        return dict(state)
+    small: dict[str, Tensor] = {}
+    for name, tensor in state.items():
+        if stored == INT8 and tensor.is_floating_point() and tensor.dim() >= 2:
+            rows = tensor.float().flatten(1)
+            scale = (rows.abs().amax(1, keepdim=True) / 127).clamp_min(1e-7).half()
+            small[name] = (rows / scale.float()).round().clamp(-127, 127).to(torch.int8).view(tensor.shape)
+            small[name + SCALE] = scale
+        else:
+            small[name] = tensor.half() if tensor.is_floating_point() else tensor
+    return small
+
+
+def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The inverse of `compact`: matrices with a scale as float32, the rest as it is."""
+    full = {}
+    for name, tensor in tensors.items():
+        if not name.endswith(SCALE):
+            scale = tensors.get(name + SCALE)
+            full[name] = tensor if scale is None else (tensor.float().flatten(1) * scale.float()).view(tensor.shape)
+    return full
+
+
+def save_module(
+    folder: Path, kind: str, module: nn.Module, description: Mapping[str, Any], stored: str = FLOAT32
+) -> str:
+    """Writes the weights and, last, `<kind>.json` -> sha256 of the weights. stored: how; `load_state` converts it back
+    to float32."""
     folder.mkdir(parents=True, exist_ok=True)
-    state = module.state_dict()
-    if half:
-        state = {k: v.half() if v.is_floating_point() else v for k, v in state.items()}
-    save_tensors(folder / WEIGHTS, state)
+    save_tensors(folder / WEIGHTS, compact(module.state_dict(), stored))
     digest = sha256_of(folder / WEIGHTS)
     write_json(folder / f"{kind}.json", {"format": FORMAT, "kind": kind, "sha256": digest, **description})
     return digest
@@ -180,16 +212,17 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
         CheckpointError: a tensor is missing, unknown or of another shape.
     """
     try:
-        module.load_state_dict(load_tensors(folder / WEIGHTS, kind))
+        module.load_state_dict(expanded(load_tensors(folder / WEIGHTS, kind)))
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(f"{kind} in {folder} does not fit its own settings: {reason}") from error
 
 
 def save_target(
-    folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], half: bool = False
+    folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], stored: str = FLOAT32
 ) -> str:
-    """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations."""
+    """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
+    `save_module`."""
     description = {
         "family": "compact",
         "environment": environment,
@@ -200,7 +233,7 @@ def save_target(
         "words": list(target.words.words),
         "provenance": provenance,
     }
-    return save_module(folder, "target", target, description, half)
+    return save_module(folder, "target", target, description, stored)
 
 
 def read_target(folder: Path) -> TargetDescription:

@@ -50,7 +50,7 @@ Progress = Callable[[int, int], None]
 def determining(train: TrainSettings) -> dict[str, Any]:
     """The optimisation settings that identify a run. Steps and validation intervals may change on resuming; `init` is
     identified by its weights' hash instead of its name."""
-    free = ("steps", "validate_every", "closed_loop", "init", "half")
+    free = ("steps", "validate_every", "closed_loop", "init", "stored")
     later = {"balance": 0.0}  # settings that older runs do not know, with what they did
     found = {k: v for k, v in asdict(train).items() if k not in free}
     return {k: v for k, v in found.items() if k not in later or v != later[k]}
@@ -245,7 +245,7 @@ class TargetRun(Run):
         """See `Run.write`."""
         assert isinstance(module, CompactTarget)
         environment = self.dataset.manifest.environment
-        save_target(self.folder, module, environment, made | self.origin, self.settings.train.half)
+        save_target(self.folder, module, environment, made | self.origin, self.settings.train.stored)
 
 
 class DrafterRun(Run):
@@ -329,7 +329,7 @@ class DrafterRun(Run):
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
         """See `Run.write`."""
         assert isinstance(module, Drafter)
-        save_drafter(self.folder, module, self.target, self.described.sha256, made, self.settings.train.half)
+        save_drafter(self.folder, module, self.target, self.described.sha256, made, self.settings.train.stored)
 
 
 class EarlyRun(DrafterRun):
@@ -357,7 +357,7 @@ class EarlyRun(DrafterRun):
     def write(self, module: nn.Module, made: dict[str, Any]) -> None:
         """See `Run.write`."""
         assert isinstance(module, EarlyDrafter)
-        save_early(self.folder, module, self.described.sha256, made, self.settings.train.half)
+        save_early(self.folder, module, self.described.sha256, made, self.settings.train.stored)
 
 
 DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": EarlyRun}
