@@ -48,7 +48,7 @@ def test_every_command_has_a_schema_and_composes() -> None:
 @pytest.mark.parametrize("choice", list(chain(*([(g, n) for n in names] for g, names in groups().items()))))
 def test_every_config_composes(choice: tuple[str, str]) -> None:
     group, name = choice
-    command = HOMES.get(group, f"train_{name}" if group == "train" else "rollout")
+    command = HOMES.get(name if group == "train" else group, "train_target" if group == "train" else "rollout")
     settings = compose(command, [f"{group}={name}"], SCHEMAS[command])
     if group in PART_GROUPS:
         chosen = getattr(settings, group)

@@ -73,8 +73,7 @@ def test_the_documented_commands_make_what_the_study_names(results: Path, cover:
 
     policy, few = "policy.target=nano-state", ("train.steps=2", "train.batch=8", "train.validate_every=2")
     part = (f"cover={cover}", policy, *(("starts=half",) if cover == "half" else ()))
-    if cover == "three":
-        kerv("train", "drafter", *part, *few, "drafter.samples=50")
+    kerv("train", "drafter", *part, *few, "drafter.samples=50")
     kerv("train", "drafter", "drafter=early", *part, *few, "drafter.samples=50")
     kerv("build", "datastore", *part, "stride=8")
     small = ("episodes=2", "world.horizon=4", *(("task=[reach]",) if cover == "half" else ()))

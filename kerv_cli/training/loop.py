@@ -94,7 +94,8 @@ class Loop:
                 if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
                     self.check(metrics)
                     on_step(self.step, self.history[-1])
-                if stopping and self.step < settings.steps:
+                asked = stopping if self.ranks.size > 1 else stop.requested  # ranks agree on it one step later
+                if asked and self.step < settings.steps:
                     if self.ranks.first:
                         self.store()
                     raise Interrupted(f"interrupted: step {self.step} is saved, the same command goes on from there")
