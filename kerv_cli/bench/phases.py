@@ -11,7 +11,10 @@ import torch
 from kerv_cli.bench.machine import Machine, measure_machine, timed
 from kerv_cli.bench.model import Model
 from kerv_cli.drafting.eagle import DraftState, draft_chain, observe
-from kerv_cli.drafting.tree import TokenTree, visible_in_verification
+from kerv_cli.targets.transfer import read
+
+Seen = np.ndarray | torch.Tensor | None
+"""As `Target.forward` takes it."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Stage:
         """Observation -> prompt."""
         self.prompt = self.target.encode(self.model.observation)
 
-    def prefill(self, drafted: int = 0, seen: np.ndarray | None = None) -> list[int]:
+    def prefill(self, drafted: int = 0, seen: Seen = None) -> list[int]:
         """The prompt and `drafted` tokens behind it -> argmax of the prompt's last row and of theirs. seen: of a
         tree."""
         x = self.prompt
@@ -84,16 +87,19 @@ class Stage:
         found: list[int] = self.target.head(self.hidden[0, self.length - 1 :]).argmax(-1).tolist()
         return found
 
-    def verify(self, drafted: int = 0, done: int = 1, seen: np.ndarray | None = None) -> list[int]:
+    def verify(
+        self, drafted: int = 0, done: int = 1, seen: Seen = None, beside: torch.Tensor | None = None, reads: bool = True
+    ) -> list[int]:
         """One token and `drafted` behind it, after `done` committed tokens -> argmax of every row. seen: of a tree;
-        default a chain."""
+        default a chain. beside (m,): read together with them. reads: whether anything is; if not, an empty list."""
         start = self.cache.length = self.length + done - 1
         positions = torch.arange(start, start + 1 + drafted, device=self.device)
-        if drafted and seen is None:
-            seen = visible_in_verification(TokenTree.chain(range(drafted)))
         x = self.target.embed(self.tokens(1 + drafted))
         self.hidden = self.target.forward(x, positions, self.cache, seen)
-        found: list[int] = self.target.head(self.hidden)[0].argmax(-1).tolist()
+        argmax = self.target.head(self.hidden)[0].argmax(-1)
+        if not reads:
+            return []
+        found: list[int] = read(argmax)[0].tolist() if beside is None else read(argmax, beside)[0].tolist()
         return found
 
     def feed(self, hidden: torch.Tensor, first: int) -> None:
@@ -103,7 +109,8 @@ class Stage:
 
     def draft(self, depth: int) -> list[int]:
         """A chain of `depth` tokens from the drafter."""
-        return draft_chain(self.model.drafter, self.target, self.draft_state, depth)
+        found: list[int] = draft_chain(self.model.drafter, self.target, self.draft_state, depth).tolist()
+        return found
 
 
 def costs(model: Model, rows: int, cached: int) -> tuple[float, float]:

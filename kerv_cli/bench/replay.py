@@ -14,8 +14,8 @@ from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Stage
 from kerv_cli.bench.sequences import Recorded
 from kerv_cli.decoding.cost import DRAFTER, DecodeSequence, Forward
-from kerv_cli.drafting.eagle import grow_tree
-from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.drafting.eagle import draft_tree
+from kerv_cli.drafting.unread import Unread
 
 _SPARE = 8
 
@@ -39,28 +39,38 @@ class Player:
         began = time.perf_counter()
         self.stage.encode()
         for place, forward in enumerate(decode.forwards):
-            self._forward(forward, proposer)
+            last = place + 1 == len(decode.forwards)
+            self._forward(forward, proposer, last)
             if decode.drafts and place + 1 < len(decode.forwards):
                 self._feed(forward)
         synchronise(device)
         return time.perf_counter() - began + decode.host
 
-    def _forward(self, forward: Forward, proposer: Mapping[str, Any]) -> None:
-        tree = TokenTree.chain([0] * forward.drafted)
+    def _forward(self, forward: Forward, proposer: Mapping[str, Any], last: bool) -> None:
+        stage, count, drafted = self.stage, forward.drafted, None
         if forward.proposer == DRAFTER:
-            depth, top_k = _tree(proposer)
-            self.stage.draft_state.cache.length = self.stage.length + forward.start - 1
-            depth = min(depth, forward.drafted)
-            state, stage = self.stage.draft_state, self.stage
-            tree = grow_tree(self.model.drafter, stage.target, state, depth, top_k, forward.drafted)
+            drafted = self._draft(forward, proposer)
+            count = len(drafted)
         if forward.kind == "prefill":
-            self.stage.prefill(len(tree), None if tree.is_chain else visible_in_prefill(tree, self.stage.length))
+            stage.prefill(count)
         else:
-            self.stage.verify(len(tree), forward.start, visible_in_verification(tree) if len(tree) else None)
-        if len(tree):
-            first = self.stage.length + forward.start - (forward.kind == "verify")
+            # as in a decode: a draft is read with the target's tokens; without a proposer all tokens behind the last
+            reads = last or proposer.get("kind") != "none"
+            seen, beside = (drafted.seen(1), drafted.numbers) if drafted is not None else (None, None)
+            stage.verify(count, forward.start, seen, beside, reads)
+        if count:
+            first = stage.length + forward.start - (forward.kind == "verify")
             kept = forward.accepted + (forward.kind == "verify")
-            self.stage.cache.compact(first, torch.arange(first, first + kept, device=self.stage.device))
+            if drafted is not None and drafted.visible is not None:
+                stage.cache.compact(first, torch.arange(first, first + kept, device=stage.device))
+            stage.cache.length = first + kept
+
+    def _draft(self, forward: Forward, proposer: Mapping[str, Any]) -> Unread:
+        depth, top_k = _tree(proposer)
+        state, stage = self.stage.draft_state, self.stage
+        state.cache.length = stage.length + forward.start - 1
+        depth = min(depth, forward.drafted)
+        return draft_tree(self.model.drafter, stage.target, state, depth, top_k, forward.drafted)
 
     def _feed(self, forward: Forward) -> None:
         if forward.kind == "prefill":

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from kerv_cli.decoding.boundary import Choice
 from kerv_cli.decoding.record import PHASES, Round, Trust
 from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree
+from kerv_cli.drafting.unread import Unread
 from kerv_cli.errors import UsageError
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.protocol import Cache
@@ -120,6 +121,7 @@ class Chunk:
         self.rounds: list[Round] = []
         self.rejection = Rejection()
         self.hidden = torch.empty(0)
+        self.asked: list[tuple[Tensor, Callable[[np.ndarray], None]]] = []  # (n,) to read beside the next target tokens
         self.forwards = 0
         self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
         self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
@@ -212,10 +214,19 @@ class Proposer(Protocol):
     def begin(self, chunk: Chunk) -> None:
         """Called once per chunk, when the prompt is encoded and the first tokens are committed."""
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        """A tree of depth ≤ `depth`; an empty one where it has no draft."""
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+        """A tree of depth ≤ `depth`; an empty one where it has no draft. One that lies on the device is read together
+        with the target's tokens."""
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
         target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those
         behind rejected nodes included."""
+
+
+@runtime_checkable
+class Asks(Protocol):
+    """A proposer that needs numbers of the encoded prompt on the host."""
+
+    def ask(self, chunk: Chunk) -> None:
+        """Called before the prefill: adds to `chunk.asked` what is to be read with its tokens."""

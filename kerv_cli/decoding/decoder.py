@@ -11,17 +11,19 @@ from torch import Tensor
 
 from kerv_cli.decoding.acceptance import Acceptance
 from kerv_cli.decoding.boundary import Boundary
-from kerv_cli.decoding.chunk import Chunk, Clock, Proposer, Rejection, Situation, steps_of
+from kerv_cli.decoding.chunk import Asks, Chunk, Clock, Proposer, Rejection, Situation, steps_of
 from kerv_cli.decoding.proposers import EMPTY
 from kerv_cli.decoding.record import PARALLEL, DecodeRecord, Round
 from kerv_cli.decoding.rectify import Compensation
 from kerv_cli.decoding.thresholds import Fixed, Threshold
 from kerv_cli.decoding.verify_skip import Skip
 from kerv_cli.drafting.kinematics import ActionHistory
-from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.drafting.tree import TokenTree, visible_in_prefill
+from kerv_cli.drafting.unread import Unread
 from kerv_cli.errors import UsageError
 from kerv_cli.spaces import Observation
 from kerv_cli.targets.protocol import Target
+from kerv_cli.targets.transfer import read, upload
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,20 @@ class Parts:
     rectifier: Compensation | None = None
     boundary: Boundary | None = None
     skip: Skip | None = None
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A forward's draft, read. tree: of n nodes. rows: (n,) the forwarded row of each. target_tokens: 1 + n, as
+    `accept_by_distance` takes them."""
+
+    tree: TokenTree
+    rows: Sequence[int]
+    target_tokens: list[int]
+
+    def rows_of(self, path: Sequence[int]) -> list[int]:
+        """Rows of a path's nodes."""
+        return [self.rows[node] for node in path]
 
 
 class Decoder:
@@ -149,6 +165,8 @@ class Decoder:
         if parts.proposer is not None and chunk.left > 1:
             parts.proposer.begin(chunk)
             clock.lap("propose")
+        if parts.proposer is None and chunk.left:
+            self.decode_alone(chunk, clock)
         while chunk.left:
             self.round(chunk, clock)
         if parts.skip is not None:
@@ -158,65 +176,121 @@ class Decoder:
 
     def prefill(self, chunk: Chunk, clock: Clock) -> None:
         """The first forward: the prompt and, where there is an in-prefill draft, the draft behind it, to verify it."""
-        tree, prompt, target, draft = EMPTY, chunk.prompt, self.target, self.parts.prefill_draft
-        if draft is not None and chunk.size > 1:
+        prompt, target, parts, length = chunk.prompt, self.target, self.parts, chunk.prompt_length
+        draft: TokenTree | Unread = EMPTY
+        if parts.prefill_draft is not None and chunk.size > 1:
             # one token less than the chunk has, as in a round: the bonus fills the last place
-            tree = draft.propose(chunk, chunk.size - 1)
+            draft = parts.prefill_draft.propose(chunk, chunk.size - 1)
             clock.lap("propose")
-        length, x, seen = chunk.prompt_length, prompt, None
-        if len(tree):
-            x = torch.cat([prompt, target.embed(torch.tensor([tree.tokens], device=prompt.device))], 1)
-            seen = None if tree.is_chain else visible_in_prefill(tree, length)
-        positions = torch.tensor([*range(length), *(length + d for d in tree.depths)], device=prompt.device)
+        if parts.proposer is not None and chunk.size > 1 and isinstance(parts.proposer, Asks):
+            parts.proposer.ask(chunk)
+        x = prompt
+        if len(draft):
+            tokens = draft.tokens if isinstance(draft, Unread) else upload(draft.tokens, prompt.device)
+            x = torch.cat([prompt, target.embed(tokens[None])], 1)
         chunk.cache.length = 0
-        chunk.hidden = hidden = target.forward(x, positions, chunk.cache, seen)
-        target_tokens = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()
+        hidden = self.forward(x, draft, 0, length, chunk)
+        chunk.hidden = hidden
+        verified = self.read(chunk, draft, target.head(hidden[0, length - 1 :]).argmax(-1))
         clock.lap("prefill")
-        path = self.accept(chunk, tree, target_tokens, draft)
-        if self.parts.skip is not None:
-            self.parts.skip.verified(chunk)
+        path = self.accept(chunk, verified.tree, verified.target_tokens, parts.prefill_draft)
+        if parts.skip is not None:
+            parts.skip.verified(chunk)
         clock.lap("accept")
-        if not len(tree):
+        if not len(draft):
             return
-        slots = torch.tensor([length + i for i in path], device=prompt.device, dtype=torch.long)
-        chunk.cache.compact(length, slots)
-        chunk.hidden = torch.cat([hidden[:, :length], hidden[:, slots]], 1)
+        chunk.hidden = self.keep(chunk, hidden, 0, length, verified.rows_of(path))
         clock.lap("prefill")
         self.rectify(chunk)
         clock.lap("rectify")
 
     def round(self, chunk: Chunk, clock: Clock) -> None:
         """One round: propose, verify, accept, commit, rectify. Without a draft the forward decodes one token."""
-        tree, proposer = EMPTY, self.parts.proposer
+        draft: TokenTree | Unread = EMPTY
+        proposer = self.parts.proposer
         if proposer is not None and chunk.left > 1:
             # one token less than is left: the bonus fills the last place whether or not everything is accepted
-            tree = proposer.propose(chunk, chunk.left - 1)
+            draft = proposer.propose(chunk, chunk.left - 1)
             clock.lap("propose")
-        hidden, target_tokens = self.verify(chunk, tree)
+        hidden, verified = self.verify(chunk, draft)
         clock.lap("verify")
         first = len(chunk.tokens) - 1
-        path = self.accept(chunk, tree, target_tokens, proposer)
+        path = self.accept(chunk, verified.tree, verified.target_tokens, proposer)
         clock.lap("accept")
-        rows = torch.tensor([0, *(i + 1 for i in path)], device=hidden.device)
-        if len(tree):
-            start = chunk.prompt_length + first
-            chunk.cache.compact(start, start + rows)
+        if len(draft):
+            hidden = self.keep(chunk, hidden, chunk.prompt_length + first, 1, verified.rows_of(path))
             clock.lap("accept")
             self.rectify(chunk)
             clock.lap("rectify")
         if proposer is not None and chunk.left > 1:
-            proposer.committed(chunk, first, hidden[:, rows], target_tokens)
+            proposer.committed(chunk, first, hidden, verified.target_tokens)
             clock.lap("propose")
 
-    def verify(self, chunk: Chunk, tree: TokenTree) -> tuple[Tensor, list[int]]:
-        """Forwards the last committed token and the tree's n nodes -> hidden (1, 1 + n, E), the 1 + n target tokens."""
-        device = self.target.device
+    def decode_alone(self, chunk: Chunk, clock: Clock) -> None:
+        """All tokens that are left, one forward each, without a proposer. Each goes from the device into the next
+        forward; all are read behind the last one."""
+        target, first = self.target, chunk.prompt_length + len(chunk.tokens) - 1
+        positions = torch.arange(first, first + chunk.left, device=target.device).split(1)
+        found = [upload(chunk.tokens[-1:], target.device)]
+        for position in positions:
+            hidden = target.forward(target.embed(found[-1][None]), position, chunk.cache, None)
+            found.append(target.head(hidden)[0].argmax(-1))
+            clock.lap("verify")
+        tokens = torch.cat(found[1:]).tolist()
+        clock.lap("verify")
+        for token in tokens:
+            self.accept(chunk, EMPTY, [token], None)
+        clock.lap("accept")
+
+    def verify(self, chunk: Chunk, draft: TokenTree | Unread) -> tuple[Tensor, Verified]:
+        """Forwards the last committed token and the draft's n rows -> hidden (1, 1 + n, E), and what was read."""
+        device, last = self.target.device, chunk.tokens[-1]
         at = chunk.prompt_length + len(chunk.tokens) - 1
-        tokens = torch.tensor([[chunk.tokens[-1], *tree.tokens]], device=device)
-        positions = torch.tensor([at, *(at + 1 + d for d in tree.depths)], device=device)
-        seen = visible_in_verification(tree) if len(tree) else None
-        hidden = self.target.forward(self.target.embed(tokens), positions, chunk.cache, seen)
-        return hidden, self.target.head(hidden)[0].argmax(-1).tolist()
+        if isinstance(draft, Unread):
+            tokens = torch.cat([torch.full_like(draft.tokens[:1], last), draft.tokens])
+        else:
+            tokens = upload([last, *draft.tokens], device)
+        hidden = self.forward(self.target.embed(tokens[None]), draft, at, 1, chunk)
+        return hidden, self.read(chunk, draft, self.target.head(hidden)[0].argmax(-1))
+
+    def forward(self, x: Tensor, draft: TokenTree | Unread, start: int, before: int, chunk: Chunk) -> Tensor:
+        """x (1, before + n, E): tokens from position `start` on, and a draft behind them -> hidden states."""
+        stop, device, seen = start + before, x.device, None
+        if isinstance(draft, Unread):
+            positions, seen = draft.positions(start, before), draft.seen(before)
+        elif draft.is_chain:
+            positions = torch.arange(start, stop + len(draft), device=device)
+        else:
+            positions = upload([*range(start, stop), *(stop + depth for depth in draft.depths)], device)
+            seen = visible_in_prefill(draft, before)
+        return self.target.forward(x, positions, chunk.cache, seen)
+
+    def read(self, chunk: Chunk, draft: TokenTree | Unread, argmax: Tensor) -> Verified:
+        """argmax (1 + n,) behind the last token before the draft and behind each of its rows -> the tree and its target
+        tokens. Here, and here alone, a round waits for the device."""
+        asked, chunk.asked = chunk.asked, []
+        if isinstance(draft, TokenTree) and not asked:
+            return Verified(draft, range(len(draft)), argmax.tolist())
+        own = [draft.numbers] if isinstance(draft, Unread) else []
+        found, *numbers = read(argmax, *own, *(tensor for tensor, _ in asked))
+        for (_, receive), answer in zip(asked, numbers[len(own) :], strict=True):
+            receive(answer)
+        tokens = found.astype(np.int64).tolist()
+        if isinstance(draft, TokenTree):
+            return Verified(draft, range(len(draft)), tokens)
+        tree, rows = draft.placed(numbers[0])
+        return Verified(tree, rows, [tokens[0], *(tokens[1 + row] for row in rows)])
+
+    def keep(self, chunk: Chunk, hidden: Tensor, start: int, before: int, rows: list[int]) -> Tensor:
+        """Commits the cache's entries of a forward that began at slot `start`: `before` tokens and the draft's `rows`
+        -> their states (1, before + rows, E). A chain's rows lie where they belong."""
+        kept = before + len(rows)
+        if rows == list(range(len(rows))):
+            chunk.cache.length = start + kept
+            return hidden[:, :kept]
+        slots = upload([before + row for row in rows], hidden.device)
+        chunk.cache.compact(start + before, start + slots)
+        return torch.cat([hidden[:, :before], hidden[:, slots]], 1)
 
     def accept(
         self, chunk: Chunk, tree: TokenTree, target_tokens: Sequence[int], proposer: Proposer | None

@@ -10,6 +10,7 @@ import torch
 from kerv_cli.decoding.chunk import Chunk
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.protocol import Target
+from kerv_cli.targets.transfer import upload
 
 
 def chunk_loss(space: ActionSpace, drafted: Sequence[int], wanted: Sequence[int], scale: float) -> float:
@@ -54,7 +55,7 @@ def target_tokens(target: Target, chunk: Chunk, chain: Sequence[int]) -> list[in
     """The target's argmax token at every place of the chunk, given the chain's tokens before it: one forward. The
     chunk's cache is overwritten; a prefill afterwards begins it anew."""
     device, length = chunk.prompt.device, chunk.prompt_length
-    shown = target.embed(torch.tensor([list(chain[: chunk.size - 1])], device=device))
+    shown = target.embed(upload([list(chain[: chunk.size - 1])], device))
     x = torch.cat([chunk.prompt, shown], 1)
     chunk.cache.length = 0
     hidden = target.forward(x, torch.arange(x.shape[1], device=device), chunk.cache, None)

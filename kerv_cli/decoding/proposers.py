@@ -8,13 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.decoding.chunk import Chunk, DraftsChunks, Proposer
+from kerv_cli.decoding.chunk import Asks, Chunk, DraftsChunks, Proposer
 from kerv_cli.drafting.datastore import Datastore, Neighbours, neighbour_tree
-from kerv_cli.drafting.eagle import DraftsStates, DraftState, grow_tree, observe
+from kerv_cli.drafting.eagle import DraftsStates, DraftState, draft_tree, observe
 from kerv_cli.drafting.early import EarlyDraft, EarlyDrafter
 from kerv_cli.drafting.kinematics import Predictor
-from kerv_cli.drafting.tree import TokenTree, merge
+from kerv_cli.drafting.tree import ROOT, TokenTree, merge
+from kerv_cli.drafting.unread import Placed, Unread
 from kerv_cli.targets.protocol import ReadableTarget, Target
+from kerv_cli.targets.transfer import read, upload
 
 EMPTY = TokenTree((), (), ())
 SURE = 0.05
@@ -42,7 +44,7 @@ class Stateless:
 class ChainProposer(Stateless):
     """A proposer whose draft is one chain of the chunk's remaining tokens."""
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """The first chain as a tree; empty where there is none."""
         chains = self.chains(chunk, depth)
         return TokenTree.chain(chains[0]) if chains else EMPTY
@@ -72,20 +74,53 @@ class PredictionProposer(ChainProposer):
 
 
 class EarlyProposer(ChainProposer):
-    """The early drafter's chunk (docs/methods.md §5), drafted once per observation."""
+    """The early drafter's chunk (docs/methods.md §5), drafted once per observation.
+
+    waits: whether a draft is read before it is verified; otherwise with the target's tokens, which on a CPU gains
+    nothing.
+    """
 
     name = "early"
 
     def __init__(self, early: EarlyDrafter, target: ReadableTarget) -> None:
         self.early, self.target = early, target
+        self.waits = target.device.type == "cpu"
         self._drafted: tuple[Chunk, EarlyDraft] | None = None
 
     def drafted(self, chunk: Chunk) -> EarlyDraft:
         """The draft of the chunk's N tokens."""
         if self._drafted is None or self._drafted[0] is not chunk:
-            history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
-            self._drafted = chunk, self.early.drafted(self.target.pooled(chunk.prompt), history, radius)
+            self._drafted = chunk, self.early.drafted(*self._inputs(chunk))
         return self._drafted[1]
+
+    def _inputs(self, chunk: Chunk) -> tuple[Tensor, np.ndarray, int]:
+        return self.target.pooled(chunk.prompt), chunk.situation.history.values(), max(chunk.limits, default=0)
+
+    def unread(self, chunk: Chunk) -> Tensor | None:
+        """The draft on the device, (N + 1,) as `EarlyDrafter.unread`; None where it was read. The reader calls
+        `take`."""
+        if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
+            return None
+        numbers, self._logits = self.early.unread(*self._inputs(chunk))
+        return numbers
+
+    def take(self, chunk: Chunk, numbers: np.ndarray) -> None:
+        """What `unread` gave, read."""
+        self._drafted = chunk, EarlyDraft.of(numbers, self._logits)
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+        """The drafted chain."""
+        numbers = self.unread(chunk)
+        if numbers is None:
+            return super().propose(chunk, depth)
+        start = len(chunk.tokens)
+
+        def placed(found: np.ndarray) -> Placed:
+            self.take(chunk, found)
+            tree = TokenTree.chain(self.chains(chunk, depth)[0])
+            return tree, range(len(tree))
+
+        return Unread(numbers[start : min(chunk.size, start + depth)].long(), numbers, placed)
 
     def distance(self, chunk: Chunk) -> float:
         """How far the observation is from those that the drafter was trained on; see `EarlyDrafter.distance`."""
@@ -107,15 +142,26 @@ class RetrievalProposer(Stateless):
 
     def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
+        self.waits = target.device.type == "cpu"
         self._found: tuple[Chunk, Neighbours] | None = None
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
         """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
         if self._found is None or self._found[0] is not chunk:
-            key = self.datastore.key(chunk.prompt, self.target)
-            self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
-            chunk.similarity = float(self._found[1].similarity[0])
+            self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
+        assert self._found is not None
         return self._found[1]
+
+    def ask(self, chunk: Chunk) -> None:
+        """As `Asks.ask`: the search key."""
+        if not self.waits and (self._found is None or self._found[0] is not chunk):
+            pooled = self.datastore.pooled(chunk.prompt, self.target)
+            chunk.asked.append((pooled, lambda found: self._search(chunk, found)))
+
+    def _search(self, chunk: Chunk, pooled: np.ndarray) -> None:
+        key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
+        self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+        chunk.similarity = float(self._found[1].similarity[0])
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         """The neighbours' chunks as one tree, merged by kinematic group."""
@@ -141,8 +187,11 @@ class MergedProposer(Stateless):
         self.name = every[0].name if len(every) == 1 else "merged"
         self.sources, self.fallback, self.nodes = sources, fallback, nodes
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
+        return self._unread(chunk, depth) or self._tree(chunk, depth)
+
+    def _tree(self, chunk: Chunk, depth: int) -> TokenTree:
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback
@@ -154,6 +203,50 @@ class MergedProposer(Stateless):
             del chains[-1]
             tree = merge(chains)
         return tree
+
+    def _unread(self, chunk: Chunk, depth: int) -> Unread | None:
+        """An early draft that was not read, and all other chains beside it, whether they will be wanted or not: which
+        of them are nodes of the tree is known once the draft is read. None where there is none, or no room."""
+        early = next((source for source in self.sources if isinstance(source, EarlyProposer)), None)
+        if early is None or (numbers := early.unread(chunk)) is None:
+            return None
+        start, device = len(chunk.tokens), numbers.device
+        own = numbers[start : min(chunk.size, start + depth)].long()
+        others = [s for s in (*self.sources, *self.fallback) if s is not early]
+        beside = [chain for source in others for chain in source.chains(chunk, depth) if chain]
+        lengths = [own.shape[0], *(len(chain) for chain in beside)]
+
+        def placed(found: np.ndarray) -> Placed:
+            early.take(chunk, found)
+            tree = self._tree(chunk, depth)
+            return tree, rows_of(tree, [early.chains(chunk, depth)[0], *beside])
+
+        if sum(lengths) > max(self.nodes, chunk.size):
+            early.take(chunk, read(numbers)[0])
+            return None
+        if not beside:
+            return Unread(own, numbers, placed)
+        depths = np.concatenate([np.arange(length) for length in lengths])
+        chain_of = np.repeat(np.arange(len(lengths)), lengths)
+        visible = (chain_of[:, None] == chain_of) & (depths[:, None] >= depths)
+        tokens = torch.cat([own, upload([token for chain in beside for token in chain], device)])
+        return Unread(tokens, numbers, placed, upload(visible, device), upload(depths, device))
+
+
+def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
+    """The rows of a merged tree's nodes where its chains were forwarded one behind the other, unmerged."""
+    children = {(parent, token): i for i, (parent, token) in enumerate(zip(tree.parents, tree.tokens, strict=True))}
+    rows, first = [0] * len(tree), 0
+    for chain in reversed(chains):
+        first -= len(chain)
+        node: int | None = ROOT
+        for place, token in enumerate(chain):
+            node = children.get((ROOT if node is None else node, token))
+            if node is None:
+                break
+            rows[node] = first + place
+    total = sum(len(chain) for chain in chains)
+    return [total + row for row in rows]
 
 
 class HybridProposer:
@@ -177,7 +270,13 @@ class HybridProposer:
         self.chosen = self.sides[chunk.choice.mode]
         self.chosen.begin(chunk)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def ask(self, chunk: Chunk) -> None:
+        """As `Asks.ask`: what the side that the boundary chose asks."""
+        side = self.sides[chunk.choice.mode] if chunk.choice is not None else None
+        if isinstance(side, Asks):
+            side.ask(chunk)
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """The chosen side's tree."""
         return self.chosen.propose(chunk, depth)
 
@@ -234,9 +333,9 @@ class DrafterProposer:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
         observe(self.drafter, self.state, following, chunk.hidden, 0)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        """A chain or dynamic tree of the settings' size."""
-        return grow_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
+    def propose(self, chunk: Chunk, depth: int) -> Unread:
+        """A chain or dynamic tree of the settings' size, on the device."""
+        return draft_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Feeds the drafter the states of the newly committed positions."""
@@ -245,4 +344,4 @@ class DrafterProposer:
 
     def embed(self, tokens: list[int]) -> Tensor:
         """T tokens -> the target's embeddings (1, T, E)."""
-        return self.target.embed(torch.tensor([tokens], device=self.target.device))
+        return self.target.embed(upload([tokens], self.target.device))

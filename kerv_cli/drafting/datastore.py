@@ -89,6 +89,11 @@ class Manifest:
 
 
 def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
+    """As `pooled_key`, on the host."""
+    return pooled_key(prompt, target, segments).cpu().numpy()
+
+
+def pooled_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
     """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
 
     Raises:
@@ -99,7 +104,7 @@ def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
         if name not in known:
             raise UnknownName("part of the prompt", name, known)
     pooled = [_unit(prompt[:, known[name]].float().mean(1)) for name in segments]
-    return _unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1)).cpu().numpy()
+    return _unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1))
 
 
 def _unit(vectors: Tensor) -> Tensor:
@@ -189,8 +194,15 @@ class Datastore:
 
     def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
         """prompt (1, P, E) of the target -> (d,) float32."""
-        keys = prompt_key(prompt, target, self.manifest.key)
-        return (keys if self.projection is None else projected(keys, self.projection))[0]
+        return self.key_of(self.pooled(prompt, target).cpu().numpy())
+
+    def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
+        """prompt (1, P, E) of the target -> what `key_of` makes the key from (p,) float32, on the device."""
+        return pooled_key(prompt, target, self.manifest.key)[0]
+
+    def key_of(self, pooled: np.ndarray) -> np.ndarray:
+        """pooled (p,) float32 -> (d,) float32."""
+        return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
         """Exact search among the entries of `task`: key (d,) -> its k nearest (all, where there are fewer).

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.drafting.public import PublicShape, load_public
 from kerv_cli.drafting.tree import ROOT, TokenTree
+from kerv_cli.drafting.unread import Unread
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import FLOAT32, Description, read_description, save_module
@@ -38,7 +39,12 @@ class DraftsStates(Protocol):
         """Rotary position of a drafted token at this place of the sequence; the same, but for public conventions."""
 
     def __call__(
-        self, following: Tensor, hidden: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | None = None
+        self,
+        following: Tensor,
+        hidden: Tensor,
+        positions: Tensor,
+        cache: Any = None,
+        seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
         """As `Drafter.forward`."""
 
@@ -66,7 +72,7 @@ class Drafter(LayerStack):
         hidden: Tensor,
         positions: Tensor,
         cache: Cache | None = None,
-        seen: np.ndarray | None = None,
+        seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
         """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
         `attention_mask`."""
@@ -93,45 +99,52 @@ def observe(drafter: DraftsStates, state: DraftState, following: Tensor, hidden:
     state.hidden = drafter(following, hidden, positions, state.cache)[0, -1]
 
 
+def draft_tree(drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> Unread:
+    """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
+    `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree. It stays on the
+    device: nothing here waits for it.
+    """
+    if top_k == 1:
+        return Unread.chain(draft_chain(drafter, target, state, min(depth, nodes)))
+    device = state.hidden.device
+    scores = torch.log_softmax(target.head(state.hidden).float(), -1)
+    values, tokens = scores.topk(min(top_k, nodes))
+    width = tokens.shape[0]
+    every, parents, cumulative = [tokens], [torch.full_like(tokens, ROOT)], [values]
+    base, offset = state.cache.length, width
+    first = drafter.draft_position(base)
+    hidden = state.hidden.expand(1, width, -1)
+    level = torch.arange(width, device=device)
+    own = torch.eye(max(width, top_k), dtype=torch.bool, device=device)
+    seen = own[:width, :width]  # of the nodes that were forwarded, level by level
+    for reached in range(1, depth):
+        following = target.embed(tokens[None])
+        position = torch.full((width,), first + reached - 1, device=device)
+        hidden = drafter(following, hidden, position, state.cache, seen.numpy() if device.type == "cpu" else seen)
+        logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
+        child_values, child_tokens = (found.flatten() for found in logp.topk(top_k, -1))
+        values, flat = child_values.topk(top_k)
+        # every child competes for a place in the tree, only the best top_k are expanded further
+        parents.append(level[:, None].expand(-1, top_k).flatten())
+        every.append(child_tokens)
+        cumulative.append(child_values)
+        level, offset, width = offset + flat, offset + child_tokens.shape[0], top_k
+        tokens, chosen = child_tokens[flat], flat // top_k
+        hidden = hidden[:, chosen]
+        seen = torch.cat([seen[chosen], own[:top_k, :top_k]], 1)
+    state.cache.length = base
+    return _keep_best(torch.cat(every), torch.cat(parents), torch.cat(cumulative), nodes, depth)
+
+
 def grow_tree(
     drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
 ) -> TokenTree:
-    """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
-    `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree.
-    """
-    if top_k == 1:
-        return TokenTree.chain(draft_chain(drafter, target, state, min(depth, nodes)))
-    scores = torch.log_softmax(target.head(state.hidden).float(), -1)
-    values, tokens = scores.topk(min(top_k, nodes))
-    level = list(range(len(tokens)))
-    all_tokens, parents, cumulative = tokens.tolist(), [ROOT] * len(tokens), values.tolist()
-    base = state.cache.length
-    first = drafter.draft_position(base)
-    hidden = state.hidden.expand(1, len(tokens), -1)
-    seen = np.eye(len(tokens), dtype=bool)  # of the nodes that were forwarded, level by level
-    for reached in range(1, depth):
-        following = target.embed(tokens[None])
-        position = torch.full((len(level),), first + reached - 1, device=tokens.device)
-        hidden = drafter(following, hidden, position, state.cache, seen)
-        logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
-        child_values, child_tokens = logp.topk(top_k, -1)
-        values, flat = child_values.flatten().topk(top_k)
-        # every child competes for a place in the tree, only the best top_k are expanded further
-        offset = len(all_tokens)
-        all_tokens += child_tokens.flatten().tolist()
-        cumulative += child_values.flatten().tolist()
-        parents += [node for node in level for _ in range(top_k)]
-        chosen = flat.tolist()
-        level = [offset + c for c in chosen]
-        tokens = child_tokens.flatten()[flat]
-        hidden = hidden[:, flat // top_k]
-        seen = np.concatenate([seen[[c // top_k for c in chosen]], np.eye(top_k, dtype=bool)], 1)
-    state.cache.length = base
-    return _keep_best(all_tokens, parents, cumulative, nodes)
+    """As `draft_tree`, read at once."""
+    return draft_tree(drafter, target, state, depth, top_k, nodes).now()
 
 
-def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> list[int]:
-    """The `depth` greedy draft tokens, without the bookkeeping of a tree."""
+def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> Tensor:
+    """The greedy draft tokens (depth,) on the device, without the bookkeeping of a tree."""
     base = state.cache.length
     first = drafter.draft_position(base)
     positions = torch.arange(first, first + depth, device=state.hidden.device).split(1)
@@ -142,14 +155,15 @@ def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth:
         hidden = drafter(following, hidden, positions[reached], state.cache)
         drafted.append(target.head(hidden[0]).argmax(-1))
     state.cache.length = base
-    return torch.cat(drafted).tolist()
+    return torch.cat(drafted)
 
 
-def _keep_best(tokens: list[int], parents: list[int], scores: list[float], nodes: int) -> TokenTree:
-    # sorted is stable and children stand behind their parents: on equal scores the parent is kept first
-    best = sorted(sorted(range(len(tokens)), key=lambda i: -scores[i])[:nodes])
-    index = {old: new for new, old in enumerate(best)} | {ROOT: ROOT}
-    return TokenTree.build([tokens[i] for i in best], [index[parents[i]] for i in best])
+def _keep_best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Unread:
+    # the sort is stable and children stand behind their parents: on equal scores the parent is kept first
+    best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
+    index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
+    index[best] = torch.arange(best.shape[0], device=tokens.device)
+    return Unread.tree(tokens[best], index[parents[best]], depth)
 
 
 @dataclass(frozen=True)

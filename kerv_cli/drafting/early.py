@@ -25,6 +25,7 @@ from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
 from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.protocol import ReadableTarget
+from kerv_cli.targets.transfer import read, upload
 
 
 def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.ndarray]:
@@ -101,16 +102,22 @@ class EarlyDrafter(nn.Module):
         logits: Tensor = self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
         return logits
 
-    @torch.inference_mode()
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
         """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
         radius: r in bins, see `choose`."""
+        numbers, logits = self.unread(features, history, radius)
+        return EarlyDraft.of(read(numbers)[0], logits)
+
+    @torch.inference_mode()
+    def unread(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
+        """As `drafted`, but left on the device: N tokens and the odds (N + 1,) float64, logits (N, V)."""
         weight = self.head.weight
         shown = padded(history, self.settings.history, self.actions.dofs)
-        actions, known = (torch.from_numpy(x).to(device=weight.device, dtype=weight.dtype)[None] for x in shown)
+        actions, known = (upload(x, weight.device).to(weight.dtype)[None] for x in shown)
         logits = self(features.to(weight.dtype), actions, known)
         tokens = choose(logits, radius, self.strict)
-        return EarlyDraft(tokens[0].tolist(), float(acceptance_odds(logits, tokens, radius, self.strict)[0]), logits[0])
+        odds = acceptance_odds(logits, tokens, radius, self.strict)
+        return torch.cat([tokens[0].double(), odds.double()]), logits[0]
 
     @torch.inference_mode()
     def tokens_of(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> list[list[int]]:
@@ -130,6 +137,11 @@ class EarlyDraft:
     tokens: list[int]
     odds: float
     logits: Tensor
+
+    @classmethod
+    def of(cls, numbers: np.ndarray, logits: Tensor) -> EarlyDraft:
+        """numbers: as `EarlyDrafter.unread`."""
+        return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]), logits)
 
     @property
     def entropy(self) -> float:

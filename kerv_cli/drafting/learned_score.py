@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from kerv_cli.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
+from kerv_cli.targets.transfer import upload
 
 AGAIN = "run 'kerv train score'"
 HIDDEN = 64
@@ -51,7 +52,7 @@ class LearnedScore(nn.Module):
     @torch.inference_mode()
     def expected_loss(self, features: Tensor, scores: Sequence[float]) -> float:
         """features (1, F) and the values of `inputs` -> the expected loss in [0, 1]."""
-        known = torch.tensor([scores], device=features.device).clamp_min(FLOOR)
+        known = upload([list(scores)], features.device).clamp_min(FLOOR)
         return float(self(torch.cat([features.float(), known], 1)).sigmoid())
 
 

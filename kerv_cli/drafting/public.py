@@ -91,7 +91,7 @@ class PublicDrafter(nn.Module):
         hidden: Tensor,
         positions: Tensor,
         cache: DraftCache | None = None,
-        seen: np.ndarray | None = None,
+        seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
         """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
         `attention_mask`. A call on an empty cache is the prompt's."""
@@ -101,7 +101,7 @@ class PublicDrafter(nn.Module):
         mask = self.prompt_mask(x, cache, seen) if self.shape.convention.mask == "prompt" else None
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
-    def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | None) -> Tensor:
+    def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
         """Additive mask (T, S + T) in which no key behind the prompt's last but one is seen."""
         prompt = cache.prompt if cache is not None else x.shape[1]
         mask = attention_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)

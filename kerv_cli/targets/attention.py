@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kerv_cli.targets.transfer import upload
+
 
 class Buffered:
     """A cache in fixed buffers. buffer: (..., slots, C), of which the first `length` slots are valid. fixed: every
@@ -26,24 +28,32 @@ class Buffered:
         self.length = start + n
 
 
-def attention_mask(seen: np.ndarray | None, tokens: int, cache: Buffered | None, like: Tensor) -> Tensor | None:
+def attention_mask(
+    seen: np.ndarray | Tensor | None, tokens: int, cache: Buffered | None, like: Tensor
+) -> Tensor | None:
     """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, slots) for a cache of fixed shapes.
 
     seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to
     all cached ones before those. None: the new tokens are causal. The mask is None where attention without one does the
-    same.
+    same. A tensor `seen` lies on the device of `like`, where its mask is made.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens
+    slots = cache.buffer.shape[-2] if cache is not None and fixed else stop
+    if isinstance(seen, Tensor):
+        there = like.new_zeros(tokens, slots)
+        there[:, stop - seen.shape[1] : stop].masked_fill_(~seen, -torch.inf)
+        there[:, stop:] = -torch.inf
+        return there
     plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
     if plain and not fixed:
         return None
     if seen is None:
         seen = np.tri(tokens, dtype=bool)
-    mask = np.zeros((tokens, cache.buffer.shape[-2] if cache is not None and fixed else stop), dtype=np.float32)
+    mask = np.zeros((tokens, slots), dtype=np.float32)
     mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
     mask[:, stop:] = -np.inf
-    return torch.from_numpy(mask).to(device=like.device, dtype=like.dtype)
+    return upload(mask, like.device).to(like.dtype)
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

@@ -66,12 +66,14 @@ class Target(Protocol):
     def new_cache(self, batch: int, capacity: int) -> Cache:
         """An empty cache for `capacity` tokens."""
 
-    def forward(self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | None = None) -> Tensor:
+    def forward(
+        self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | Tensor | None = None
+    ) -> Tensor:
         """Hidden states (B, T, E) of the new tokens x (B, T, E) at `positions` (T,), behind the cached ones. cache:
         from `new_cache`, or None.
 
         seen (T, T) bool says which of the new tokens each new token attends to; all attend to every cached one. None:
-        the new tokens are causal.
+        the new tokens are causal. It is an array; on another device than a CPU it may be a tensor there.
         """
 
     def head(self, hidden: Tensor) -> Tensor:

@@ -36,6 +36,7 @@ from kerv_cli.targets.compact.packed import Packable, PackedPrompt, load_packed,
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.targets.transfer import upload
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class CompactTarget(Packable):
             CheckpointError: numbers or images of another size than the policy was trained on.
         """
         felt, state = (
-            torch.from_numpy(np.asarray(x, dtype=np.float32)).to(self.device)[None]
+            upload(np.asarray(x, dtype=np.float32), self.device)[None]
             for x in (observation.proprioception, observation.state)
         )
         if felt.shape[1] != len(self.observation.proprioception) or state.shape[1] != self.observation.state:
@@ -180,12 +181,12 @@ class CompactTarget(Packable):
             if camera not in observation.images:
                 raise CheckpointError(f"the target was trained on images of camera '{camera}', which were not drawn")
             image = np.ascontiguousarray(observation.images[camera])
-            images = torch.from_numpy(image).to(self.device).permute(2, 0, 1)[None]
+            images = upload(image, self.device).permute(2, 0, 1)[None]
         return Inputs(images, felt, state, self.words_of(observation.instruction))
 
     def words_of(self, instruction: str) -> Tensor:
         """The instruction's word ids (1, L) int64."""
-        return torch.tensor([self.words.encode(instruction, self.settings.instruction_tokens)], device=self.device)
+        return upload([self.words.encode(instruction, self.settings.instruction_tokens)], self.device)
 
     def encode(self, observation: Observation) -> Tensor:
         """The prompt's embeddings (1, P, E); errors as `inputs`."""
@@ -242,7 +243,7 @@ class CompactTarget(Packable):
         return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
+        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """As `Target.forward`: hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
         hidden: Tensor = self.trunk(x, positions, cache, seen)

@@ -164,7 +164,7 @@ class LayerStack(Packable):
         """Whether a captured graph computes x: one sequence on CUDA, without gradients, in a cache of fixed shapes."""
         return x.is_cuda and x.shape[0] == 1 and cache is not None and cache.fixed and not wants_gradient(x)
 
-    def run_layers(self, x: Tensor, positions: Tensor, cache: Cache | None, seen: np.ndarray | None) -> Tensor:
+    def run_layers(self, x: Tensor, positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None) -> Tensor:
         """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
         `attention_mask`."""
         mask = attention_mask(seen, x.shape[1], cache, x)
@@ -197,7 +197,7 @@ class Trunk(LayerStack):
                     parameter.data /= (2 * layers) ** 0.5
 
     def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | None = None
+        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """Hidden states (B, T, E) of the new tokens x (B, T, E) at rotary `positions` (T,), behind the cached ones."""
         packed = self.packed_for(x, cache)

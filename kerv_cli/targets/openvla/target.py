@@ -26,6 +26,7 @@ from kerv_cli.targets.openvla.image import Normalisation, check_image, pixels_of
 from kerv_cli.targets.openvla.loading import OpenVLAModel, load_model, open_shards
 from kerv_cli.targets.openvla.prompt import Prompter
 from kerv_cli.targets.openvla.trunk import KeyValueCache
+from kerv_cli.targets.transfer import upload
 
 
 @dataclass(frozen=True)
@@ -110,13 +111,11 @@ class OpenVLATarget:
 
     def see(self, pixels: Tensor) -> Tensor:
         """pixels (B, 6, s, s) -> vision tokens (B, n, E)."""
-        patches: Tensor = self.model.projector(
-            self.model.vision_backbone(pixels.to(device=self.device, dtype=self.dtype))
-        )
+        patches: Tensor = self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
         return patches
 
     def _words(self, instruction: str) -> Tensor:
-        ids = torch.tensor([self.prompter.ids(instruction)], device=self.device)
+        ids = upload([self.prompter.ids(instruction)], self.device)
         embedded: Tensor = self.model.language_model.model.embed_tokens(ids)
         return embedded
 
@@ -131,7 +130,7 @@ class OpenVLATarget:
         return KeyValueCache(self.shape.language, batch, capacity, self.action_rows, fixed)
 
     def forward(
-        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | None = None
+        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """As `Target.forward`."""
         hidden: Tensor = self.model.language_model.model(x, positions, cache, seen)

@@ -131,7 +131,7 @@ def run_layers(
     x: Tensor,
     positions: Tensor,
     cache: KeyValueCache | None,
-    seen: np.ndarray | None,
+    seen: np.ndarray | Tensor | None,
     mask: Tensor | None = None,
 ) -> Tensor:
     """x (B, T, E) at `positions` (T,) -> output of the last layer (B, T, E); the cache grows by T. seen: as in
@@ -156,7 +156,7 @@ class LlamaModel(nn.Module):
         self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
 
     def forward(
-        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | None = None
+        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """x (B, T, E) at `positions` (T,) -> hidden states behind the final norm (B, T, E)."""
         normed: Tensor = self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))

@@ -1,0 +1,77 @@
+"""Where a policy's decode spends its time on a CPU: products and attention, other tensor operations, Python."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from kerv_cli.bench.model import Model, blank
+from kerv_cli.config import compose as compose_settings
+from kerv_cli.decoding.build import compose, needs
+from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.settings import RolloutSettings
+from kerv_cli.spaces import Observation
+
+METHODS = ("ar", "spec_vla", "one_pass")
+PRODUCTS = ("mm", "mv", "dot", "linear", "convolution", "scaled_dot_product", "softmax", "einsum")
+"""Parts of the names of operations that are products, convolutions or attention."""
+
+
+@dataclass(frozen=True)
+class DecodeShare:
+    """Seconds of one decode, median. products: in products, convolutions and attention. operations: in all tensor
+    operations. Both are the profiler's self times, which include its own cost per call: `rest` is an upper bound of
+    what is neither products nor attention only where that cost is small."""
+
+    method: str
+    seconds: float
+    products: float
+    operations: float
+
+    @property
+    def rest(self) -> float:
+        """Share of the decode that is neither products nor attention, in [0, 1]."""
+        return 1.0 - self.products / self.seconds
+
+
+def is_product(name: str) -> bool:
+    """Whether an operation of this name is a product, a convolution or attention."""
+    operation = name.rpartition("::")[2]
+    return any(part in operation for part in PRODUCTS)
+
+
+def share_of(method: str, decoder: Decoder, observation: Observation, repeats: int) -> DecodeShare:
+    """Measures `repeats` decodes without the profiler, and as many with it."""
+    from torch.profiler import ProfilerActivity, profile
+
+    for _ in range(2):
+        decoder.decode(observation)
+    seconds = [decoder.decode(observation).seconds for _ in range(repeats)]
+    with profile(activities=[ProfilerActivity.CPU]) as profiled:
+        for _ in range(repeats):
+            decoder.decode(observation)
+    events = [(event.key, event.self_cpu_time_total / 1e6 / repeats) for event in profiled.key_averages()]
+    products = sum(own for name, own in events if is_product(name))
+    return DecodeShare(method, float(np.median(seconds)), products, sum(own for _, own in events))
+
+
+def measure_shares(model: Model, repeats: int, methods: Sequence[str] = METHODS) -> list[DecodeShare]:
+    """Of a policy on a CPU, for every method whose artifacts are there; nothing for shapes and other devices."""
+    artifacts: Any = model.artifacts
+    if artifacts is None or torch.device(model.target.device).type != "cpu":
+        return []
+    found = []
+    for name in methods:
+        settings = compose_settings("rollout", [f"method={name}"], RolloutSettings)
+        if not all(artifacts.place(kind).exists() for kind in needs(settings.parts())):
+            continue
+        decoder = compose(settings.parts(), model.target, artifacts.load)
+        decoder.reset("", 0, np.zeros(3))
+        for _ in range(10):
+            decoder.observe(np.zeros(model.target.actions.dofs), np.zeros(3))
+        found.append(share_of(name, decoder, blank(model.target), repeats))
+    return found

@@ -1,0 +1,157 @@
+"""A round waits for the device once: counted on a pretended device, for every family of proposers."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pretended_device import DEVICE, Device, There, move
+from test_decoding_lossless import random_prompt, random_target
+from test_proposers import HELD, D, situation, stored
+
+from kerv_cli.decoding.boundary import Always
+from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.proposers import (
+    DrafterProposer,
+    EarlyProposer,
+    HybridProposer,
+    JacobiProposer,
+    MergedProposer,
+    PredictionProposer,
+    RetrievalProposer,
+)
+from kerv_cli.drafting.eagle import Drafter
+from kerv_cli.drafting.early import EarlyDrafter
+from kerv_cli.drafting.kinematics import Hold, Kalman, Noise
+from kerv_cli.settings import DrafterSettings
+from kerv_cli.targets.compact.trunk import LayerStack
+
+CHUNK = 2
+
+
+def test_the_device_counts_what_waits() -> None:
+    with torch.inference_mode(), Device() as device:
+        there = torch.arange(4, device=DEVICE)
+        index = torch.ones(2, dtype=torch.long).to(DEVICE, non_blocking=True)
+        assert isinstance(there, There)
+        doubled, chosen = 2 * there, there[index]
+        assert not device.waits
+        assert doubled.tolist() == [0, 2, 4, 6]
+        assert chosen.cpu().tolist() == [1, 1]
+        assert [int(there[3]), float(there.sum()), bool(there[0] == 0)] == [3, 6.0, True]
+        torch.zeros(2).to(DEVICE)
+        there[there > 1]
+        assert len(device.waits) == 7
+        with pytest.raises(AssertionError, match="mixes"):
+            there + torch.arange(4)
+        with pytest.raises(AssertionError, match="waits"):
+            there + torch.tensor([1], device=DEVICE)
+
+
+def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -> Parts:
+    """Untrained drafters and a few stored chunks, one of them right at first: there are rejections and rounds."""
+    wrong = np.array([truth] * 3)
+    wrong[:, 3:] = (wrong[:, 3:] + [[1], [2], [0]]) % 255
+    retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 24)
+    torch.manual_seed(1)
+    drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
+    network = EarlyDrafter.beside(DrafterSettings(width=16, layers=1, history=2, rank=4), target).eval()
+    chain, tree = (DrafterProposer(drafter, target, *sizes) for sizes in ((5, 1, 5), (3, 4, 9)))
+    early = EarlyProposer(network.requires_grad_(False), target)
+    hold = PredictionProposer(Hold(HELD, minimum=1, horizon=CHUNK))
+    kalman = PredictionProposer(Kalman(HELD, Noise.uniform(D, 1.0), horizon=CHUNK))
+    both = HybridProposer(chain, retrieval)
+    merged = MergedProposer([early], 48, [hold, kalman])
+    return {
+        "ar": Parts(),
+        "chain": Parts(proposer=chain),
+        "tree": Parts(proposer=tree),
+        "jacobi": Parts(proposer=JacobiProposer()),
+        "hold": Parts(proposer=hold),
+        "kalman": Parts(proposer=kalman),
+        "retrieval": Parts(proposer=retrieval),
+        "hybrid, drafter": Parts(proposer=both, boundary=Always("drafter")),
+        "hybrid, retrieval": Parts(proposer=both, boundary=Always("retrieval")),
+        "hold in the prefill": Parts(prefill_draft=hold),
+        "early": Parts(prefill_draft=early),
+        "merged": Parts(prefill_draft=merged),
+        "merged, then chain": Parts(prefill_draft=merged, proposer=chain),
+    }[family]
+
+
+FAMILIES = (
+    "ar", "chain", "tree", "jacobi", "hold", "kalman", "retrieval", "hybrid, drafter", "hybrid, retrieval",
+    "hold in the prefill", "early", "merged", "merged, then chain",
+)  # fmt: skip
+
+
+def modules(parts: Parts) -> list[torch.nn.Module]:
+    """The networks of a method."""
+    found: list[Any] = [parts.prefill_draft, parts.proposer]
+    for part in found:
+        found += [*getattr(part, "sources", ()), *getattr(part, "sides", {}).values()]
+    networks = [getattr(part, name, None) for part in found for name in ("drafter", "early")]
+    return [network for network in networks if isinstance(network, torch.nn.Module)]
+
+
+CASES = [
+    (family, captured) for family in FAMILIES for captured in (False, family in ("ar", "tree", "merged, then chain"))
+]
+
+
+@pytest.mark.parametrize(("family", "captured"), dict.fromkeys(CASES))
+def test_a_round_waits_once(family: str, captured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the tokens are those of the host, draft for draft: the same rounds."""
+    target = random_target(2, 1, 2, CHUNK)
+    prompt = random_prompt(target, 2)
+    truth = Decoder(target).decode_prompt(prompt).tokens
+    on_host = Decoder(target, parts_of(family, target, prompt, truth))
+    on_host.situation = situation(np.random.default_rng(0), 8)
+    wanted = on_host.decode_prompt(prompt)
+    assert wanted.tokens == truth
+    if captured:
+        monkeypatch.setattr(LayerStack, "captures", lambda self, x, cache: cache is not None and cache.fixed)
+    parts = parts_of(family, target, prompt, truth)
+    monkeypatch.setattr(Drafter, "new_cache", functools.partialmethod(LayerStack.new_cache, fixed=captured))
+    target.new_cache = functools.partial(target.new_cache, fixed=captured)  # type: ignore[method-assign]
+    for module in (target, *modules(parts)):
+        move(module)
+    with torch.inference_mode(), Device() as device:
+        decoder = Decoder(target, parts_of_device(parts))
+        waits: list[int] = []
+
+        def counted(work: Any) -> Any:
+            def run(*arguments: Any) -> Any:
+                before = len(device.waits)
+                result = work(*arguments)
+                waits.append(len(device.waits) - before)
+                return result
+
+            return run
+
+        for name in ("prefill", "round", "decode_alone"):
+            monkeypatch.setattr(decoder, name, counted(getattr(decoder, name)))
+        decoder.situation = situation(np.random.default_rng(0), 8)
+        found = decoder.decode_prompt(prompt.to(DEVICE, non_blocking=True))
+    assert found.tokens == truth
+    assert found.rounds == wanted.rounds
+    assert len(found.rounds) > 1
+    assert max(waits) == 1, device.waits
+    assert sum(waits) == len(device.waits), "waits outside of the rounds"
+    alone = parts.proposer is None  # what is left is then read at once
+    assert len(waits) == (2 if alone else len(found.rounds))
+
+
+def parts_of_device(parts: Parts) -> Parts:
+    """The parts, told that their target is there."""
+    known: list[Any] = [parts.prefill_draft, parts.proposer]
+    for part in known:
+        known += [*getattr(part, "sources", ()), *getattr(part, "sides", {}).values()]
+        if hasattr(part, "waits"):
+            part.waits = False
+        if isinstance(part, DrafterProposer):
+            part.state.cache = part.drafter.new_cache(1, part.state.cache.capacity)
+    return parts
