@@ -172,9 +172,9 @@ class StandInCalibration:
 
 
 def datastore_of(tokens: np.ndarray, width: int, steps: int) -> Datastore:
-    """ENTRIES random keys; chunks near `tokens` (N,)."""
+    """ENTRIES random keys in few directions, as a policy's are; chunks near `tokens` (N,)."""
     random = np.random.default_rng(0)
-    vectors = random.standard_normal((ENTRIES, width)).astype(np.float32)
+    vectors = (random.standard_normal((ENTRIES, 16)) @ random.standard_normal((16, width))).astype(np.float32)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     chunks = (tokens + random.integers(0, 3, (ENTRIES, len(tokens)))) % SPEC.actions.tokens
     files = {"vectors.npy": "", "payload.parquet": ""}

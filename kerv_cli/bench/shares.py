@@ -16,6 +16,7 @@ from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.settings import RolloutSettings
 from kerv_cli.spaces import Observation
 
+_PROFILED = 5  # decodes under the profiler: a thousand events each
 METHODS = ("ar", "spec_vla", "one_pass")
 PRODUCTS = ("mm", "mv", "dot", "linear", "convolution", "scaled_dot_product", "softmax", "einsum")
 """Parts of the names of operations that are products, convolutions or attention."""
@@ -45,16 +46,16 @@ def is_product(name: str) -> bool:
 
 
 def share_of(method: str, decoder: Decoder, observation: Observation, repeats: int) -> DecodeShare:
-    """Measures `repeats` decodes without the profiler, and as many with it."""
+    """Measures `repeats` decodes without the profiler, and a few with it."""
     from torch.profiler import ProfilerActivity, profile
 
     for _ in range(2):
         decoder.decode(observation)
     seconds = [decoder.decode(observation).seconds for _ in range(repeats)]
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
-        for _ in range(repeats):
+        for _ in range(_PROFILED):
             decoder.decode(observation)
-    events = [(event.key, event.self_cpu_time_total / 1e6 / repeats) for event in profiled.key_averages()]
+    events = [(event.key, event.self_cpu_time_total / 1e6 / _PROFILED) for event in profiled.key_averages()]
     products = sum(own for name, own in events if is_product(name))
     return DecodeShare(method, float(np.median(seconds)), products, sum(own for _, own in events))
 

@@ -27,6 +27,8 @@ class ActionHistory:
     def __init__(self, dofs: int, window: int = WINDOW) -> None:
         self.dofs = dofs
         self._actions: deque[np.ndarray] = deque(maxlen=window)
+        self._stacked = np.zeros((0, dofs))  # the same, for the readers of one decode; never written to
+        self._stacked.flags.writeable = False
 
     def append(self, action: np.ndarray) -> None:
         """An action (D,) in [-1, 1] was executed.
@@ -38,6 +40,8 @@ class ActionHistory:
         if action.shape != (self.dofs,) or not np.isfinite(action).all():
             raise ValueError(f"an executed action must be {self.dofs} finite numbers, not {action}")
         self._actions.append(action)
+        self._stacked = np.array(self._actions)
+        self._stacked.flags.writeable = False
 
     def values(self, pending: np.ndarray | None = None) -> np.ndarray:
         """(m, D), oldest first, m ≤ window.
@@ -45,9 +49,10 @@ class ActionHistory:
         pending: (k, D) steps of the present chunk that are known but not yet executed. They are appended as if
         executed, so that the next step is one step ahead instead of k + 1.
         """
-        known = [*self._actions, *(() if pending is None else np.asarray(pending, dtype=np.float64))]
-        known = known[-(self._actions.maxlen or 0) :]
-        return np.stack(known) if known else np.zeros((0, self.dofs))
+        if pending is None or not len(pending):
+            return self._stacked
+        known = np.concatenate([self._stacked, np.asarray(pending, dtype=np.float64)])
+        return known[-(self._actions.maxlen or 0) :]
 
 
 @dataclass(frozen=True)

@@ -96,9 +96,7 @@ def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
 def visible_in_prefill(tree: TokenTree, prompt: int) -> np.ndarray:
     """(P + n, P + n) bool for [prompt, nodes…]: causal in the prompt; a node sees the prompt and its path."""
     n = len(tree)
-    seen = np.zeros((prompt + n, prompt + n), dtype=bool)
-    seen[:prompt, :prompt] = np.tri(prompt, dtype=bool)
-    seen[prompt:, :prompt] = True
+    seen = np.tri(prompt + n, dtype=bool)
     seen[prompt:, prompt:] = tree.ancestors()
     return seen
 
