@@ -15,6 +15,7 @@ from kerv_cli.bench.phases import Stage
 from kerv_cli.bench.sequences import Recorded
 from kerv_cli.decoding.cost import DRAFTER, DecodeSequence, Forward
 from kerv_cli.drafting.eagle import draft_tree
+from kerv_cli.drafting.tree import TokenTree, visible_in_verification
 from kerv_cli.drafting.unread import Unread
 
 _SPARE = 8
@@ -56,16 +57,20 @@ class Player:
         else:
             # as in a decode: a draft is read with the target's tokens; without a proposer all tokens behind the last
             reads = last or proposer.get("kind") != "none"
-            seen, beside = (drafted.seen(1), drafted.numbers) if drafted is not None else (None, None)
+            seen, beside = None, None
+            if isinstance(drafted, Unread):
+                seen, beside = drafted.seen(1), drafted.numbers
+            elif drafted is not None:
+                seen = visible_in_verification(drafted)
             stage.verify(count, forward.start, seen, beside, reads)
         if count:
             first = stage.length + forward.start - (forward.kind == "verify")
             kept = forward.accepted + (forward.kind == "verify")
-            if drafted is not None and drafted.visible is not None:
+            if isinstance(drafted, TokenTree) or (drafted is not None and drafted.visible is not None):
                 stage.cache.compact(first, torch.arange(first, first + kept, device=stage.device))
             stage.cache.length = first + kept
 
-    def _draft(self, forward: Forward, proposer: Mapping[str, Any]) -> Unread:
+    def _draft(self, forward: Forward, proposer: Mapping[str, Any]) -> TokenTree | Unread:
         depth, top_k = _tree(proposer)
         state, stage = self.stage.draft_state, self.stage
         state.cache.length = stage.length + forward.start - 1

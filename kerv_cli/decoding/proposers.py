@@ -333,8 +333,8 @@ class DrafterProposer:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
         observe(self.drafter, self.state, following, chunk.hidden, 0)
 
-    def propose(self, chunk: Chunk, depth: int) -> Unread:
-        """A chain or dynamic tree of the settings' size, on the device."""
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+        """A chain or dynamic tree of the settings' size."""
         return draft_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:

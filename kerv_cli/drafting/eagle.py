@@ -99,10 +99,12 @@ def observe(drafter: DraftsStates, state: DraftState, following: Tensor, hidden:
     state.hidden = drafter(following, hidden, positions, state.cache)[0, -1]
 
 
-def draft_tree(drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> Unread:
+def draft_tree(
+    drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
+) -> TokenTree | Unread:
     """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
     `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree. It stays on the
-    device: nothing here waits for it.
+    device, nothing here waits for it; on a CPU, where there is nothing to wait for, a tree is ranked on the host.
     """
     if top_k == 1:
         return Unread.chain(draft_chain(drafter, target, state, min(depth, nodes)))
@@ -133,14 +135,19 @@ def draft_tree(drafter: DraftsStates, target: Target, state: DraftState, depth: 
         hidden = hidden[:, chosen]
         seen = torch.cat([seen[chosen], own[:top_k, :top_k]], 1)
     state.cache.length = base
-    return _keep_best(torch.cat(every), torch.cat(parents), torch.cat(cumulative), nodes, depth)
+    found = torch.cat(every), torch.cat(parents), torch.cat(cumulative)
+    if device.type == "cpu":
+        every_token, every_parent, every_score = (numbers.tolist() for numbers in found)
+        return _best_of(every_token, every_parent, every_score, nodes)
+    return _keep_best(*found, nodes, depth)
 
 
 def grow_tree(
     drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
 ) -> TokenTree:
     """As `draft_tree`, read at once."""
-    return draft_tree(drafter, target, state, depth, top_k, nodes).now()
+    found = draft_tree(drafter, target, state, depth, top_k, nodes)
+    return found if isinstance(found, TokenTree) else found.now()
 
 
 def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> Tensor:
@@ -158,8 +165,15 @@ def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth:
     return torch.cat(drafted)
 
 
+def _best_of(tokens: list[int], parents: list[int], scores: list[float], nodes: int) -> TokenTree:
+    # sorted is stable and children stand behind their parents: on equal scores the parent is kept first
+    best = sorted(sorted(range(len(tokens)), key=lambda i: -scores[i])[:nodes])
+    index = {old: new for new, old in enumerate(best)} | {ROOT: ROOT}
+    return TokenTree.build([tokens[i] for i in best], [index[parents[i]] for i in best])
+
+
 def _keep_best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Unread:
-    # the sort is stable and children stand behind their parents: on equal scores the parent is kept first
+    # as `_best_of`, on the device
     best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
     index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
     index[best] = torch.arange(best.shape[0], device=tokens.device)
