@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import torch
 
+from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.recording import DemoConfig, record, run_expert
@@ -75,8 +76,8 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     generator = torch.Generator().manual_seed(0)
 
     def share(balance: float) -> float:
-        job = Job(torch.nn.Linear(1, 1), 1000, lambda i, s: (torch.zeros(()), {}), lambda m: {}, lambda m, x: None)
-        job = Job(**(vars(job) | {"weights": balanced(tasks, balance)}))
+        nothing = (lambda i, s: (torch.zeros(()), {}), lambda m: {}, lambda m, x: None)
+        job = Job(torch.nn.Linear(1, 1), 1000, *nothing, balanced(tasks, balance))
         return float(tasks[job.batch(20_000, generator)].double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
@@ -105,7 +106,7 @@ def test_datasets_of_other_cameras_do_not_add_up(results: Path, tmp_path: Path) 
 
 
 def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
-    acts = TargetActs.of("results", "mt10-state", WorldSettings())
+    acts = TargetActs.of("results", "mt10-state", SPEC, WorldSettings())
     tasks, share = ("reach-v3",), 0.5
     config = DemoConfig(tasks, 2, camera=SHORT, frame_stride=20, workers=1, horizon=60, expert_share=share)
     config = DemoConfig(**(vars(config) | {"policy": acts.sha256}))
@@ -147,4 +148,9 @@ def test_a_target_of_another_frame_size_is_refused() -> None:
     settings = WorldSettings()
     settings.camera.size = 48
     with pytest.raises(UsageError, match=r"world.camera.size=48"):
-        TargetActs.of("results", "mt10-vision", settings)
+        TargetActs.of("results", "mt10-vision", SPEC, settings)
+
+
+def test_a_target_of_other_actions_is_refused() -> None:
+    with pytest.raises(CheckpointError, match="target 'mt10-state'"):
+        TargetActs.of("results", "mt10-state", spec_of("insert-peg"), WorldSettings())

@@ -44,7 +44,7 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
     from kerv_cli.environments.camera import CameraConfig
     from kerv_cli.environments.demos.recording import DemoConfig, record
 
-    actor = _actor(settings)
+    actor = _actor(settings, tasks[0])
     config = DemoConfig(
         tasks=tasks,
         episodes=settings.episodes,
@@ -69,15 +69,16 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
 
 
-def _actor(settings: DemosSettings) -> TargetActs | None:
-    """What moves the robot in the expert's place; None: the expert itself."""
+def _actor(settings: DemosSettings, task: str) -> TargetActs | None:
+    """What moves the robot in the expert's place; None: the expert itself. task: one of those recorded."""
+    from kerv_cli.environments import spec_of
     from kerv_cli.settings import EXPERT, PolicySettings
 
     target = settings.policy.target
     if settings.policy.kind != EXPERT:
         from kerv_cli.training.dagger import TargetActs
 
-        return TargetActs.of(settings.results, target, settings.world)
+        return TargetActs.of(settings.results, target, spec_of(task), settings.world)
     if target != PolicySettings().target:
         from kerv_cli.errors import UsageError
 

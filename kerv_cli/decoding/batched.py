@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.decoding.chunk import Chunk, Situation
-from kerv_cli.decoding.decoder import Decoder, mode_of
+from kerv_cli.decoding.decoder import Decoder, deviation, record_of
 from kerv_cli.decoding.proposers import EarlyProposer
 from kerv_cli.decoding.record import PARALLEL, UNTIMED, DecodeRecord, Round
 from kerv_cli.decoding.verify_skip import ParallelPass
@@ -106,8 +106,9 @@ class BatchDecoder:
             lane.decodes += 1
             if self.every and lane.decodes % self.every == 0:
                 due.append(place)
-        for place, deviation in zip(due, self._deviations([chunks[i] for i in due]), strict=True):
-            records[place] = replace(records[place], deviation=deviation)
+        for place, wanted in zip(due, self._autoregressive([chunks[place] for place in due]), strict=True):
+            gap = deviation(self.target.actions, records[place].actions, wanted) if wanted is not None else 0.0
+            records[place] = replace(records[place], deviation=gap)
         return records
 
     def _prompts(self, observations: Sequence[Observation]) -> list[Tensor]:
@@ -159,33 +160,23 @@ class BatchDecoder:
         for chunk, tokens in zip(chunks, found, strict=True):
             chunk.skip(tokens, draft.name)
 
-    def _deviations(self, chunks: Sequence[Chunk]) -> list[float]:
-        """Mean absolute difference of each chunk to autoregressive decoding, normalised action units."""
-        space, found = self.target.actions, [0.0] * len(chunks)
+    def _autoregressive(self, chunks: Sequence[Chunk]) -> list[np.ndarray | None]:
+        """The actions (H, D) that autoregressive decoding would have chosen for each chunk; None where it decoded
+        them."""
+        found: list[np.ndarray | None] = [None] * len(chunks)
         if self.draft is None and self.skip is None:
-            return found  # it is that
+            return found
+        space = self.target.actions
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
             places = [place for place, chunk in enumerate(chunks) if chunk.prompt_length == length]
             wanted = self._tokens(torch.cat([chunks[place].prompt for place in places]))
             for place, tokens in zip(places, wanted, strict=True):
-                both = [space.decode(np.array(t).reshape(-1, space.dofs)) for t in (chunks[place].tokens, tokens)]
-                own, other = (space.normalise(actions.astype(np.float32)) for actions in both)
-                found[place] = float(np.abs(own - other).mean())
+                found[place] = space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
         return found
 
     def _record(self, chunk: Chunk) -> DecodeRecord:
-        actions, _ = self.decoder.actions_of(chunk)
-        return DecodeRecord(
-            tokens=tuple(chunk.tokens),
-            actions=actions,
-            size=chunk.size,
-            forwards=chunk.forwards,
-            rounds=tuple(chunk.rounds),
-            mode=mode_of(chunk.rounds),
-            seconds=math.nan,
-            phases=dict(UNTIMED),
-            skipped=any(played.mode == "skip" for played in chunk.rounds),
-        )
+        actions, predicted = self.decoder.actions_of(chunk)
+        return record_of(chunk, actions, math.nan, dict(UNTIMED), predicted)
 
     @property
     def _size(self) -> int:

@@ -143,6 +143,11 @@ def compose(
     return Decoder(target, Parts(**context.built), chunk)
 
 
+def own_decoder(target: Any) -> Decoder:
+    """A target as it was trained to decode: autoregressive, or all tokens in one pass."""
+    return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
+
+
 def nothing(settings: Any, context: Context) -> None:
     """Choices that stand for the absence of a part: none, reinfer, always."""
 

@@ -21,7 +21,7 @@ from kerv_cli.drafting.kinematics import ActionHistory
 from kerv_cli.drafting.tree import TokenTree, visible_in_prefill
 from kerv_cli.drafting.unread import Unread
 from kerv_cli.errors import UsageError
-from kerv_cli.spaces import Observation
+from kerv_cli.spaces import ActionSpace, Observation
 from kerv_cli.targets.protocol import Target
 from kerv_cli.targets.transfer import read, upload
 
@@ -121,22 +121,7 @@ class Decoder:
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
         seconds = clock.stop()
-        return DecodeRecord(
-            tokens=tuple(chunk.tokens),
-            actions=actions,
-            size=chunk.size,
-            forwards=chunk.forwards,
-            rounds=tuple(chunk.rounds),
-            mode=mode_of(chunk.rounds),
-            seconds=seconds,
-            phases=clock.phases,
-            compensated=predicted,
-            variability=chunk.variability,
-            skipped=any(r.mode == "skip" for r in chunk.rounds),
-            similarity=chunk.similarity,
-            metric=chunk.choice.metric if chunk.choice is not None else None,
-            trust=chunk.trust,
-        )
+        return record_of(chunk, actions, seconds, clock.phases, predicted)
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
         """The chunk's actions (steps, D) float32 in environment units, and how many of their numbers were predicted."""
@@ -331,6 +316,35 @@ class Decoder:
         # where the target's token filled the last place nothing is missing, if it may be used
         if chunk.left or not rectifier.settings.use_target_token:
             rectifier.close(chunk)
+
+
+def record_of(
+    chunk: Chunk, actions: np.ndarray, seconds: float, phases: dict[str, float], compensated: int
+) -> DecodeRecord:
+    """The record of a complete chunk. actions (H, D), seconds, phases, compensated: as in `DecodeRecord`."""
+    return DecodeRecord(
+        tokens=tuple(chunk.tokens),
+        actions=actions,
+        size=chunk.size,
+        forwards=chunk.forwards,
+        rounds=tuple(chunk.rounds),
+        mode=mode_of(chunk.rounds),
+        seconds=seconds,
+        phases=phases,
+        compensated=compensated,
+        variability=chunk.variability,
+        skipped=any(played.mode == "skip" for played in chunk.rounds),
+        similarity=chunk.similarity,
+        metric=chunk.choice.metric if chunk.choice is not None else None,
+        trust=chunk.trust,
+    )
+
+
+def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:
+    """Mean absolute difference of actions (h, D) to the first h ≤ H of autoregressive decoding's (H, D), in normalised
+    action units."""
+    gap = space.normalise(actions) - space.normalise(autoregressive[: len(actions)])
+    return float(np.abs(gap).mean())
 
 
 def mode_of(rounds: Sequence[Round]) -> str:

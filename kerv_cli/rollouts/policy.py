@@ -12,7 +12,7 @@ from kerv_cli.artifacts import Artifacts
 from kerv_cli.decoding.batched import BatchDecoder, check_batch
 from kerv_cli.decoding.build import check as check_method
 from kerv_cli.decoding.build import compose, needs
-from kerv_cli.decoding.decoder import Decoder
+from kerv_cli.decoding.decoder import Decoder, deviation
 from kerv_cli.decoding.record import DecodeRecord
 from kerv_cli.environments import resolve_tasks, spec_of
 from kerv_cli.environments.spec import EnvironmentSpec
@@ -94,11 +94,8 @@ def check(settings: RolloutSettings) -> None:
         _check_expert(settings, spec)
         return
     artifacts = artifacts_of(settings)
-    target, camera = artifacts.description, settings.world.camera
-    size = target.settings.get("image_size", camera.size)
-    if target.cameras and camera.size != size:
-        raise UsageError(f"world.camera.size={camera.size}: the policy was trained on {size} pixels")
-    target.actions.check_same(spec.actions, f"target '{settings.policy.target}'", f"environment {spec.name}")
+    target = artifacts.description
+    target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
     method = settings.parts()
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
@@ -159,10 +156,8 @@ class Sampled:
         self.count += 1
         if self.count % self.every:
             return record
-        space = self.decoder.target.actions
-        wanted = self.reference.decode(observation).actions[: len(record.actions)]
-        gap = np.abs(space.normalise(record.actions) - space.normalise(wanted))
-        return dataclasses.replace(record, deviation=float(gap.mean()))
+        wanted = self.reference.decode(observation).actions
+        return dataclasses.replace(record, deviation=deviation(self.decoder.target.actions, record.actions, wanted))
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """Tells the decoder; AR needs no history."""

@@ -10,10 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from kerv_cli.decoding.batched import BatchDecoder
-from kerv_cli.decoding.build import is_parallel
-from kerv_cli.decoding.decoder import Decoder, Parts
+from kerv_cli.decoding.build import own_decoder
 from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.decoding.verify_skip import ParallelPass
 from kerv_cli.environments import spec_of
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.spec import World
@@ -152,7 +150,7 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to,
     autoregressively or in parallel, TOGETHER at a time."""
-    decoder = BatchDecoder(Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None))
+    decoder = BatchDecoder(own_decoder(target))
     wanted = [Wanted(None, task, seed) for task in tasks for seed in seeds]
     outcomes = []
     for ended in run_together(decoder, wanted, TOGETHER, lambda task: new_world(task, settings)):

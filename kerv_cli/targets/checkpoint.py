@@ -65,6 +65,18 @@ class TargetDescription(Description):
         """Whether it decodes all tokens of a chunk at once, and only so."""
         return bool(self.settings.get("parallel"))
 
+    def check_world(self, name: str, environment: str, actions: ActionSpace, size: int) -> None:
+        """Refuses a world that the target, called `name`, was not made for. actions, size: the environment's action
+        space, and the pixels of the frames that it would be shown.
+
+        Raises:
+            UsageError: frames of another size. CheckpointError: another action space.
+        """
+        trained = self.settings.get("image_size", size)
+        if self.cameras and size != trained:
+            raise UsageError(f"world.camera.size={size}: the policy was trained on {trained} pixels")
+        self.actions.check_same(actions, f"target '{name}'", f"environment {environment}")
+
     def check_autoregressive(self, asked: str, why: str) -> None:
         """Refuses a target that decodes in parallel. asked: what wants another one; why: what it would lack.
 

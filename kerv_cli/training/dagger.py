@@ -12,12 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kerv_cli.decoding.build import is_parallel
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.verify_skip import ParallelPass
+from kerv_cli.decoding.build import own_decoder
 from kerv_cli.environments.demos.recording import DemoConfig
-from kerv_cli.environments.spec import World
-from kerv_cli.errors import UsageError
+from kerv_cli.environments.spec import EnvironmentSpec, World
 from kerv_cli.places import find_target
 from kerv_cli.settings import WorldSettings
 from kerv_cli.targets.checkpoint import load_target, read_target
@@ -28,7 +25,7 @@ class TargetActor:
     the chunks, drawn by task and seed, the expert acts instead; then the target decodes anew."""
 
     def __init__(self, target: Any, expert_share: float) -> None:
-        self.decoder = Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)
+        self.decoder = own_decoder(target)
         self.chunk, self.share = target.chunk, expert_share
         self.in_hand: deque[NDArray[np.float64]] = deque()
         self.expert_steps = 0
@@ -77,17 +74,15 @@ class TargetActs:
     sha256: str
 
     @classmethod
-    def of(cls, results: str, name: str, world: WorldSettings) -> TargetActs:
-        """The target of that name.
+    def of(cls, results: str, name: str, spec: EnvironmentSpec, world: WorldSettings) -> TargetActs:
+        """The target of that name, for worlds of an environment.
 
         Raises:
-            UsageError: no such target, or one that was trained on frames of another size. CheckpointError: damaged.
+            UsageError: no such target, or as `check_world`. CheckpointError: it is damaged, or as `check_world`.
         """
         folder = find_target(results, name)
         described = read_target(folder)
-        size = described.settings.get("image_size", world.camera.size)
-        if described.cameras and size != world.camera.size:
-            raise UsageError(f"world.camera.size={world.camera.size}: policy={name} was trained on {size} pixels")
+        described.check_world(name, spec.name, spec.actions, world.camera.size)
         return cls(folder, described.sha256)
 
     def __call__(self, config: DemoConfig) -> TargetActor:

@@ -63,8 +63,9 @@ def load_samples(
         episode = dataset.load(index)
         seen = read_observations(episode, settings, dataset.manifest.observation, words)
         chunks = torch.from_numpy(read_chunks(episode, seen.steps.numpy(), settings.chunk)).float()
-        of_all = (torch.full((len(seen),), n) for n in (number, task_names.index(episode.task)))
-        parts.append(Samples(**vars(seen), chunks=chunks, **dict(zip(("episodes", "tasks"), of_all, strict=True))))
+        episodes = torch.full((len(seen),), number)
+        tasks = torch.full_like(episodes, task_names.index(episode.task))
+        parts.append(Samples(**vars(seen), chunks=chunks, episodes=episodes, tasks=tasks))
         on_episode(number + 1, len(chosen))
     return Samples.joined(parts)
 

@@ -6,6 +6,7 @@ and history: an interrupted and resumed run writes the same bytes as an uninterr
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
@@ -44,11 +45,15 @@ class Job:
 
     def batch(self, size: int, generator: torch.Generator) -> Tensor:
         """(size,) int64: samples drawn with replacement."""
-        if self.weights is None:
+        if self._borders is None:
             return torch.randint(self.samples, (size,), generator=generator)
-        borders = self.weights.double().cumsum(0)
-        drawn = torch.rand(size, generator=generator, dtype=torch.float64) * borders[-1]
-        return torch.searchsorted(borders, drawn, right=True).clamp_(max=self.samples - 1)
+        drawn = torch.rand(size, generator=generator, dtype=torch.float64) * self._borders[-1]
+        return torch.searchsorted(self._borders, drawn, right=True).clamp_(max=self.samples - 1)
+
+    @functools.cached_property
+    def _borders(self) -> Tensor | None:
+        """Sums of the weights up to each sample."""
+        return None if self.weights is None else self.weights.double().cumsum(0)
 
 
 @dataclass(frozen=True)
