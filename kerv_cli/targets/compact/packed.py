@@ -12,11 +12,13 @@ and the module computes without them.
 from __future__ import annotations
 
 import math
+import platform
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -40,6 +42,15 @@ def has_blocked_layouts() -> bool:
     """Whether this build of torch carries oneDNN's fused operators."""
     names = ("_linear_pointwise", "_convolution_pointwise", "_reorder_linear_weight", "_reorder_convolution_weight")
     return torch.backends.mkldnn.is_available() and all(hasattr(torch.ops.mkldnn, name) for name in names)
+
+
+@lru_cache(maxsize=1)
+def is_intel() -> bool:
+    """Whether the CPU is Intel's. On others MKL, with which torch is built, multiplies one row slowly: the products of
+    one token of `small` take 1.7 ms on an AMD EPYC, with numpy's OpenBLAS 0.8 ms (measured)."""
+    described = Path("/proc/cpuinfo")
+    text = described.read_text(encoding="utf-8", errors="replace") if described.exists() else platform.processor()
+    return "Intel" in text
 
 
 def wants_gradient(x: Tensor) -> bool:
@@ -123,6 +134,7 @@ class FastLinear:
         self.input_major = weight.t().contiguous()
         self.weight = self.input_major.t()
         self.nothing = weight.new_zeros(1)
+        self.array = None if is_intel() else self.input_major.numpy()
         self.rows = -(-BLOCKED_FROM // weight.numel())
         self.blocked: Tensor | None = None
         if has_blocked_layouts():
@@ -141,7 +153,17 @@ class FastLinear:
 
     def of_vector(self, x: Tensor, scale: float) -> Tensor:
         """x (I,) -> scale · the product (O,)."""
+        if self.array is not None:
+            product = np.dot(x.numpy(), self.array)
+            product *= scale
+            return torch.from_numpy(product)
         return torch.addmv(self.nothing, self.weight, x, beta=0, alpha=scale)
+
+    def added_to_vector(self, other: Tensor, x: Tensor) -> Tensor:
+        """other (O,) + the product of x (I,)."""
+        if self.array is not None:
+            return torch.from_numpy(np.dot(x.numpy(), self.array)).add_(other)
+        return torch.addmv(other, self.weight, x)
 
 
 class RowNorm:
@@ -227,9 +249,9 @@ class PackedLayer:
             cache.narrow(3, start, 1).copy_(heads[1:])
             k, v = cache.narrow(3, 0, start + 1)
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        row = torch.addmv(row, self.out.weight, attended.view(self.width))
+        row = self.out.added_to_vector(row, attended.view(self.width))
         gate, up = self.gate_up.of_vector(row, self.norm.of_vector(row)).view(2, -1)
-        return row.addmv_(self.down.weight, F.silu(gate).mul_(up)).view(1, 1, self.width)
+        return self.down.added_to_vector(row, F.silu(gate).mul_(up)).view(1, 1, self.width)
 
 
 class PackedLayers(Packed):
