@@ -75,18 +75,19 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
-def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(tmp_path: Path, number: signal.Signals) -> None:
     whole = quadratic(tmp_path / "whole")
     whole.run()
     cut = quadratic(tmp_path / "cut")
     steps: list[int] = []
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
+    before = signal.signal(number, signal.default_int_handler)  # a test run in the background ignores Ctrl-C
     try:
         with pytest.raises(Interrupted, match="step 7 is saved"):
-            cut.run(lambda step, metrics: os.kill(os.getpid(), signal.SIGINT) if step == 7 else None)
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+            cut.run(lambda step, metrics: os.kill(os.getpid(), number) if step == 7 else None)
+        assert signal.getsignal(number) is signal.default_int_handler
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
     resumed = quadratic(tmp_path / "cut")
     resumed.run(lambda step, metrics: steps.append(step))
     assert steps[0] == 8

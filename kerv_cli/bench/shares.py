@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +48,20 @@ def is_product(name: str) -> bool:
     return any(part in operation for part in PRODUCTS)
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Nothing reaches standard error: the profiler writes its stages there, whatever its log level."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
 def share_of(method: str, decoder: Decoder, observation: Observation, repeats: int) -> DecodeShare:
     """Measures `repeats` decodes without the profiler, and a few with it."""
     from torch.profiler import ProfilerActivity, profile
@@ -52,7 +69,7 @@ def share_of(method: str, decoder: Decoder, observation: Observation, repeats: i
     for _ in range(2):
         decoder.decode(observation)
     seconds = [decoder.decode(observation).seconds for _ in range(repeats)]
-    with profile(activities=[ProfilerActivity.CPU]) as profiled:
+    with quiet(), profile(activities=[ProfilerActivity.CPU]) as profiled:
         for _ in range(_PROFILED):
             decoder.decode(observation)
     events = [(event.key, event.self_cpu_time_total / 1e6 / _PROFILED) for event in profiled.key_averages()]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -52,7 +53,7 @@ class LearnedScore(nn.Module):
     @torch.inference_mode()
     def expected_loss(self, features: Tensor, scores: Sequence[float]) -> float:
         """features (1, F) and the values of `inputs` -> the expected loss in [0, 1]."""
-        known = upload([list(scores)], features.device).clamp_min(FLOOR)
+        known = upload(np.asarray([scores], dtype=np.float32), features.device).clamp_min(FLOOR)
         return float(self(torch.cat([features.float(), known], 1)).sigmoid())
 
 

