@@ -52,7 +52,7 @@ step() {
         return
     fi
     start=$SECONDS
-    timeout --kill-after=10 "$most" "$@" >"$OUT/$name.log" 2>&1 </dev/null
+    timeout --kill-after=30 "$most" "$@" >"$OUT/$name.log" 2>&1 </dev/null
     code=$?
     # training goes on for as long as there is time and saves its state when it is told to end
     [ "$code" -eq 0 ] || [ "$name:$code" = train:124 ] || failures=$((failures + 1))
@@ -99,7 +99,7 @@ if [ -d "$DEMOS" ]; then
     mkdir -p "$OUT/artifacts/demos"
     ln -sfn "$(cd "$DEMOS" && pwd)" "$OUT/artifacts/demos/mt50"
     # shellcheck disable=SC2086
-    kerv train "$(left)" train target name=mt50-vision task=MT50 demos=mt50 $TRAIN
+    kerv train "$(left)" train target name=mt50-vision-gpu task=MT50 demos=mt50 $TRAIN
 else
     skip train "no demonstrations in $DEMOS: run 'kerv demos task=MT50 name=mt50', or set DEMOS"
 fi
