@@ -75,22 +75,24 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize(("number", "last"), [(signal.SIGINT, 7), (signal.SIGTERM, 7), (signal.SIGINT, 2)])
+def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
+    tmp_path: Path, number: signal.Signals, last: int
+) -> None:  # step 2 comes before the first validation
     whole = quadratic(tmp_path / "whole")
     whole.run()
     cut = quadratic(tmp_path / "cut")
     steps: list[int] = []
     before = signal.signal(number, signal.default_int_handler)  # a test run in the background ignores Ctrl-C
     try:
-        with pytest.raises(Interrupted, match="step 7 is saved"):
-            cut.run(lambda step, metrics: os.kill(os.getpid(), number) if step == 7 else None)
+        with pytest.raises(Interrupted, match=f"step {last} is saved"):
+            cut.run(lambda step, metrics: os.kill(os.getpid(), number) if step == last else None)
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, before)
     resumed = quadratic(tmp_path / "cut")
     resumed.run(lambda step, metrics: steps.append(step))
-    assert steps[0] == 8
+    assert steps[0] == last + 1
     for name, tensor in whole.job.module.state_dict().items():
         assert torch.equal(tensor, resumed.job.module.state_dict()[name])
 

@@ -59,11 +59,11 @@ class Job:
 @dataclass(frozen=True)
 class Progress:
     """The progress of a run. identity: hash of everything that determines it. step: steps done. best: greatest score so
-    far. history: the metrics of every validation."""
+    far, None before the first validation. history: the metrics of every validation."""
 
     identity: str
     step: int
-    best: float
+    best: float | None
     history: list[Metrics]
 
 
@@ -161,14 +161,17 @@ class Loop:
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
-        progress = Progress(self.identity, self.step, self.best, self.history)
+        best = self.best if self.history else None
+        progress = Progress(self.identity, self.step, best, self.history)
         write_state(self.folder / "resume.safetensors", tensors, progress)
         self.log()
 
     def log(self) -> None:
-        """Writes `log.csv`, a row per validation."""
+        """Writes `log.csv`, a row per validation; nothing before the first."""
         import pandas as pd
 
+        if not self.history:
+            return
         with atomic_path(self.folder / "log.csv") as temporary:
             pd.DataFrame(self.history).to_csv(temporary, index=False, float_format="%.6g")
 
@@ -195,7 +198,8 @@ class Loop:
                 state.setdefault(int(index), {})[key] = tensor
         groups = self.optimiser.state_dict()["param_groups"]
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
-        self.step, self.best, self.history = progress.step, progress.best, progress.history
+        self.step, self.history = progress.step, progress.history
+        self.best = -math.inf if progress.best is None else progress.best
         self.log()  # the run may have ended before it wrote the log
 
 
