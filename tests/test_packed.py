@@ -11,11 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kerv_cli.bench.shares import timed_row_products
 from kerv_cli.drafting.eagle import Drafter
 from kerv_cli.drafting.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.settings import DrafterSettings, TargetSettings
 from kerv_cli.spaces import Observation, ObservationSpace, Place
+from kerv_cli.targets.compact import packed
 from kerv_cli.targets.compact.packed import FastLinear, has_blocked_layouts, pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -238,3 +240,14 @@ def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
     copy.deepcopy(frozen)(twin, torch.arange(4)).sum().backward()
     assert x.grad is not None
     assert close(x.grad, twin.grad)
+
+
+@pytest.mark.parametrize("intel", [True, False])
+def test_one_row_on_either_processor(intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packed, "is_intel", lambda: intel)
+    weight, x, other = torch.randn(24, 16), torch.randn(16), torch.randn(24)
+    fast = FastLinear(weight)
+    with timed_row_products() as seconds:
+        torch.testing.assert_close(fast.of_vector(x, 0.5), 0.5 * (weight @ x))
+        torch.testing.assert_close(fast.added_to_vector(other, x), other + weight @ x)
+    assert len(seconds) == (0 if intel else 2)

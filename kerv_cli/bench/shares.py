@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,7 @@ from kerv_cli.decoding.build import compose, needs
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.settings import RolloutSettings
 from kerv_cli.spaces import Observation
+from kerv_cli.targets.compact import packed
 
 _PROFILED = 5  # decodes under the profiler: a thousand events each
 METHODS = ("ar", "spec_vla", "one_pass")
@@ -62,6 +64,25 @@ def quiet() -> Iterator[None]:
         os.close(kept)
 
 
+@contextlib.contextmanager
+def timed_row_products() -> Iterator[list[float]]:
+    """Collects the seconds of the products that numpy computes (`packed.row_product`)."""
+    seconds: list[float] = []
+    plain = packed.row_product
+
+    def timed(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        begin = time.perf_counter()
+        product = plain(x, weight)
+        seconds.append(time.perf_counter() - begin)
+        return product
+
+    packed.row_product = timed
+    try:
+        yield seconds
+    finally:
+        packed.row_product = plain
+
+
 def share_of(method: str, decoder: Decoder, observation: Observation, repeats: int) -> DecodeShare:
     """Measures `repeats` decodes without the profiler, and a few with it."""
     from torch.profiler import ProfilerActivity, profile
@@ -69,12 +90,13 @@ def share_of(method: str, decoder: Decoder, observation: Observation, repeats: i
     for _ in range(2):
         decoder.decode(observation)
     seconds = [decoder.decode(observation).seconds for _ in range(repeats)]
-    with quiet(), profile(activities=[ProfilerActivity.CPU]) as profiled:
+    with quiet(), timed_row_products() as rows, profile(activities=[ProfilerActivity.CPU]) as profiled:
         for _ in range(_PROFILED):
             decoder.decode(observation)
     events = [(event.key, event.self_cpu_time_total / 1e6 / _PROFILED) for event in profiled.key_averages()]
-    products = sum(own for name, own in events if is_product(name))
-    return DecodeShare(method, float(np.median(seconds)), products, sum(own for _, own in events))
+    by_numpy = sum(rows) / _PROFILED
+    products = sum(own for name, own in events if is_product(name)) + by_numpy
+    return DecodeShare(method, float(np.median(seconds)), products, sum(own for _, own in events) + by_numpy)
 
 
 def measure_shares(model: Model, repeats: int, methods: Sequence[str] = METHODS) -> list[DecodeShare]:
