@@ -53,11 +53,12 @@ class TokenTree:
 
     def ancestors(self) -> np.ndarray:
         """(n, n) bool: node i sees node j if j is i or an ancestor of i."""
-        seen = np.eye(len(self), dtype=bool)
+        paths: list[int] = []  # bit j of number i: node i sees node j
         for i, parent in enumerate(self.parents):
-            if parent != ROOT:
-                seen[i] |= seen[parent]
-        return seen
+            paths.append(1 << i | (paths[parent] if parent != ROOT else 0))
+        n, width = len(paths), (len(paths) + 7) // 8
+        rows = np.frombuffer(b"".join(path.to_bytes(width, "little") for path in paths), dtype=np.uint8)
+        return np.unpackbits(rows.reshape(n, width), axis=1, count=n, bitorder="little").view(bool)
 
     def down_from(self, node: int) -> list[int]:
         """`node` and the nodes below it along first children, down to a leaf."""
