@@ -87,10 +87,10 @@ for shape in $SHAPES; do
     kerv "bench-$place-$shape" 180 bench "target=$shape" --json
 done
 if [ -d "$STUDY" ]; then
-    study=$(basename "$STUDY")
-    ln -sfn "$(cd "$STUDY" && pwd)" "$OUT/studies/$study"
-    kerv replay 420 bench replay "study=$study" "target=$SCALE" "tokens=[7,16]" "decodes=$DECODES" --json
-    rm -f "$OUT/studies/$study"
+    # under a name of its own: the sweep below makes a study named main
+    ln -sfn "$(cd "$STUDY" && pwd)" "$OUT/studies/recorded"
+    kerv replay 420 bench replay study=recorded "target=$SCALE" "tokens=[7,16]" "decodes=$DECODES" --json
+    rm -f "$OUT/studies/recorded"
 else
     skip replay "no study in $STUDY: run 'kerv sweep study=main', or set STUDY"
 fi

@@ -29,6 +29,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
+from kerv_cli.training.runs import determining
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
@@ -95,6 +96,25 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
     assert steps[0] == last + 1
     for name, tensor in whole.job.module.state_dict().items():
         assert torch.equal(tensor, resumed.job.module.state_dict()[name])
+
+
+def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path: Path) -> None:
+    def stop(step: int, metrics: Metrics) -> None:
+        for _ in range(2):  # torchrun passes on what the process heard already
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(Interrupted, match="step 1 is saved"):
+        quadratic(tmp_path).run(stop)
+    over = quadratic(tmp_path)
+    over.settings = replace(TINY, steps=1)
+    with pytest.raises(CheckpointError, match="interrupted at step 1, before its first validation"):
+        over.run()
+
+
+def test_scores_with_and_without_success_are_of_different_runs() -> None:
+    alone, some, more = (determining(replace(TINY, closed_loop=episodes)) for episodes in (0, 1, 2))
+    assert some == more != alone
+    assert "closed_loop" not in alone  # as in runs from before it counted
 
 
 def test_another_run_is_never_resumed(tmp_path: Path) -> None:

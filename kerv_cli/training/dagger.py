@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from kerv_cli.decoding.build import own_decoder
 from kerv_cli.environments.demos.recording import DemoConfig
 from kerv_cli.environments.spec import EnvironmentSpec, World
+from kerv_cli.errors import CheckpointError
 from kerv_cli.places import find_target
 from kerv_cli.settings import WorldSettings
 from kerv_cli.targets.checkpoint import load_target, read_target
@@ -61,9 +62,14 @@ class TargetActor:
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded(folder: Path) -> Any:
+def _loaded(folder: Path, sha256: str) -> Any:
     torch.set_num_threads(1)
-    return load_target(folder)[0]
+    target, described = load_target(folder)
+    if described.sha256 != sha256:
+        raise CheckpointError(
+            f"the target in {folder} has changed since the recording began: record under another name="
+        )
+    return target
 
 
 @dataclass(frozen=True)
@@ -87,4 +93,4 @@ class TargetActs:
 
     def __call__(self, config: DemoConfig) -> TargetActor:
         """The actor, in the process that records."""
-        return TargetActor(_loaded(self.folder), config.expert_share)
+        return TargetActor(_loaded(self.folder, self.sha256), config.expert_share)

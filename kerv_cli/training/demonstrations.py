@@ -7,10 +7,12 @@ from kerv_cli.places import artifact
 
 
 def open_demos(results: str, names: str) -> DemoDataset:
-    """The dataset of that name; several, e.g. `mt50+mt50-dagger`, are joined in that order.
+    """The dataset of that name; several, e.g. `mt50+mt50-dagger`, are joined in that order. A folder of that very
+    name comes first.
 
     Raises:
         UsageError: no folder name. CheckpointError: one is missing, unfinished or damaged, or they do not add up.
     """
-    found = [artifact(results, "demos", name) for name in names.split("+")]
+    whole = artifact(results, "demos", names)
+    found = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
     return DemoDataset.joined([DemoDataset.open(folder) for folder in found])

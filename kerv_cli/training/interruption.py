@@ -6,9 +6,13 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+SAME_REQUEST = 2.0
+"""Seconds."""
 
 
 class Stop:
@@ -21,18 +25,19 @@ class Stop:
 @contextmanager
 def until_interrupted() -> Iterator[Stop]:
     """Yields a Stop that the first SIGINT or SIGTERM sets (schedulers and `timeout` send the latter); a second one of
-    the same kind raises KeyboardInterrupt at once (torchrun answers Ctrl-C, which its processes hear too, with
-    SIGTERM). Outside the main thread it stays unset, and a signal that is ignored stays so."""
+    the same kind raises KeyboardInterrupt at once. One that follows within seconds is the same request: torchrun and
+    schedulers pass on what the process heard already. Outside the main thread it stays unset, and a signal that is
+    ignored stays so."""
     stop = Stop()
-    came: set[int] = set()
+    came: dict[int, float] = {}
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
 
     def caught(number: int, frame: FrameType | None) -> None:
-        if number in came:
+        now = time.monotonic()
+        if now - came.setdefault(number, now) > SAME_REQUEST:
             raise KeyboardInterrupt
-        came.add(number)
         if stop.requested:
             return
         stop.requested = True

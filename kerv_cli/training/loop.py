@@ -86,8 +86,9 @@ class Loop:
         rank than the first.
 
         Raises:
-            CheckpointError: as `restore`. KervError: training diverged. StorageError: writing failed. Interrupted:
-                Ctrl-C; the step that ran was finished and the run's state is stored.
+            CheckpointError: as `restore`; no step is left and none was ever validated. KervError: training diverged.
+            StorageError: writing failed. Interrupted: Ctrl-C; the step that ran was finished and the run's state is
+            stored.
         """
         self.restore()
         settings = self.settings
@@ -103,8 +104,16 @@ class Loop:
                 if asked and self.step < settings.steps:
                     if self.ranks.first:
                         self.store()
+                    self.ranks.wait()  # a rank that ends makes torchrun end the others
                     raise Interrupted(f"interrupted: step {self.step} is saved, the same command goes on from there")
-        return max(self.history, key=lambda m: m["score"]) if self.ranks.first else {}
+        if not self.ranks.first:
+            return {}
+        if not self.history:
+            raise CheckpointError(
+                f"{self.folder} was interrupted at step {self.step}, before its first validation: set train.steps "
+                "above that"
+            )
+        return max(self.history, key=lambda m: m["score"])
 
     def update(self, stop: Stop) -> tuple[Metrics, bool]:
         """One optimiser step -> loss and logged numbers, and whether any rank was asked to stop.

@@ -53,6 +53,11 @@ class Ranks:
             begin += gradient.numel()
         return [float(x) for x in flat[begin:]]
 
+    def wait(self) -> None:
+        """Until all ranks are here."""
+        if self.size > 1:
+            dist.barrier()
+
 
 ALONE = Ranks()
 """One process."""

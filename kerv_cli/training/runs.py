@@ -50,9 +50,10 @@ Progress = Callable[[int, int], None]
 def determining(train: TrainSettings) -> dict[str, Any]:
     """The optimisation settings that identify a run. Steps and validation intervals may change on resuming; `init` is
     identified by its weights' hash instead of its name."""
-    free = ("steps", "validate_every", "closed_loop", "init", "stored")
-    later = {"balance": 0.0}  # settings that older runs do not know, with what they did
+    free = ("steps", "validate_every", "init", "stored")
+    later = {"balance": 0.0, "closed_loop": False}  # what older runs did not record, with what they did
     found = {k: v for k, v in asdict(train).items() if k not in free}
+    found["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
     return {k: v for k, v in found.items() if k not in later or v != later[k]}
 
 
@@ -293,9 +294,14 @@ class DrafterRun(Run):
         """Loads the target and lets it decode the demonstrations' observations; progress(done, total).
 
         Raises:
-            CheckpointError: target or demonstrations are damaged.
+            CheckpointError: target or demonstrations are damaged. UsageError: as `begin`; noise on several processes.
         """
         self.begin()
+        if self.settings.drafter.noise and self.ranks.size > 1:
+            raise UsageError(
+                f"drafter.noise={self.settings.drafter.noise} is drawn for a whole batch: train with one process, or "
+                "without noise"
+            )
         self.target, self.described = load_target(self.target_folder, self.device)
         self.teach(progress)
 

@@ -1,5 +1,5 @@
-"""Frames of demonstrations as they lie on disk: PNG in memory-mapped files, decoded when they are asked for. Training
-keeps none of them in memory, so it does not depend on the size of the dataset."""
+"""Frames of demonstrations as they lie on disk: PNG in the episodes' files, read and decoded when they are asked for.
+Training keeps none of them in memory and no file open, so it does not depend on the size of the dataset."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's leng
 
 
 class EncodedFrames:
-    """n frames (size, size, 3) uint8. sources: the bytes of each file; of frame i sources[source[i]] holds the PNG at
-    start[i] … end[i]."""
+    """n frames (size, size, 3) uint8. sources: the files; sources[source[i]] holds the PNG of frame i at start[i] …
+    end[i]."""
 
     def __init__(
         self,
-        sources: Sequence[NDArray[np.uint8]],
+        sources: Sequence[Path],
         source: NDArray[np.int64],
         start: NDArray[np.int64],
         end: NDArray[np.int64],
@@ -42,15 +42,16 @@ class EncodedFrames:
             CheckpointError: the file has no such bytes.
         """
         try:
-            mapped = np.memmap(path, dtype=np.uint8, mode="r")
-            header, begin = header_of(mapped)
+            with path.open("rb") as file:
+                length = file.read(LENGTH.size)
+                header, begin = header_of(length + file.read(LENGTH.unpack(length)[0]))
             first, last = header["png"]["data_offsets"]
         except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
             raise CheckpointError(f"{path} is missing or damaged: {error}") from error
         places = offsets + begin + first
         if len(offsets) < 1 or (np.diff(offsets) <= 0).any() or offsets[0] < 0 or offsets[-1] > last - first:
             raise CheckpointError(f"{path} is damaged: its frames lie outside their tensor")
-        return cls([mapped], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size)
+        return cls([path], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size)
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
@@ -105,22 +106,25 @@ class EncodedFrames:
     def _decoded(self, i: int) -> NDArray[np.uint8]:
         from PIL import Image
 
-        data = self.sources[self.source[i]][self.start[i] : self.end[i]].tobytes()
+        path, start = self.sources[self.source[i]], int(self.start[i])
         try:
+            with path.open("rb") as file:
+                file.seek(start)
+                data = file.read(int(self.end[i]) - start)
             with Image.open(io.BytesIO(data)) as image:
                 return np.array(image)  # a copy: torch warns of memory that may not be written to
         except (OSError, SyntaxError, ValueError) as error:
-            raise CheckpointError(f"a frame of the demonstrations is damaged: {error}") from error
+            raise CheckpointError(f"a frame of the demonstrations in {path} is damaged: {error}") from error
 
 
-def header_of(data: bytes | NDArray[np.uint8]) -> tuple[dict[str, Any], int]:
+def header_of(data: bytes) -> tuple[dict[str, Any], int]:
     """The header of a safetensors file, and where its arrays begin; data: the file's bytes.
 
     Raises:
         struct.error, ValueError: it has none.
     """
-    begin = LENGTH.size + LENGTH.unpack(bytes(data[: LENGTH.size]))[0]
-    return json.loads(bytes(data[LENGTH.size : begin])), begin
+    begin = LENGTH.size + LENGTH.unpack(data[: LENGTH.size])[0]
+    return json.loads(data[LENGTH.size : begin]), begin
 
 
 def encode_png(frame: NDArray[np.uint8]) -> bytes:
