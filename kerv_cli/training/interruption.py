@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 SAME_REQUEST = 2.0
-"""Seconds."""
+"""Seconds after a signal in which another one of its kind is a repetition and no second request."""
 
 
 class Stop:
