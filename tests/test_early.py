@@ -18,8 +18,8 @@ from kerv_cli.artifacts import artifact_folder
 from kerv_cli.config import compose
 from kerv_cli.drafting.early import (
     EarlyDrafter,
-    acceptance_odds,
     choose,
+    choose_with_odds,
     load_early,
     padded,
     read_early,
@@ -34,6 +34,7 @@ from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.early_distillation import (
@@ -117,6 +118,28 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
         assert drafted(moved, history) != plain
 
 
+@pytest.mark.parametrize("is_intel", [True, False])
+@pytest.mark.parametrize("history", [0, 2])
+def test_packed_weights_give_the_same_logits(history: int, is_intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kerv_cli.targets.compact.packed.is_intel", lambda: is_intel)
+    torch.manual_seed(0)
+    early = drafter(DrafterSettings(kind="early", layers=2, width=24, rank=6, history=history))
+    for parameter in early.parameters():  # fresh blocks begin as the identity, with gains of one
+        parameter.data += 0.3 * torch.randn_like(parameter)
+    features = torch.randn(9, early.mean.numel())
+    early.standardise(5.0 * features + 2.0)
+    shown = (features[:1], torch.randn(1, history, 4), torch.ones(1, history))
+    early.eval().requires_grad_(False)
+    plain = early(*shown)
+    pack(early)
+    assert early.packed is not None
+    assert torch.allclose(early(*shown), plain, rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(early(torch.zeros_like(shown[0]), *shown[1:]), plain, rtol=1e-2)
+    assert len(early(*(torch.cat([part, part]) for part in shown))) == 2
+    early.train()
+    assert early.packed is None
+
+
 def test_features_are_standardised_and_constants_survive() -> None:
     early = drafter(dataclasses.replace(SMALL, history=0))
     features = torch.randn(50, FEATURES, generator=torch.Generator().manual_seed(0)) * 30 + 7
@@ -173,14 +196,15 @@ def test_the_chosen_bin_is_the_one_most_likely_to_be_accepted() -> None:
 @given(st.integers(0, 10_000), st.integers(0, 20))
 def test_the_odds_are_those_of_independent_tokens(seed: int, radius: int) -> None:
     logits = 3 * torch.randn(2, 8, 255, generator=torch.Generator().manual_seed(seed))
-    tokens = choose(logits, radius, STRICT)
+    tokens, found = choose_with_odds(logits, radius, STRICT)
+    assert torch.equal(tokens, choose(logits, radius, STRICT))
     for row in range(2):
         odds = 1.0
         for i, token in enumerate(tokens[row].tolist()):
             r = 0 if i % 4 == 3 else radius
             window = slice(max(0, token - r), token + r + 1)
             odds *= float(logits[row, i].double().softmax(-1)[window].sum())
-        assert float(acceptance_odds(logits, tokens, radius, STRICT)[row]) == pytest.approx(odds, rel=1e-3)
+        assert float(found[row]) == pytest.approx(odds, rel=1e-3)
 
 
 def test_plain_and_perturbed_episodes_count_alike() -> None:

@@ -19,11 +19,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.drafting.packed_early import PackedEarly
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
-from kerv_cli.targets.compact.packed import load_packed
+from kerv_cli.targets.compact.packed import Packable, load_packed
 from kerv_cli.targets.protocol import ReadableTarget
 from kerv_cli.targets.transfer import read, upload
 
@@ -54,7 +55,7 @@ class Block(nn.Module):
         return x + self.down(F.silu(gate) * up)
 
 
-class EarlyDrafter(nn.Module):
+class EarlyDrafter(Packable):
     """A residual network from (pooled prompt (F,), h past actions (h, D)) to the logits (N, V) of all tokens.
 
     actions: the action space of its tokens; chunk: H; features: F.
@@ -63,6 +64,7 @@ class EarlyDrafter(nn.Module):
     mean: Tensor
     scale: Tensor
     strict: Tensor
+    packed: PackedEarly | None
 
     def __init__(self, settings: DrafterSettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
@@ -83,6 +85,15 @@ class EarlyDrafter(nn.Module):
         """A fresh early drafter for the target's action space, H and F."""
         return cls(settings, target.actions, target.chunk, target.pooled_width)
 
+    @property
+    def typed_blocks(self) -> list[Block]:
+        """The residual blocks."""
+        return [block for block in self.blocks if isinstance(block, Block)]
+
+    def pack_weights(self) -> PackedEarly | None:
+        """As `Packable.pack_weights`; None in other number formats than float32."""
+        return PackedEarly(self) if self.mean.dtype == torch.float32 else None
+
     def standardise(self, features: Tensor) -> None:
         """Takes mean and spread from the training features (n, F)."""
         self.mean.copy_(features.float().mean(0))
@@ -95,6 +106,8 @@ class EarlyDrafter(nn.Module):
 
     def forward(self, features: Tensor, history: Tensor, known: Tensor) -> Tensor:
         """pooled prompts (B, F), history (B, h, D) normalised, known (B, h) -> logits (B, N, V)."""
+        if self.packed is not None and len(features) == 1:
+            return self.packed(torch.cat([features[0], history.flatten(), known[0]]))[None]
         x = torch.cat([(features - self.mean) * self.scale, history.flatten(1), known], -1)
         x = self.enter(x)
         for block in self.blocks:
@@ -115,8 +128,7 @@ class EarlyDrafter(nn.Module):
         shown = padded(history, self.settings.history, self.actions.dofs)
         actions, known = (upload(x, weight.device).to(weight.dtype)[None] for x in shown)
         logits = self(features.to(weight.dtype), actions, known)
-        tokens = choose(logits, radius, self.strict)
-        odds = acceptance_odds(logits, tokens, radius, self.strict)
+        tokens, odds = choose_with_odds(logits, radius, self.strict)
         return torch.cat([tokens[0].double(), odds.double()]), logits[0]
 
     @torch.inference_mode()
@@ -157,28 +169,27 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
     probabilities within a third of it and of the bin itself break the tie, so that accepted tokens stay near the target
     token. Where `strict`, a token must equal the target's: it is always the most probable one.
     """
-    best = logits.argmax(-1)
-    if not radius:
-        return best
+    return logits.argmax(-1) if not radius else choose_with_odds(logits, radius, strict)[0]
+
+
+def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
+    """As `choose`, and the odds (B,): probability that each token lies within `radius` of the target's, the strict ones
+    exactly on it, if the tokens were independent. They are not, and training on soft labels keeps probabilities low:
+    use it to compare chunks, not as a probability."""
     probability = logits.float().softmax(-1)
-    score = _within(probability, radius) + 0.1 * _within(probability, radius // 3) + 0.05 * probability
-    return torch.where(strict, best, score.argmax(-1))
+    below = F.pad(probability, (radius + 1, radius)).cumsum(-1)  # one sum for both radii
+    near, best = _between(below, radius, radius, logits.shape[-1]), logits.argmax(-1)
+    tokens = best
+    if radius:
+        score = near + 0.1 * _between(below, radius, radius // 3, logits.shape[-1]) + 0.05 * probability
+        tokens = torch.where(strict, best, score.argmax(-1))
+    exact, within = (of.gather(-1, tokens[..., None])[..., 0] for of in (probability, near))
+    return tokens, torch.where(strict, exact, within).prod(-1)
 
 
-def acceptance_odds(logits: Tensor, tokens: Tensor, radius: int, strict: Tensor) -> Tensor:
-    """logits (B, N, V), tokens (B, N), strict (N,) bool -> (B,): probability that each token lies within `radius` of
-    the target's, the strict ones exactly on it, if the tokens were independent. They are not, and training on soft
-    labels keeps probabilities low: use the number to compare chunks, not as a probability."""
-    probability = logits.float().softmax(-1)
-    exact = probability.gather(-1, tokens[..., None])[..., 0]
-    near = _within(probability, radius).gather(-1, tokens[..., None])[..., 0]
-    return torch.where(strict, exact, near).prod(-1)
-
-
-def _within(probability: Tensor, radius: int) -> Tensor:
-    """(…, V) -> probability of lying at most `radius` bins away, (…, V)."""
-    below = F.pad(probability, (radius + 1, radius)).cumsum(-1)
-    return below[..., 2 * radius + 1 :] - below[..., : probability.shape[-1]]
+def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
+    """below (…, V + 2 pad + 1): cumulated probability -> that of lying at most `radius` ≤ pad bins away (…, V)."""
+    return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 
 
 @dataclass(frozen=True)
