@@ -19,6 +19,7 @@ from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.plots import series_of, study_figures
 from kerv_cli.reporting.scatter import place_labels
 from kerv_cli.reporting.tables import load_study, study_table
+from kerv_cli.reporting.task_map import has_task_map, task_map
 from kerv_cli.settings import RolloutSettings, StudySettings
 from kerv_cli.studies.plan import plan
 from kerv_cli.studies.store import StudyStore
@@ -162,3 +163,38 @@ def test_labels_keep_apart_in_a_crowd() -> None:
     assert {note.get_text() for note in notes} == {text for _, _, text in labels}
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     assert all(frame.x0 <= b.x0 and b.x1 <= frame.x1 and frame.y0 <= b.y0 and b.y1 <= frame.y1 for b in boxes)
+
+
+def by_task(**columns: list[Any]) -> pd.DataFrame:
+    """Rows of `per_task_table` as far as the map reads them: two settings on two tasks."""
+    rows = {
+        "task": ["reach", "reach", "push", "push"],
+        "label": ["ar", "bold"] * 2,
+        "stress": "none",
+        "stress_level": 0,
+    }
+    return pd.DataFrame(
+        rows | {"successes": [9, 2, 5, 7], "episodes": 10, "difference": [np.nan, -0.7, np.nan, 0.2]} | columns
+    )
+
+
+def test_a_map_has_a_field_for_every_task_and_setting_and_its_colours_are_differences() -> None:
+    panel = task_map(by_task(), "Title", "about").axes[0]
+    assert [text.get_text() for text in panel.texts] == ["9/10", "2/10", "5/10", "7/10"]
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["reach", "push"]
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["ar", "bold"]
+    shown = np.ma.masked_invalid(np.ma.asarray(panel.get_images()[0].get_array()))
+    assert shown[:, 0].mask.all()
+    assert np.allclose(shown[:, 1], [-70.0, 20.0])
+    behind, ahead = panel.get_images()[0].to_rgba(np.array([-70.0, 20.0]))
+    assert behind[0] > behind[2]  # red
+    assert ahead[2] > ahead[0]  # blue
+
+
+def test_a_map_needs_two_tasks_two_settings_that_can_be_read_and_one_stress() -> None:
+    assert has_task_map(by_task())
+    assert not has_task_map(by_task(task=["reach"] * 4))
+    assert not has_task_map(by_task(label=["ar"] * 4))
+    assert not has_task_map(by_task(stress_level=[0, 4, 0, 4]))
+    many = pd.concat([by_task(label=[f"a{i}", f"b{i}"] * 2) for i in range(11)])
+    assert not has_task_map(many)

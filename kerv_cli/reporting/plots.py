@@ -44,20 +44,21 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
     """
     rows = table[table["averaging"] == averaging].reset_index(drop=True)
     if is_stressed(rows):
-        return {"": stress_figure(rows, title, _about(rows, averaging), averaging)}
+        return {"": stress_figure(rows, title, about(rows, averaging), averaging)}
     numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
     with mpl.rc_context(STYLE):
         figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
         if rows["time_per_step_ms"].notna().any():
             figures["_phases"] = _phases(rows)
         for figure in figures.values():
-            entitle(figure, title, _about(rows, averaging))
+            entitle(figure, title, about(rows, averaging))
         if not numbers:
-            figures["_tradeoff"] = tradeoff_figure(rows, title, _about(rows, averaging))
+            figures["_tradeoff"] = tradeoff_figure(rows, title, about(rows, averaging))
     return figures
 
 
-def _about(rows: pd.DataFrame, averaging: str) -> str:
+def about(rows: pd.DataFrame, averaging: str) -> str:
+    """A figure's subtitle: targets, counts, averaging, device."""
     first = rows.iloc[0]
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
     names = ", ".join(dict.fromkeys(str(name) for name in rows["target"]))

@@ -20,9 +20,10 @@ from kerv_cli.reporting.latency import latency_figure, latency_summary, latency_
 from kerv_cli.reporting.measures import MICRO
 from kerv_cli.reporting.own_actions import own_errors
 from kerv_cli.reporting.page import Section, render
-from kerv_cli.reporting.plots import study_figures
+from kerv_cli.reporting.plots import about, study_figures
 from kerv_cli.reporting.publish import check_publishable
 from kerv_cli.reporting.tables import StudyData, load_study, per_task_table, study_table, write_csv
+from kerv_cli.reporting.task_map import has_task_map, task_map
 from kerv_cli.studies.store import StudyStore, begun_studies
 
 
@@ -90,7 +91,10 @@ class _Reporter:
         before = len(self.report.files)
         self._save_table(whole, name)
         self._save_table(per_task, f"{name}_per_task")
-        figures = study_figures(whole, data.plan.axis, data.plan.title or name)
+        title = data.plan.title or name
+        figures = study_figures(whole, data.plan.axis, title)
+        if has_task_map(per_task):
+            figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, MICRO))
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
         sections = [self.latency_section(data)]
