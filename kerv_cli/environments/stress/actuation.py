@@ -23,7 +23,7 @@ class Level:
 
 STUCK_SECONDS = 0.25
 """Of a spell in which a DoF sticks."""
-LEVELS = (Level(0.1, 0.1, 0.25), Level(0.3, 0.2, 0.5), Level(0.6, 0.4, 1.0), Level(0.9, 0.6, 1.5))
+LEVELS = (Level(0.3, 0.2, 0.5), Level(0.6, 0.4, 1.0), Level(0.9, 0.6, 1.5), Level(1.8, 0.8, 4.0))
 
 
 class Actuation(Stress):

@@ -20,7 +20,7 @@ class Level:
     degrees: float
 
 
-LEVELS = (Level(0.003, 0.3), Level(0.006, 0.6), Level(0.01, 1.0), Level(0.015, 1.5))
+LEVELS = (Level(0.006, 0.6), Level(0.01, 1.0), Level(0.015, 1.5), Level(0.022, 2.2))
 
 
 class CameraJitter(Stress):

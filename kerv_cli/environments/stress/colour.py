@@ -9,7 +9,7 @@ import numpy as np
 from kerv_cli.environments.stress.base import Draws, ModelChanges, Stress, level_of, robot_roots
 from kerv_cli.spaces import ActionSpace
 
-LEVELS = (0.05, 0.1, 0.2, 0.3)
+LEVELS = (0.1, 0.2, 0.3, 0.45)
 """Share of a random colour in the colour that multiplies a surface's texture."""
 WIDE = 0.35
 """Metres: a fixed geom whose bounding sphere has this radius or more, or a plane, is background or table."""

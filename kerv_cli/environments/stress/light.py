@@ -21,7 +21,7 @@ class Level:
     degrees: float
 
 
-LEVELS = (Level(1.05, 5), Level(1.1, 10), Level(1.2, 15), Level(1.3, 20))
+LEVELS = (Level(1.1, 10), Level(1.2, 15), Level(1.3, 20), Level(1.8, 45))
 
 
 class Light(Stress):

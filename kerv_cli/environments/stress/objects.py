@@ -23,7 +23,7 @@ class Level:
     spread: float
 
 
-LEVELS = (Level(1.05, 1.25, 1.25, 1.1), Level(1.1, 1.6, 1.5, 1.2), Level(1.2, 2.5, 2.0, 1.4), Level(1.3, 4.0, 3.0, 1.7))
+LEVELS = (Level(1.1, 1.6, 1.5, 1.2), Level(1.2, 2.5, 2.0, 1.4), Level(1.3, 4.0, 3.0, 1.7), Level(1.5, 6.0, 4.0, 2.3))
 
 
 class Objects(Stress):

@@ -9,7 +9,7 @@ from kerv_cli.spaces import ActionSpace
 
 SECONDS = 0.1
 """Of a burst."""
-LEVELS = (1.0, 2.0, 4.0, 8.0)
+LEVELS = (2.0, 4.0, 8.0, 14.0)
 """Bursts per second that begin while none lasts."""
 
 

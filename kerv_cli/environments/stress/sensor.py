@@ -22,7 +22,7 @@ class Level:
     dropped: float
 
 
-LEVELS = (Level(8, 0.25, 0.05), Level(16, 0.5, 0.1), Level(22, 0.65, 0.15), Level(30, 0.9, 0.2))
+LEVELS = (Level(16, 0.5, 0.1), Level(22, 0.65, 0.15), Level(30, 0.9, 0.2), Level(97, 3.0, 0.55))
 
 
 class Sensor(Stress):
