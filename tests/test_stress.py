@@ -204,7 +204,7 @@ def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction(met
 
 def test_what_a_policy_does_changes_neither_pushes_nor_noise() -> None:
     def executed(kind: str, wanted: float) -> np.ndarray:
-        stress = stressing.build(StressSettings(kind, 2))
+        stress = stressing.build(StressSettings(kind, 1))
         stress.begin("push-v3", SEED, METAWORLD.actions)
         return np.array([stress.act(np.full(4, wanted), step)[:3] for step in range(400)])
 
