@@ -361,6 +361,8 @@ def test_report_writes_the_same_bytes_again(results: Path) -> None:
         "report/plots/threshold.svg",
         "report/plots/threshold_phases.png",
         "report/plots/threshold_phases.svg",
+        "report/plots/threshold_tasks.png",
+        "report/plots/threshold_tasks.svg",
         "studies/threshold/report.html",
         "report/tables/boundary_radius.csv",  # without study=
         "report/plots/boundary_radius.png",  # as SVG it would be too large
@@ -369,7 +371,7 @@ def test_report_writes_the_same_bytes_again(results: Path) -> None:
     for path in written:
         path.unlink()
     again = report(results, "threshold").files
-    assert again == written[:7]
+    assert again == written[:9]
     assert {path: path.read_bytes() for path in again} == {path: before[path] for path in again}
     assert all(content.startswith(b"\x89PNG") for path, content in before.items() if path.suffix == ".png")
     assert all(len(content) > 2000 for path, content in before.items() if path.suffix != ".csv")
@@ -377,7 +379,7 @@ def test_report_writes_the_same_bytes_again(results: Path) -> None:
 
 def test_the_page_stands_alone(results: Path) -> None:
     page = (results / "studies" / "threshold" / "report.html").read_text(encoding="utf-8")
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 3
     assert "src=" not in page
     assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
         "http://creativecommons.org", ""
