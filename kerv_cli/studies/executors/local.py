@@ -7,6 +7,7 @@ import re
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -78,6 +79,8 @@ class Processes:
         """A pool whose worker starts with its first work."""
         from joblib.externals.loky import ProcessPoolExecutor
 
+        # loky replaces a worker whose memory grew (open worlds, drawing contexts) and warns of it; no work is lost
+        warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
         pool = ProcessPoolExecutor(
             max_workers=1,
             initializer=_begin_worker,
