@@ -85,11 +85,6 @@ class EarlyDrafter(Packable):
         """A fresh early drafter for the target's action space, H and F."""
         return cls(settings, target.actions, target.chunk, target.pooled_width)
 
-    @property
-    def typed_blocks(self) -> list[Block]:
-        """The residual blocks."""
-        return [block for block in self.blocks if isinstance(block, Block)]
-
     def pack_weights(self) -> PackedEarly | None:
         """As `Packable.pack_weights`; None in other number formats than float32."""
         return PackedEarly(self) if self.mean.dtype == torch.float32 else None

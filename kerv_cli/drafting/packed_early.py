@@ -5,7 +5,7 @@ Standardisation and the norms' gains are folded into the weights behind them, as
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch.nn.functional as F
 from torch import Tensor
@@ -35,16 +35,16 @@ class PackedEarly(Packed):
     """Packed weights of `EarlyDrafter.forward` for one observation."""
 
     def __init__(self, early: EarlyDrafter) -> None:
-        self.tokens, rank = early.tokens, early.settings.rank
         weight, features = early.enter.weight.clone(), len(early.mean)
         weight[:, :features] *= early.scale
         self.enter = FastLinear(weight)
         self.enter_bias = early.enter.bias - weight[:, :features] @ early.mean
-        self.blocks = [PackedBlock(block) for block in early.typed_blocks]
+        blocks: Any = early.blocks
+        self.blocks = [PackedBlock(block) for block in blocks]
         self.norm = RowNorm(early.norm)
         self.spread, self.spread_bias = FastLinear(early.spread.weight * gain_of(early.norm)), early.spread.bias
-        self.head, self.shape = FastLinear(early.head.weight), (early.tokens, rank)
-        self.head_bias = early.head.bias
+        self.head, self.head_bias = FastLinear(early.head.weight), early.head.bias
+        self.shape = early.tokens, early.settings.rank
 
     def __call__(self, shown: Tensor) -> Tensor:
         """shown (F + h (D + 1),): pooled prompt, past actions and which of them are known -> logits (N, V)."""
