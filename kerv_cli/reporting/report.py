@@ -94,7 +94,7 @@ class _Reporter:
         title = data.plan.title or name
         figures = study_figures(whole, data.plan.axis, title)
         if has_task_map(per_task):
-            figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, MICRO))
+            figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, "successes of each task"))
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
         sections = [self.latency_section(data)]
