@@ -25,6 +25,7 @@ _SUCCESS = ("successes", "success", "success_low", "success_high")
 _FELT = ("felt_latency_ms", "felt_latency_steps", "held_share", "forwards_per_step")
 _DIFFERENCE = ("pairs", "difference", "difference_low", "difference_high", "only_baseline", "only_method", "mcnemar_p")
 _DODGE = 0.012  # of the axis, between neighbouring methods' bars
+_NARROWEST = 0.12  # natural logarithm of two ticks' ratio, below which their labels touch
 
 
 def latency_table(data: StudyData) -> pd.DataFrame | None:
@@ -90,7 +91,8 @@ def latency_figure(table: pd.DataFrame, title: str, about: str) -> Figure:
     methods = list(dict.fromkeys(table["method"]))
     shades = dict(zip(methods, _shades(table, methods), strict=True))
     with mpl.rc_context(STYLE):
-        figure = new_figure(max(6.5, 5.6 * len(kinds)), 5.0)
+        width = max(6.5, 5.6 * len(kinds))
+        figure = new_figure(width, 5.0)
         panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         for panel, kind in zip(panels, kinds, strict=True):
             own = table[table["rollout.delay_compensation"] == kind]
@@ -102,7 +104,7 @@ def latency_figure(table: pd.DataFrame, title: str, about: str) -> Figure:
             _name_latencies(panel, own)
         panels[0].set_ylabel("success, % of episodes and 95 % interval")
         handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels)))
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels), int(width / 2.0)))
         entitle(figure, title, about)
     return figure
 
@@ -124,16 +126,21 @@ def _draw(panel: Axes, rows: pd.DataFrame, method: str, shade: str, place: int, 
 
 
 def _name_latencies(panel: Axes, rows: pd.DataFrame) -> None:
-    """A logarithmic axis with a tick at every latency; those that no factor made are marked."""
-    own = rows[rows["rollout.ar_ms"] == 0]["ar_latency_ms"]
-    ticks = {float(f"{x:.3g}"): f"{x:.3g}" for x in sorted(rows["ar_latency_ms"]) if is_number(x) and x > 0}
+    """A logarithmic axis with a tick at every latency, but for neighbours whose labels would touch; those that no
+    factor made are marked."""
+    scaled = rows["rollout.ar_ms"] > 0
+    own = rows[~scaled]["ar_latency_ms"]
+    ticks: dict[float, str] = {}
+    for x in [*sorted(rows[scaled]["ar_latency_ms"]), *sorted(own)]:
+        if is_number(x) and x > 0 and all(abs(math.log(x / other)) > _NARROWEST for other in ticks):
+            ticks[float(f"{x:.3g}")] = f"{x:.3g}"
     panel.set_xscale("log")
     panel.set_xticks([], minor=True)
-    panel.set_xticks(list(ticks), list(ticks.values()))
-    if len(own) and math.isfinite(own.iloc[0]) and (rows["rollout.ar_ms"] > 0).any():
+    panel.set_xticks(sorted(ticks), [ticks[x] for x in sorted(ticks)])
+    if len(own) and math.isfinite(own.iloc[0]) and scaled.any():
         panel.axvline(own.iloc[0], color=MUTED, linewidth=1.0, linestyle=":")
         panel.annotate(
-            *("its own", (own.iloc[0], 0.0), (3, 4)),
+            *(f"its own, {own.iloc[0]:.3g}", (own.iloc[0], 0.0), (3, 4)),
             xycoords=("data", "axes fraction"),
             textcoords="offset points",
             fontsize=8,
