@@ -13,7 +13,8 @@ from kerv_cli.config import compose
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.reporting.page import verdict as page_verdict
 from kerv_cli.reporting.plots import study_figures
-from kerv_cli.reporting.stressed import by_kind, is_stressed, stem, verdict
+from kerv_cli.reporting.report import report
+from kerv_cli.reporting.stressed import by_kind, is_stressed, stem, summed_table, verdict
 from kerv_cli.reporting.tables import StudyData, load_study, rows_of, study_table
 from kerv_cli.settings import RolloutSettings, StressSettings, StudySettings, SweepSettings
 from kerv_cli.studies.plan import Cell, plan, stress_of
@@ -89,6 +90,38 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(table: pd.DataFra
     named = [line for line in panels[1].lines if line.get_label() in ("ar", "bold")]
     assert [list(line.get_ydata()) for line in named] == [[100, 100, 100], [100, 100, 50]]
     assert {text.get_text() for text in figures[""].legends[0].get_texts()} == {"ar", "bold"}
+
+
+def test_sums_count_every_stressed_world_once(table: pd.DataFrame) -> None:
+    """20 seeds x 2 tasks; level 4 of a push fails half of everything, level 4 of light half of what is bold."""
+    found = {row["label"]: row for row in rows_of(summed_table(table))}
+    sums = ["light", "push", "level 1", "level 4", "all"]
+    assert list(found) == [f"{name} {one}" for one in sums for name in ("ar", "bold")]
+    counted = {one: (found[f"bold {one}"]["successes"], found[f"bold {one}"]["episodes"]) for one in sums}
+    assert counted == {
+        "light": (60, 80),
+        "push": (60, 80),
+        "level 1": (80, 80),
+        "level 4": (40, 80),
+        "all": (120, 160),
+    }
+    assert (found["ar all"]["successes"], found["ar all"]["baseline"]) == (140, "ar all")
+    lost = found["bold all"]
+    assert (lost["only_baseline"], lost["only_method"], lost["pairs"]) == (20, 0, 160)
+    assert lost["difference"] == pytest.approx(-20 / 160)
+    assert lost["difference_low"] < -20 / 160 < lost["difference_high"] < 0
+    assert not lost["non_inferior"]
+    assert found["bold push"]["non_inferior"] is (found["bold push"]["difference_low"] > -0.03)
+
+
+def test_the_report_writes_the_sums_and_shows_them(data: StudyData, tmp_path: Path) -> None:
+    store = StudyStore(tmp_path, "stress")
+    for cell in plan(settings(), TASKS, {"target": "t"}, baseline="ar"):
+        store.write_cell(cell, episodes(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
+    store.write_plan(StudySettings("stress", "", "ar"), plan(settings(), TASKS, {"target": "t"}, baseline="ar"))
+    written = {path.name for path in report(tmp_path, "stress").files}
+    assert {"stress_summed.csv", "stress_summed.png", "stress.png"} <= written
+    assert "Summed over levels" in (store.root / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_sentence_says_who_falls_behind_where(data: StudyData, table: pd.DataFrame) -> None:

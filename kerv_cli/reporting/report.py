@@ -22,6 +22,7 @@ from kerv_cli.reporting.own_actions import own_errors
 from kerv_cli.reporting.page import Section, render
 from kerv_cli.reporting.plots import about, study_figures
 from kerv_cli.reporting.publish import check_publishable
+from kerv_cli.reporting.stressed import is_stressed, summed_table
 from kerv_cli.reporting.tables import StudyData, load_study, per_task_table, study_table, write_csv
 from kerv_cli.reporting.task_map import has_task_map, task_map
 from kerv_cli.studies.store import StudyStore, begun_studies
@@ -97,7 +98,7 @@ class _Reporter:
             figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, "successes of each task"))
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
-        sections = [self.latency_section(data)]
+        sections = [self.latency_section(data), self.stress_section(whole, name)]
         for target in prediction.predicting_targets(settings):
             sections += [self.prediction_section(target), self.own_actions_section(store, data, target)]
         if _varies_boundary(settings):
@@ -166,6 +167,18 @@ class _Reporter:
             figure=self._save_plot(latency_figure(table, title, about), name),
             table=latency_summary(table),
         )
+
+    def stress_section(self, whole: pd.DataFrame, study: str) -> Section | None:
+        """Writes a study of stress summed over levels, kinds and all; None where nothing is stressed."""
+        if not is_stressed(whole):
+            return None
+        table = summed_table(whole)
+        name, title = f"{study}_summed", "Summed over levels, and over kinds"
+        self._save_table(table, name)
+        fields = table.drop(columns="label").rename(columns={"sum": "task", "method": "label"})
+        figure = task_map(fields, title, about(whole, "successes over all tasks"))
+        note = f"Points against the baseline under the same stresses, same episodes: tables/{name}.csv."
+        return Section(title, note, self._save_plot(figure, name))
 
     def curvature_section(self) -> Section:
         """Writes table and plot of the boundary's radius on known paths, ours and the public code's."""

@@ -3,6 +3,7 @@ autoregressive decoding under the same stress."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -12,8 +13,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from kerv_cli.reporting import statistics as stats
 from kerv_cli.reporting.drawing import DASHES, STYLE, entitle, new_figure, setting_colours
-from kerv_cli.reporting.measures import MICRO
+from kerv_cli.reporting.measures import MARGIN, MICRO
 from kerv_cli.reporting.scatter import success_floor
 from kerv_cli.reporting.tables import is_number, rows_of
 
@@ -97,6 +99,59 @@ def _draw(panel: Axes, rows: list[dict[str, Any]], shade: str, dashes: Any, name
             [at, at], [100 * row["success_low"], 100 * row["success_high"]], color=shade, linewidth=1.4, alpha=0.4
         )
     panel.plot(x, y, color=shade, linestyle=dashes, linewidth=1.8, marker="o", markersize=4.5, label=name)
+
+
+def summed_table(table: pd.DataFrame) -> pd.DataFrame:
+    """Successes of every method summed over the levels of a kind, the kinds of a level, and all stresses, and the
+    difference from the baseline in the same worlds under the same stresses; the unstressed row is in no sum.
+
+    Args:
+        table: `study_table`.
+
+    Returns:
+        Columns study, label (`METHOD SUM`), method (label without stress), sum (`push`, `level 2`, `all`), baseline,
+        episodes, successes, success, pairs and their counts, mcnemar_p, difference, margin, non_inferior; intervals
+        with the endings _low and _high.
+    """
+    rows = [row for row in rows_of(table, MICRO) if row["stress"] != NONE]
+    reference = stem(str(table["baseline"].iloc[0]))
+    kinds = sorted({str(row["stress"]) for row in rows})
+    levels = sorted({int(row["stress_level"]) for row in rows})
+    groups = {kind: [row for row in rows if row["stress"] == kind] for kind in kinds}
+    groups |= {f"level {level}": [row for row in rows if int(row["stress_level"]) == level] for level in levels}
+    groups["all"] = rows
+    return pd.DataFrame(
+        _sum([row for row in own if stem(str(row["label"])) == method], method, name, reference)
+        for name, own in groups.items()
+        for method in _stems(own)
+    )
+
+
+def _sum(rows: list[dict[str, Any]], method: str, name: str, reference: str) -> dict[str, Any]:
+    counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
+    difference = stats.paired_difference(counts)
+    episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
+    bounds = stats.wilson(successes, episodes)
+    return {
+        "study": rows[0]["study"],
+        "label": f"{method} {name}",
+        "method": method,
+        "sum": name,
+        "baseline": f"{reference} {name}",
+        "episodes": episodes,
+        "successes": successes,
+        "success": successes / episodes,
+        "success_low": bounds.low,
+        "success_high": bounds.high,
+        "pairs": sum(counts),
+        **counts._asdict(),
+        "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
+        "difference": difference.value,
+        "difference_low": difference.low,
+        "difference_high": difference.high,
+        "margin": MARGIN,
+        "non_inferior": bool(difference.low > -MARGIN),
+    }
 
 
 def verdict(table: pd.DataFrame) -> str:
