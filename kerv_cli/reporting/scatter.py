@@ -43,6 +43,8 @@ def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
     panel.margins(x=0.14)
     panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
     panel.set_ylim(success_floor(rows), 103)
+    panel.set_yticks([tick for tick in panel.get_yticks() if tick <= 100])
+    panel.set_ylim(success_floor(rows), 103)
     panel.set_title("Success against speedup")
     entitle(figure, title, about)  # before the labels: it moves the panel
     labels = [(row["speedup"], 100 * row["success"], str(row["label"])) for row in points]
