@@ -116,9 +116,9 @@ def test_sums_count_every_stressed_world_once(table: pd.DataFrame) -> None:
 
 def test_the_report_writes_the_sums_and_shows_them(data: StudyData, tmp_path: Path) -> None:
     store = StudyStore(tmp_path, "stress")
-    for cell in plan(settings(), TASKS, {"target": "t"}, baseline="ar"):
+    for cell in data.plan.cells:
         store.write_cell(cell, episodes(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
-    store.write_plan(StudySettings("stress", "", "ar"), plan(settings(), TASKS, {"target": "t"}, baseline="ar"))
+    store.write_plan(StudySettings("stress", "", "ar"), list(data.plan.cells))
     written = {path.name for path in report(tmp_path, "stress").files}
     assert {"stress_summed.csv", "stress_summed.png", "stress.png"} <= written
     assert "Summed over levels" in (store.root / "report.html").read_text(encoding="utf-8")

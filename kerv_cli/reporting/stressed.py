@@ -129,7 +129,7 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
 
 def _sum(rows: list[dict[str, Any]], method: str, name: str, reference: str) -> dict[str, Any]:
     counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
-    difference = stats.paired_difference(counts)
+    pairs, difference = sum(counts), stats.paired_difference(counts)
     episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
     bounds = stats.wilson(successes, episodes)
     return {
@@ -143,9 +143,9 @@ def _sum(rows: list[dict[str, Any]], method: str, name: str, reference: str) -> 
         "success": successes / episodes,
         "success_low": bounds.low,
         "success_high": bounds.high,
-        "pairs": sum(counts),
+        "pairs": pairs,
         **counts._asdict(),
-        "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
+        "mcnemar_p": stats.mcnemar(counts) if pairs else math.nan,
         "difference": difference.value,
         "difference_low": difference.low,
         "difference_high": difference.high,
