@@ -43,8 +43,20 @@ def test_every_part_is_one_of_the_next_larger_and_none_is_of_the_unseen_tasks() 
     assert not nested[2] & set(resolve_tasks(unseen))
 
 
+def test_thirty_five_of_fifty_tasks_are_in_one_study_and_the_others_in_the_other() -> None:
+    tasks = [
+        set(resolve_tasks(compose("rollout", study["common"].split(), RolloutSettings).task))
+        for study in (
+            read_yaml((conf_dir() / f"study/coverage_50_{part}.yaml").read_text()) for part in ("seen", "unseen")
+        )
+    ]
+    assert tasks[0] == set(covers_tasks("thirty_five"))
+    assert not tasks[0] & tasks[1]
+    assert tasks[0] | tasks[1] == set(resolve_tasks(["MT50"]))
+
+
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("cover", [*COVERS, "half"])
+@pytest.mark.parametrize("cover", [*COVERS, "thirty_five", "half"])
 def test_a_preset_names_tasks_and_artifacts_alike_for_every_command(cover: str, command: str) -> None:
     settings = compose(command, [f"cover={cover}"], COMMANDS[command])
     kinds = ("drafter", "early", "datastore", "risk", "score")
