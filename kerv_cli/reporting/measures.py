@@ -58,7 +58,6 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
     macro = averaging == MACRO
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
     counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
-    difference = stats.paired_difference(counts)
     once = episodes[episodes["repeat"] == 0]
     timed = _decodes(episodes) and is_timed(pairs, "time_method") and is_timed(pairs, "time_baseline")
     return {
@@ -69,12 +68,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
         **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
-        "pairs": sum(counts),
-        **counts._asdict(),
-        "mcnemar_p": stats.mcnemar(counts) if len(pairs) else math.nan,
-        **_columns("difference", difference),
-        "margin": MARGIN,
-        "non_inferior": bool(difference.low > -MARGIN),
+        **paired_columns(counts),
         "pairs_to_settle": stats.pairs_to_settle(counts, MARGIN),
         "same_run": bool(len(pairs) and pairs["same_run"].all()),
         "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
@@ -102,6 +96,20 @@ def _risk_interval(episodes: pd.DataFrame) -> stats.Interval:
         return stats.Interval(math.nan, math.nan)
     found = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
     return stats.Interval(max(0.0, found.low), min(1.0, found.high))
+
+
+def paired_columns(counts: stats.PairedCounts) -> dict[str, Any]:
+    """What paired episodes say about success: their number and counts, McNemar's p (NaN without pairs), the difference
+    with its interval, and whether it is above minus the margin."""
+    difference = stats.paired_difference(counts)
+    return {
+        "pairs": sum(counts),
+        **counts._asdict(),
+        "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
+        **_columns("difference", difference),
+        "margin": MARGIN,
+        "non_inferior": bool(difference.low > -MARGIN),
+    }
 
 
 def _columns(name: str, estimate: Estimate) -> dict[str, float]:

@@ -3,7 +3,6 @@ autoregressive decoding under the same stress."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 
 from kerv_cli.reporting import statistics as stats
 from kerv_cli.reporting.drawing import DASHES, STYLE, entitle, new_figure, setting_colours
-from kerv_cli.reporting.measures import MARGIN, MICRO
+from kerv_cli.reporting.measures import MICRO, paired_columns
 from kerv_cli.reporting.scatter import success_floor
 from kerv_cli.reporting.tables import is_number, rows_of
 
@@ -129,7 +128,6 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
 
 def _sum(rows: list[dict[str, Any]], method: str, name: str, reference: str) -> dict[str, Any]:
     counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
-    pairs, difference = sum(counts), stats.paired_difference(counts)
     episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
     bounds = stats.wilson(successes, episodes)
     return {
@@ -143,14 +141,7 @@ def _sum(rows: list[dict[str, Any]], method: str, name: str, reference: str) -> 
         "success": successes / episodes,
         "success_low": bounds.low,
         "success_high": bounds.high,
-        "pairs": pairs,
-        **counts._asdict(),
-        "mcnemar_p": stats.mcnemar(counts) if pairs else math.nan,
-        "difference": difference.value,
-        "difference_low": difference.low,
-        "difference_high": difference.high,
-        "margin": MARGIN,
-        "non_inferior": bool(difference.low > -MARGIN),
+        **paired_columns(counts),
     }
 
 
