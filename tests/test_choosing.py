@@ -128,4 +128,19 @@ def test_the_interval_of_a_ratio_covers_it() -> None:
         found = ratio(above, below)
         hits += found.low <= 8.0 <= found.high
     assert hits / 400 == pytest.approx(0.95, abs=0.03)
+
+
+def test_the_interval_of_a_ratio_covers_it_with_few_episodes_among_many_that_say_nothing() -> None:
+    rng = np.random.default_rng(2)
+    hits = 0
+    for _ in range(400):
+        below = np.concatenate([rng.integers(5, 9, size=4), np.zeros(40)])
+        above = np.concatenate([rng.normal(0.3 * below[:4], 1.0), np.zeros(40)])
+        found = ratio(above, below)
+        hits += found.low <= 0.3 <= found.high
+    assert hits / 400 == pytest.approx(0.95, abs=0.03)
+
+
+def test_one_episode_gives_a_ratio_no_interval() -> None:
     assert math.isnan(ratio(np.array([3]), np.array([2])).low)
+    assert math.isnan(ratio(np.array([3, 0, 0]), np.array([2, 0, 0])).high)

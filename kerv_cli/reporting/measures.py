@@ -91,10 +91,12 @@ def _acceptance_interval(episodes: pd.DataFrame, macro: bool) -> stats.Interval:
 
 
 def _risk_interval(episodes: pd.DataFrame) -> stats.Interval:
-    """Of the realised risk, pooled over all audits."""
+    """Of the realised risk, pooled over all audits; 0 to 1 where a single episode holds them all."""
     if not episodes["audits"].sum():
         return stats.Interval(math.nan, math.nan)
     found = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
+    if math.isnan(found.low):
+        return stats.Interval(0.0, 1.0)
     return stats.Interval(max(0.0, found.low), min(1.0, found.high))
 
 

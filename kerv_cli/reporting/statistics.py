@@ -109,13 +109,17 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
 
 def ratio(numerators: np.ndarray, denominators: np.ndarray) -> Estimate:
     """Sum over sum of two arrays (episodes,), with the 95 % interval of a ratio estimator: episodes are independent,
-    what happens within one is not (Cochran, Sampling Techniques, section 2.11). NaN bounds for one episode."""
+    what happens within one is not (Cochran, Sampling Techniques, section 2.11; Student's t, as there may be few of
+    them). An episode with a denominator of 0 says nothing and does not count. NaN bounds for one that counts."""
+    from scipy.special import stdtrit
+
     a, b = np.asarray(numerators, dtype=np.float64), np.asarray(denominators, dtype=np.float64)
+    a, b = a[b > 0], b[b > 0]
     value = float(a.sum() / b.sum())
     if a.size < 2:
         return Estimate(value, math.nan, math.nan)
     spread = float(((a - value * b) ** 2).sum() * a.size / (a.size - 1))
-    reach = 1.96 * math.sqrt(spread) / float(b.sum())
+    reach = float(stdtrit(a.size - 1, 0.975)) * math.sqrt(spread) / float(b.sum())
     return Estimate(value, value - reach, value + reach)
 
 
