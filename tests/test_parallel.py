@@ -94,13 +94,13 @@ def test_training_shows_it_no_action_token() -> None:
 
 def test_it_continues_an_autoregressive_target_with_fresh_queries() -> None:
     plain = target()
-    made = continued_target(nano("target.parallel=true"), plain)
+    made = continued_target(nano("target.parallel=true"), plain, "")
     assert torch.equal(made.head.weight, plain.head.weight)
     assert made.queries.shape == (8, plain.width)
-    described = type("D", (), {"settings": vars(plain.settings)})()
-    check_init(nano("target.parallel=true"), described, Path("x"))
+    described = type("D", (), {"settings": vars(plain.settings), "cameras": plain.cameras})()
+    check_init(nano("target.parallel=true"), "", described, Path("x"))
     with pytest.raises(UsageError, match=r"width"):
-        check_init(nano("target.parallel=true", "target.width=64"), described, Path("x"))
+        check_init(nano("target.parallel=true", "target.width=64"), "", described, Path("x"))
 
 
 @pytest.fixture

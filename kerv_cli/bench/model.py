@@ -30,6 +30,7 @@ from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_b
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
 from kerv_cli.training.imitation import vocabulary
+from kerv_cli.views import frame_shape
 
 _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encoder, caches, one layer twice
 
@@ -171,7 +172,7 @@ def _drafter(target: Any) -> Drafter:
 def blank(target: Any) -> Observation:
     """A black image and zeros."""
     size, space = target.settings.image_size, target.observation
-    images = {name: np.zeros((size, size, 3), np.uint8) for name in target.cameras}
+    images = {name: np.zeros(frame_shape(name, size), np.uint8) for name in target.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
 

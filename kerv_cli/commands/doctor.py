@@ -62,12 +62,13 @@ def _target(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.runtime import set_up
     from kerv_cli.spaces import Observation
     from kerv_cli.targets.conformance import check_target
+    from kerv_cli.views import frame_shape
 
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     described, random = artifacts.description, np.random.default_rng(settings.seed)
     size, space = int(described.settings.get("image_size", settings.world.camera.size)), described.observation
-    images = {name: random.integers(0, 256, (size, size, 3), dtype=np.uint8) for name in described.cameras}
+    images = {name: random.integers(0, 256, frame_shape(name, size), dtype=np.uint8) for name in described.cameras}
     state = random.normal(size=space.state)
     words = " ".join(described.words[:3]) or "move"
     return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))

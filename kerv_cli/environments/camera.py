@@ -39,8 +39,9 @@ class CameraConfig:
 
     Attributes:
         name: one of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.
+            Joined names, `views.views_of`, are several views side by side, which a world draws one by one.
         fovy: vertical field of view in degrees; 45 doubles the pixels on hand and object that 60 gives.
-        size: width and height of a frame in pixels.
+        size: width and height of a view in pixels.
         supersample: each pixel is the mean of supersample x supersample rendered ones.
 
     Raises:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.registry import load
+from kerv_cli.views import views_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -99,7 +100,8 @@ class World(Protocol):
         """
 
     def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
-        """(size, size, 3) uint8 RGB, upright, of the current state. camera: another view than the world's own.
+        """(size, size, 3) uint8 RGB, upright, of the current state; several views lie side by side, `frame_shape`.
+        camera: another view than the world's own.
 
         Raises:
             RenderingUnavailable: nothing can be drawn here.
@@ -195,13 +197,14 @@ class EnvironmentSpec:
         return suite or ((full,) if full else ())
 
     def camera_name(self, name: str = "") -> str:
-        """`name`, or the environment's first camera where it is empty.
+        """`name`, or the environment's first camera where it is empty. Several views are joined, see `views_of`.
 
         Raises:
-            UnknownName: the environment has no such camera.
+            UnknownName: the environment has no such camera. UsageError: as `views_of`.
         """
-        if name and name not in self.cameras:
-            raise UnknownName("camera", name, self.cameras)
+        for view in views_of(name) if name else ():
+            if view.camera not in self.cameras:
+                raise UnknownName("camera", view.camera, self.cameras)
         return name or self.cameras[0]
 
     def camera(self, config: CameraConfig | None = None) -> CameraConfig:

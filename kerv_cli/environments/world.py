@@ -15,6 +15,7 @@ from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.environments.stress.base import NO_STRESS, ModelChanges, Stress
 from kerv_cli.errors import KervError, UsageError
 from kerv_cli.spaces import Observation
+from kerv_cli.views import View, views_of
 
 
 class EpisodeWorld(ABC):
@@ -38,6 +39,7 @@ class EpisodeWorld(ABC):
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
+        self._drawn: dict[tuple[CameraConfig, View], list[tuple[int, NDArray[np.uint8]]]] = {}  # by control step
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -49,7 +51,7 @@ class EpisodeWorld(ABC):
 
     @abstractmethod
     def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
-        """(size, size, 3) uint8 RGB, upright."""
+        """(size, size, 3) uint8 RGB, upright, of one camera."""
 
     @property
     @abstractmethod
@@ -85,6 +87,7 @@ class EpisodeWorld(ABC):
         if seed < 0:
             raise UsageError(f"episode seed must be 0 or more, not {seed}")
         self.stress.begin(self.task, seed, self.spec.actions)
+        self._drawn.clear()
         state = self._start(seed)
         self.steps, self.success, self.succeeded = 0, False, False
         return self._told(state)
@@ -114,7 +117,26 @@ class EpisodeWorld(ABC):
     def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
         """As `World.frame`."""
         self.observation  # noqa: B018 - raises before the first reset
-        return self._draw(self.camera if camera is None else self.spec.camera(camera))
+        config = self.camera if camera is None else self.spec.camera(camera)
+        views = views_of(config.name)
+        if config.name == views[0].camera:
+            return self._draw(config)
+        cameras = [replace(config, name=view.camera, fovy=view.fovy or config.fovy) for view in views]
+        now = {camera: self._draw(camera) for camera in dict.fromkeys(cameras)}
+        parts = [self._at(config, view, now[camera]) for view, camera in zip(views, cameras, strict=True)]
+        return np.concatenate(parts, axis=1)
+
+    def _at(self, config: CameraConfig, view: View, now: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A part of the frame `config`; now: what its camera shows. Of a delayed view the newest drawn frame that is
+        old enough, until there is one the episode's first."""
+        if not view.delay:
+            return now
+        drawn = self._drawn.setdefault((config, view), [])
+        if not drawn or drawn[-1][0] < self.steps:
+            drawn.append((self.steps, now))
+        while len(drawn) > 1 and drawn[1][0] <= self.steps - view.delay:
+            drawn.pop(0)
+        return drawn[0][1]
 
     def observe(self, cameras: Sequence[str]) -> Observation:
         """As `World.observe`; images have the size of the world's own camera."""
@@ -126,6 +148,7 @@ class EpisodeWorld(ABC):
     def close(self) -> None:
         """As `World.close`."""
         self._observation = None
+        self._drawn.clear()
 
     def __enter__(self) -> Self:
         return self

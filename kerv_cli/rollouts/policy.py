@@ -25,6 +25,7 @@ from kerv_cli.rollouts.expert import ExpertDecoder
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings
 from kerv_cli.spaces import Observation
+from kerv_cli.views import frame_shape
 
 WARM_UP_DECODES = 6
 CALIBRATION_DECODES = 15
@@ -234,7 +235,7 @@ def _ar_seconds(
 
 def still_observation(decoder: ActionDecoder, spec: EnvironmentSpec, pixels: int) -> Observation:
     """Zeros for everything that the decoder reads. pixels: size of the images."""
-    images = {name: np.zeros((pixels, pixels, 3), dtype=np.uint8) for name in decoder.cameras}
+    images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     space = spec.observation
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 

@@ -12,6 +12,7 @@ from kerv_cli.registry import find
 from kerv_cli.runtime import set_up
 from kerv_cli.serving.session import GRIPPERS, Interface, Session
 from kerv_cli.settings import ServeSettings
+from kerv_cli.views import frame_shape
 
 WARM_UP = 4  # decodes
 
@@ -50,7 +51,7 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
 def warm_up(interface: Interface, decoder: Decoder) -> None:
     """Answers a few observations of zeros: first calls allocate memory and choose kernels."""
     session = Session(interface, decoder)
-    images = {f"observation/{c}": np.zeros((interface.size, interface.size, 3), np.uint8) for c in interface.cameras}
+    images = {f"observation/{c}": np.zeros(frame_shape(c, interface.size), np.uint8) for c in interface.cameras}
     message = {**images, "observation/state": np.zeros(interface.observation.state), "prompt": ""}
     for _ in range(WARM_UP):
         session.answer(message)

@@ -11,6 +11,7 @@ import numpy as np
 from kerv_cli.decoding.decoder import Decoder
 from kerv_cli.errors import UsageError
 from kerv_cli.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.views import frame_shape
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 
@@ -76,7 +77,7 @@ class Interface:
         key = next((key for key in keys if key in message), None)
         if key is None:
             raise UsageError(f"no image: {' or '.join(keys)} is wanted, the message has {_keys(message)}")
-        image, wanted = message[key], (self.size, self.size, 3)
+        image, wanted = message[key], frame_shape(camera, self.size)
         if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
             what = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
             raise UsageError(f"{key} is {what}, {wanted} uint8 is wanted")

@@ -181,9 +181,10 @@ def new_target(
     return CompactTarget(replace(settings), actions, dataset.manifest.observation, words, camera)
 
 
-def check_init(settings: TargetSettings, description: TargetDescription, folder: Path) -> None:
-    """Checks that the target in `folder`, with this description, can be fine-tuned to `settings`. All of them but
-    the chunk length, on which no weight depends, and `parallel`, whose queries begin fresh, must agree.
+def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
+    """Checks that the target in `folder`, with this description, can be fine-tuned to `settings` and to frames of
+    `camera`. All settings but the chunk length, on which no weight depends, and `parallel`, whose queries begin fresh,
+    must agree; views may be added behind its own.
 
     Raises:
         UsageError: the first shape that differs.
@@ -194,15 +195,30 @@ def check_init(settings: TargetSettings, description: TargetDescription, folder:
             raise UsageError(
                 f"train.init: the target in {folder} has {name}={there}, the run target.{name}={wanted}: set both alike"
             )
+    trained = description.cameras[0] if description.cameras else ""
+    if settings.observation == "vision" and not f"{camera}+".startswith(f"{trained}+"):
+        raise UsageError(
+            f"train.init: the target in {folder} sees {trained}, the run {camera}: set world.camera.name to {trained}, "
+            "which other views may follow"
+        )
 
 
-def continued_target(settings: TargetSettings, init: CompactTarget) -> CompactTarget:
+def continued_target(settings: TargetSettings, init: CompactTarget, camera: str) -> CompactTarget:
     """A policy of `settings` that begins with a copy of the weights of `init` and shares its statistics and words. Only
-    the queries of a parallel target are fresh."""
-    camera = init.cameras[0] if init.cameras else ""
+    the queries of a parallel target are fresh. A further view of `camera` begins with the first one's encoder, and the
+    estimated positions do not depend on it yet."""
     target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
     fresh = {k: v for k, v in target.state_dict().items() if k == "queries"}
-    target.load_state_dict({**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}})
+    begun = {**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}}
+    if target.cameras:
+        for view in range(len(init.encoders) - 1, len(target.encoders) - 1):
+            begun |= {f"further_views.{view}.{k}": v for k, v in init.vision.state_dict().items()}
+        points = 2 * settings.keypoints * len(init.encoders)
+        added = 2 * settings.keypoints * len(target.encoders) - points
+        weight = begun["locate.0.weight"]
+        columns = [weight[:, :points], weight.new_zeros(len(weight), added), weight[:, points:]]
+        begun["locate.0.weight"] = torch.cat(columns, 1)
+    target.load_state_dict(begun)
     return target
 
 

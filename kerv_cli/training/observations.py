@@ -50,7 +50,7 @@ def _joined(column: Sequence[Any]) -> Any:
 class Observations(Rows):
     """n observations, in the order of episodes and control steps."""
 
-    frames: Tensor | EncodedFrames | None  # (n, size, size, 3) uint8; None for a state policy
+    frames: Tensor | EncodedFrames | None  # (n, size, size x views, 3) uint8; None for a state policy
     proprioception: Tensor  # (n, p) float32
     states: Tensor  # (n, s) float32, privileged
     words: Tensor  # (n, L) int64

@@ -192,7 +192,7 @@ class TargetRun(Run):
             raise UsageError(
                 f"train.init={name} would be overwritten by the run that begins with it: choose another name="
             )
-        check_init(self.settings.target, read_target(folder), folder)
+        check_init(self.settings.target, self.world.camera.name, read_target(folder), folder)
         return folder
 
     def plan(self) -> str:
@@ -221,12 +221,12 @@ class TargetRun(Run):
     def job(self) -> Job:
         """See `Run.job`; validated in closed loop where the settings ask for it."""
         assert self.samples is not None
-        settings = self.settings
+        settings, camera = self.settings, self.world.camera.name
         if self.begun is None:
-            camera, seed = self.world.camera.name, settings.train.seed
+            seed = settings.train.seed
             target = new_target(settings.target, self.dataset, self.samples, self.words, camera, seed)
         else:
-            target = continued_target(settings.target, self.begun)
+            target = continued_target(settings.target, self.begun, camera)
             freeze(target, settings.train.freeze)
         run = Imitation(target.to(self.device), self.samples, settings.train, torch.device(self.device))
         return imitation_job(run, self.save, self.closed_loop if settings.train.closed_loop else None)

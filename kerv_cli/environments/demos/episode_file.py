@@ -28,7 +28,7 @@ class DemoEpisode:
     Attributes:
         task, seed: of the episode. perturbed: whether its execution was noisy.
         steps: T.
-        frames: (n, size, size, 3) uint8, the frames before the actions of `frame_steps`; encoded where loaded.
+        frames: (n, size, size x views, 3) uint8, the frames before the actions of `frame_steps`; encoded where loaded.
         frame_steps: (n,) int64.
         states: (T, s) float32, privileged state before each action; it begins with the proprioception.
         labels: (T + tail, D) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
@@ -79,6 +79,9 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "steps": str(episode.steps),
         "frame_size": str(episode.frames.shape[1]),
     }
+    height, width = episode.frames.shape[1:3]
+    if width != height:  # several views; files of one view are as they always were
+        metadata["frame_width"] = str(width)
     # save_file would hide a full disk behind an error type of its own.
     data = _with_sorted_metadata(save(tensors, metadata=metadata))
     with atomic_path(path) as temporary:
@@ -110,7 +113,8 @@ def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
             names = [name for name in file.keys() if name != "png"]  # noqa: SIM118 - not a mapping
             arrays = {name: file.get_tensor(name) for name in names}
-        frames = EncodedFrames.of_file(path, arrays["png_offsets"], int(metadata["frame_size"]))
+        width = int(metadata.get("frame_width", 0))
+        frames = EncodedFrames.of_file(path, arrays["png_offsets"], int(metadata["frame_size"]), width)
         return _episode_from(arrays, frames, metadata, actions.dofs, observation.state)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error

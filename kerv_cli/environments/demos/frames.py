@@ -21,8 +21,8 @@ LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's leng
 
 
 class EncodedFrames:
-    """n frames (size, size, 3) uint8. sources: the files; sources[source[i]] holds the PNG of frame i at start[i] …
-    end[i]."""
+    """n frames (size, width, 3) uint8. sources: the files; sources[source[i]] holds the PNG of frame i at start[i] …
+    end[i]. width: default `size`."""
 
     def __init__(
         self,
@@ -31,12 +31,14 @@ class EncodedFrames:
         start: NDArray[np.int64],
         end: NDArray[np.int64],
         size: int,
+        width: int = 0,
     ) -> None:
-        self.sources, self.source, self.start, self.end, self.size = sources, source, start, end, size
+        self.sources, self.source, self.start, self.end = sources, source, start, end
+        self.size, self.width = size, width or size
 
     @classmethod
-    def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int) -> EncodedFrames:
-        """The frames of an episode's file; offsets (n + 1,): in its tensor `png`.
+    def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int, width: int = 0) -> EncodedFrames:
+        """The frames of an episode's file; offsets (n + 1,): in its tensor `png`. width: default `size`.
 
         Raises:
             CheckpointError: the file has no such bytes.
@@ -51,7 +53,7 @@ class EncodedFrames:
         places = offsets + begin + first
         if len(offsets) < 1 or (np.diff(offsets) <= 0).any() or offsets[0] < 0 or offsets[-1] > last - first:
             raise CheckpointError(f"{path} is damaged: its frames lie outside their tensor")
-        return cls([path], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size)
+        return cls([path], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size, width)
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
@@ -60,12 +62,12 @@ class EncodedFrames:
         first = np.cumsum([0, *(len(part.sources) for part in parts)])
         columns = [(part.source + base, part.start, part.end) for part, base in zip(parts, first, strict=False)]
         source, start, end = (np.concatenate(column) for column in zip(*columns, strict=True))
-        return cls(sources, source, start, end, parts[0].size)
+        return cls(sources, source, start, end, parts[0].size, parts[0].width)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """(n, size, size, 3)."""
-        return len(self), self.size, self.size, 3
+        """(n, size, width, 3)."""
+        return len(self), self.size, self.width, 3
 
     def __len__(self) -> int:
         return len(self.source)
@@ -87,10 +89,10 @@ class EncodedFrames:
         if isinstance(chosen, int | np.integer):
             return self._decoded(int(chosen))
         at = np.asarray(chosen) if not isinstance(chosen, slice) else chosen
-        return EncodedFrames(self.sources, self.source[at], self.start[at], self.end[at], self.size)
+        return EncodedFrames(self.sources, self.source[at], self.start[at], self.end[at], self.size, self.width)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """(n, size, size, 3), decoded on as many threads as this process may use.
+        """(n, size, width, 3), decoded on as many threads as this process may use.
 
         Raises:
             CheckpointError: a frame is damaged.
@@ -128,7 +130,7 @@ def header_of(data: bytes) -> tuple[dict[str, Any], int]:
 
 
 def encode_png(frame: NDArray[np.uint8]) -> bytes:
-    """frame (size, size, 3) uint8 -> PNG."""
+    """frame (h, w, 3) uint8 -> PNG."""
     from PIL import Image
 
     buffer = io.BytesIO()

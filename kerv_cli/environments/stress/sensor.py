@@ -15,7 +15,7 @@ from kerv_cli.spaces import ActionSpace
 @dataclass(frozen=True)
 class Level:
     """noise: standard deviation per pixel and colour, grey levels of 255. blur: standard deviation of the Gaussian, in
-    hundredths of the picture's width. dropped: probability that a picture is the one observed before."""
+    hundredths of the picture's height. dropped: probability that a picture is the one observed before."""
 
     noise: float
     blur: float
@@ -42,7 +42,7 @@ class Sensor(Stress):
         dropped = random.random() < level.dropped
         if dropped and camera in self._last:
             return self._last[camera]
-        blur = level.blur / 100 * image.shape[1]
+        blur = level.blur / 100 * image.shape[0]
         seen = gaussian_filter(image.astype(np.float32), sigma=(blur, blur, 0))
         seen += random.standard_normal(image.shape, dtype=np.float32) * level.noise
         self._last[camera] = np.clip(np.rint(seen), 0, 255).astype(np.uint8)

@@ -408,7 +408,7 @@ class PackedPrompt(Packed):
     def __init__(self, target: CompactTarget) -> None:
         centre, space = target.centre.double(), target.observation
         felt, places = len(space.proprioception), len(space.places)
-        self.vision, self.words = target.vision, target.word_embedding
+        self.encoders, self.words, self.size = target.encoders, target.word_embedding, target.settings.image_size
         self.tokens, self.places = target.settings.scene_tokens, places
         self.hand = affine(lambda x: hand_features(x, centre), felt)
         bias, weight = affine(
@@ -429,10 +429,17 @@ class PackedPrompt(Packed):
         """As `CompactTarget.encode_batch`, for one observation."""
         words, felt = self.words(inputs.words), inputs.proprioception
         hand = torch.addmm(self.hand[0], felt, self.hand[1])
-        tokens, points = self.vision(inputs.images)
-        places = perceptron(torch.cat([points, hand, words.mean(1)], -1), self.locate)
+        tokens, points = self.see(inputs.images)
+        places = perceptron(torch.cat([*points, hand, words.mean(1)], -1), self.locate)
         features = torch.addmm(self.lines[0], torch.cat([felt, places], -1), self.lines[1])
         features[:, self.straight :].tanh_()
         scene = perceptron(features, self.scene).view(1, self.tokens, -1)
-        prompt = torch.cat([tokens, words, scene, perceptron(hand, self.proprioception)[None]], 1)
+        prompt = torch.cat([*tokens, words, scene, perceptron(hand, self.proprioception)[None]], 1)
         return prompt, places.view(1, self.places, 3)
+
+    def see(self, images: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
+        """Tokens (1, grid², E) and points (1, 2K) of every view."""
+        assert images is not None
+        views = (images,) if len(self.encoders) == 1 else images.split(self.size, -1)
+        seen = [encoder(view) for encoder, view in zip(self.encoders, views, strict=True)]
+        return [tokens for tokens, _ in seen], [points for _, points in seen]

@@ -1,6 +1,7 @@
 """The compact target: vision + instruction + scene + proprioception tokens -> Llama-style trunk -> action tokens.
 
-Prompt order: [vision grid] [instruction] [scene] [proprioception]; the last prompt position predicts token 0.
+Prompt order: [vision grid] [instruction] [scene] [proprioception]; the last prompt position predicts token 0. A frame
+of several views has as many grids.
 
 Scene tokens carry where the environment's places are (object and goal, say), as positions and as vectors relative to
 the hand. With `observation=vision` the positions are *estimated* from the image points (supervised while training,
@@ -37,12 +38,13 @@ from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
 from kerv_cli.targets.transfer import upload
+from kerv_cli.views import frame_shape, views_of
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """A batch of observations as tensors. images (B, 3, size, size) uint8 or None, proprioception (B, p) and states
-    (B, s) float32, words (B, L) int64. A vision policy does not read `states`."""
+    """A batch of observations as tensors. images (B, 3, size, size x views) uint8 or None, proprioception (B, p) and
+    states (B, s) float32, words (B, L) int64. A vision policy does not read `states`."""
 
     images: Tensor | None
     proprioception: Tensor
@@ -53,7 +55,8 @@ class Inputs:
 class CompactTarget(Packable):
     """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Parameters in float32.
 
-    cameras: of a vision policy, the one whose images it reads. segments: slice of the prompt by the name of its part.
+    cameras: of a vision policy, the one whose images it reads; each of its views (`views_of`) has an encoder and vision
+    tokens of its own. segments: slice of the prompt by the name of its part.
     sha256: of the weights it was loaded with, else empty.
     """
 
@@ -72,7 +75,8 @@ class CompactTarget(Packable):
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
         self.cameras = (camera,) if s.observation == "vision" else ()
-        self.segments = _segments(s)
+        views = len(views_of(camera)) if self.cameras else 0
+        self.segments = _segments(s, views)
         felt, places = len(observation.proprioception), len(observation.places)
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.embedding = nn.Embedding(actions.tokens, s.width)
@@ -85,9 +89,11 @@ class CompactTarget(Packable):
         )
         self.proprioception = nn.Sequential(nn.Linear(felt, s.width), nn.SiLU(), nn.Linear(s.width, s.width))
         if s.observation == "vision":
-            self.vision = VisionEncoder(s.image_size, s.grid, s.keypoints, s.channels, s.width)
+            shapes = s.image_size, s.grid, s.keypoints, s.channels, s.width
+            self.vision = VisionEncoder(*shapes)
+            self.further_views = nn.ModuleList(VisionEncoder(*shapes) for _ in range(views - 1))
             self.locate = nn.Sequential(
-                nn.Linear(2 * s.keypoints + felt + s.width, 256),
+                nn.Linear(2 * s.keypoints * views + felt + s.width, 256),
                 nn.SiLU(),
                 nn.Linear(256, 128),
                 nn.SiLU(),
@@ -129,6 +135,11 @@ class CompactTarget(Packable):
     def max_prompt(self) -> int:
         """P, which is the same for every observation and instruction."""
         return self.segments["proprioception"].stop
+
+    @property
+    def encoders(self) -> tuple[VisionEncoder, ...]:
+        """Of a vision policy, one per view, from left to right."""
+        return self.vision, *self.further_views
 
     @property
     def pooled_width(self) -> int:
@@ -181,6 +192,11 @@ class CompactTarget(Packable):
             if camera not in observation.images:
                 raise CheckpointError(f"the target was trained on images of camera '{camera}', which were not drawn")
             image = np.ascontiguousarray(observation.images[camera])
+            if image.shape != frame_shape(camera, self.settings.image_size):
+                raise CheckpointError(
+                    f"the image of camera '{camera}' has shape {image.shape}, the target takes "
+                    f"{frame_shape(camera, self.settings.image_size)}"
+                )
             images = upload(image, self.device).permute(2, 0, 1)[None]
         return Inputs(images, felt, state, self.words_of(observation.instruction))
 
@@ -224,9 +240,11 @@ class CompactTarget(Packable):
         return torch.cat([*parts, words, scene, proprioception], 1), places
 
     def see(self, inputs: Inputs, words: Tensor, hand: Tensor) -> tuple[Tensor, Tensor]:
-        """Vision tokens (B, grid², E) and the places' estimated positions (B, K, 3), metres."""
+        """Vision tokens (B, grid² x views, E) and the places' estimated positions (B, K, 3), metres."""
         assert inputs.images is not None
-        tokens, points = self.vision(inputs.images)
+        images = inputs.images.split(self.settings.image_size, -1)
+        seen = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
+        tokens, points = torch.cat([one for one, _ in seen], 1), torch.cat([one for _, one in seen], -1)
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
@@ -268,10 +286,10 @@ class CompactTarget(Packable):
         return self.head(hidden[:, prompt.shape[1] - 1 :]), places
 
 
-def _segments(settings: TargetSettings) -> Mapping[str, slice]:
+def _segments(settings: TargetSettings, views: int) -> Mapping[str, slice]:
     sizes = {"instruction": settings.instruction_tokens, "scene": settings.scene_tokens, "proprioception": 1}
-    if settings.observation == "vision":
-        sizes = {"vision": settings.grid**2, **sizes}
+    if views:
+        sizes = {"vision": settings.grid**2 * views, **sizes}
     stops = itertools.accumulate(sizes.values())
     return {name: slice(stop - size, stop) for (name, size), stop in zip(sizes.items(), stops, strict=True)}
 

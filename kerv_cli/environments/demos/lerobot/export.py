@@ -40,6 +40,7 @@ from kerv_cli.environments.demos.lerobot.layout import (
 )
 from kerv_cli.errors import UsageError
 from kerv_cli.files import atomic_path, write_json
+from kerv_cli.views import VIEWS
 
 EVERY = 10  # of the images every so many are read for the statistics
 
@@ -85,6 +86,11 @@ class Export:
     rows: int = 0
     size: tuple[int, ...] = ()
 
+    @property
+    def image_keys(self) -> list[str]:
+        """The feature of each view of the frames."""
+        return [f"{IMAGES}{view}" for view in self.camera.split(VIEWS)]
+
     def columns(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
         """Every numeric column of an episode (n, …), one row per frame."""
         steps = episode.frame_steps
@@ -117,12 +123,12 @@ class Export:
                 arrays[name] = pa.array(values)
             if name != DONE:
                 self.moments.setdefault(name, Moments()).add(values.reshape(len(values), -1))
-        key = f"{IMAGES}{self.camera}"
-        frames = np.asarray(episode.frames)
-        pictures = [{"bytes": encode_png(frame), "path": None} for frame in frames]
-        arrays[key] = pa.array(pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
-        self.moments.setdefault(key, Moments((3, 1, 1))).add(frames[::EVERY].reshape(-1, 3) / 255)
-        self.size = frames.shape[1:]
+        keys = self.image_keys
+        for key, frames in zip(keys, np.split(np.asarray(episode.frames), len(keys), axis=2), strict=True):
+            pictures = [{"bytes": encode_png(frame), "path": None} for frame in frames]
+            arrays[key] = pa.array(pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
+            self.moments.setdefault(key, Moments((3, 1, 1))).add(frames[::EVERY].reshape(-1, 3) / 255)
+            self.size = frames.shape[1:]
         self.episodes.append(
             {
                 "episode_index": len(self.episodes),
@@ -137,7 +143,7 @@ class Export:
             }
         )
         self.rows += len(episode.frames)
-        order = [key, *(name for name in arrays if name not in (*COUNTERS, key)), *COUNTERS]
+        order = [*keys, *(name for name in arrays if name not in (*COUNTERS, *keys)), *COUNTERS]
         return pa.table({name: arrays[name] for name in order})
 
     def write_data(self, progress: Callable[[int, int], None]) -> None:
@@ -166,7 +172,7 @@ class Export:
         observation, actions = manifest.observation, manifest.actions
         image = {"dtype": "image", "shape": list(self.size), "names": ["height", "width", "channels"]}
         features = {
-            f"{IMAGES}{self.camera}": image,
+            **dict.fromkeys(self.image_keys, image),
             STATE: numbers("float32", list(observation.proprioception)),
             ENVIRONMENT: numbers("float32", [f"state_{i}" for i in range(observation.state)]),
             ACTION: numbers("float32", list(actions.names)),

@@ -1,0 +1,195 @@
+"""Frames of several views: their names, what a world draws, recordings, the policy that sees them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kerv_cli.app import app
+from kerv_cli.config import compose
+from kerv_cli.environments.camera import CameraConfig
+from kerv_cli.environments.demos.dataset import DemoDataset
+from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.environments.metaworld.world import MetaWorld
+from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.settings import TargetSettings, TrainTargetSettings
+from kerv_cli.spaces import Observation
+from kerv_cli.targets.compact.packed import has_blocked_layouts, pack
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.imitation import check_init, continued_target, vocabulary
+from kerv_cli.views import View, frame_shape, views_of
+
+SIZE = 32
+HAND = "corner4+gripperPOV:75"
+PAST = "corner4+corner4@4"
+
+
+@pytest.fixture(scope="module")
+def world() -> Iterator[MetaWorld]:
+    made = SPEC.open_world("drawer-close", CameraConfig(HAND, size=SIZE, supersample=1))
+    assert isinstance(made, MetaWorld)
+    with made:
+        yield made
+
+
+def test_a_name_says_cameras_fields_of_view_and_delays() -> None:
+    assert views_of("corner4") == (View("corner4"),)
+    assert views_of("a+b:75.5+a@4+b:60@12") == (View("a"), View("b", 75.5), View("a", delay=4), View("b", 60.0, 12))
+    assert frame_shape("a+b", 96) == (96, 192, 3)
+    assert frame_shape("", 96) == (96, 96, 3)
+
+
+@pytest.mark.parametrize("name", ["a+", "+a", "a@", "a@0", "a@x", "a@-1", "a:0", "a:180", "a:", "a:x", "a@4:60", "a:²"])
+def test_a_name_that_says_none_of_them_is_refused(name: str) -> None:
+    with pytest.raises(UsageError, match="cameras joined with"):
+        views_of(name)
+
+
+def test_views_lie_side_by_side_as_their_cameras_draw_them(world: MetaWorld) -> None:
+    world.reset(0)
+    left, right = np.split(world.frame(), 2, axis=1)
+    assert left.tobytes() == world.frame(CameraConfig("corner4", size=SIZE, supersample=1)).tobytes()
+    assert right.tobytes() == world.frame(CameraConfig("gripperPOV", 75.0, SIZE, 1)).tobytes()
+    assert world.observe([HAND]).images[HAND].tobytes() == world.frame().tobytes()
+    with pytest.raises(UnknownName, match="gripperPOW"):
+        world.observe(["corner4+gripperPOW"])
+
+
+def test_a_delayed_view_is_the_newest_drawn_frame_that_is_old_enough(world: MetaWorld) -> None:
+    def parts() -> tuple[bytes, bytes]:
+        now, past = np.split(world.observe([PAST]).images[PAST], 2, axis=1)
+        return now.tobytes(), past.tobytes()
+
+    drawn = {}
+    world.reset(1)
+    for step in range(13):
+        if step in (0, 2, 3, 7, 12):
+            drawn[step], past = parts()
+            assert past == drawn[{0: 0, 2: 0, 3: 0, 7: 3, 12: 7}[step]]
+            assert (drawn[step], past) == parts()  # however often it is drawn
+        world.step([1.0, 1.0, 0.3, 0.0])
+    assert len(set(drawn.values())) == 5
+    world.reset(2)
+    assert len(set(parts())) == 1  # nothing of the episode before
+
+
+def small(*overrides: str) -> TargetSettings:
+    return compose("train_target", ["target=nano", f"target.image_size={SIZE}", *overrides], TrainTargetSettings).target
+
+
+def made(camera: str, seed: int = 0) -> CompactTarget:
+    torch.manual_seed(seed)
+    target = CompactTarget(small(), SPEC.actions, SPEC.observation, vocabulary(SPEC.name), camera)
+    for parameter in target.parameters():
+        if parameter.dim() == 1:
+            parameter.data += 0.1 * torch.rand(parameter.shape)
+    return target.eval().requires_grad_(False)
+
+
+def shown(camera: str, seed: int = 0) -> Observation:
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, frame_shape(camera, SIZE), dtype=np.uint8)
+    return Observation(rng.normal(size=4), rng.normal(size=39), "close the drawer", {camera: image})
+
+
+def test_every_view_has_tokens_of_its_own() -> None:
+    one, two = made("corner4"), made(HAND)
+    cells = one.settings.grid**2
+    assert two.segments["vision"] == slice(0, 2 * cells)
+    assert two.max_prompt == one.max_prompt + cells
+    seen = shown(HAND)
+    prompt, places = two.encode_batch(two.inputs(seen))
+    changed = seen.images[HAND].copy()
+    changed[:, SIZE:] = 255 - changed[:, SIZE:]
+    other, moved = two.encode_batch(two.inputs(seen.with_images({HAND: changed})))
+    assert torch.equal(prompt[:, :cells], other[:, :cells])
+    assert not torch.allclose(prompt[:, cells : 2 * cells], other[:, cells : 2 * cells])
+    assert not torch.allclose(places, moved)
+
+
+@pytest.mark.skipif(not has_blocked_layouts(), reason="no packed vision encoder in this build of torch")
+@pytest.mark.parametrize("camera", ["corner4", HAND, "corner4+corner4@4+gripperPOV"])
+def test_packed_weights_compute_the_same_prompt(camera: str) -> None:
+    plain, packed = made(camera), made(camera)
+    pack(packed)
+    assert packed.packed is not None
+    for seed in range(3):
+        inputs = plain.inputs(shown(camera, seed))
+        for ours, theirs in zip(packed.encode_batch(inputs), plain.encode_batch(inputs), strict=True):
+            assert torch.allclose(ours, theirs, atol=1e-4)
+
+
+def test_a_frame_of_other_views_is_refused() -> None:
+    seen = shown("corner4")
+    with pytest.raises(CheckpointError, match=r"\(32, 32, 3\), the target takes \(32, 64, 3\)"):
+        made(HAND).encode(seen.with_images({HAND: seen.images["corner4"]}))
+
+
+def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates() -> None:
+    one = made("corner4", seed=3)
+    two = continued_target(one.settings, one, HAND).eval()
+    seen = shown(HAND)
+    left = seen.with_images({"corner4": seen.images[HAND][:, :SIZE]})
+    ours, places = two.encode_batch(two.inputs(seen))
+    theirs, expected = one.encode_batch(one.inputs(left))
+    cells = one.settings.grid**2
+    assert torch.equal(places, expected)
+    assert torch.equal(ours[:, :cells], theirs[:, :cells])
+    assert torch.equal(ours[:, 2 * cells :], theirs[:, cells:])
+    alike = seen.with_images({HAND: np.tile(seen.images[HAND][:, :SIZE], (1, 2, 1))})
+    assert torch.equal(*two.encode(alike)[:, : 2 * cells].split(cells, 1))
+    # further training reaches the new encoder
+    two.requires_grad_(True)
+    two.encode_batch(two.inputs(seen))[1].sum().backward()
+    assert two.locate[0].weight.grad is not None
+    assert two.locate[0].weight.grad[:, 2 * one.settings.keypoints : 4 * one.settings.keypoints].abs().sum() > 0
+
+
+def test_training_goes_on_only_with_views_behind_those_it_has() -> None:
+    one = made("corner4")
+    described = type("D", (), {"settings": vars(one.settings), "cameras": one.cameras})()
+    for camera in ("corner4", HAND, PAST):
+        check_init(one.settings, camera, described, Path("x"))
+    for camera in ("corner", "gripperPOV+corner4", "corner4:60"):
+        with pytest.raises(UsageError, match="sees corner4"):
+            check_init(one.settings, camera, described, Path("x"))
+
+
+def test_from_recording_to_rollout_and_export(tmp_path: Path) -> None:
+    """Every command of a policy that sees two views, as docs/training.md gives them, small."""
+    common = ["task=drawer-close", f"world.camera.name={HAND}", "world.camera.size=32", f"results={tmp_path}"]
+
+    def run(*words: str) -> str:
+        result = CliRunner().invoke(app, list(words))
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    run("demos", "name=two", "episodes=3", "frame_stride=4", "runtime.workers=1", *common)
+    dataset = DemoDataset.open(tmp_path / "artifacts/demos/two")
+    frames = dataset.load(0).frames
+    assert frames.shape[1:] == (SIZE, 2 * SIZE, 3)
+    assert np.asarray(frames).shape == frames.shape
+    sizes = ["target=nano", "target.image_size=32"]
+    steps = ["train.steps=2", "train.batch=4", "train.validate_every=1"]
+    one = [word for word in common if "camera.name" not in word]
+    run("demos", "name=one", "episodes=3", "frame_stride=4", "runtime.workers=1", *one)
+    run("train", "target", "name=first", "demos=one", *sizes, *steps, *one)
+    run("train", "target", "name=seen", "demos=two", "train.init=first", *sizes, *steps, *common)
+    described = json.loads((tmp_path / "artifacts/target/seen/target.json").read_text())
+    assert described["cameras"] == [HAND]
+    run("train", "drafter", "drafter=early", "policy.target=seen", "demos=two", "drafter.samples=8", *steps, common[-1])
+    run("rollout", "policy.target=seen", "method=ar", "episodes=1", "world.horizon=8", "record=1", *common)
+    run("demos", "export", "format=lerobot", "demos=two", common[-1])
+    features = json.loads((tmp_path / "lerobot/two/meta/info.json").read_text())["features"]
+    assert [features[f"observation.images.{view}"]["shape"] for view in HAND.split("+")] == [[SIZE, SIZE, 3]] * 2
+    wrong = CliRunner().invoke(
+        app, ["train", "target", "name=wrong", "demos=two", "train.init=first", *sizes, *steps, *one]
+    )
+    assert wrong.exit_code == 1
+    assert "show camera corner4+gripperPOV:75, the policy would be shown corner4" in wrong.output
