@@ -25,7 +25,7 @@ MOST_STRESS = 4
 class CameraSettings:
     """The policy's view: a camera of the environment, vertical field of view in degrees, pixels, supersampling."""
 
-    name: str = ""  # empty: the environment's first camera
+    name: str = ""  # empty: the environment's first camera; joined names are several views side by side
     fovy: float = number(45.0, above=0, most=179)
     size: int = number(96, 8, 4096)  # pixels, square
     supersample: int = number(2, 1, 16)
