@@ -61,7 +61,8 @@ def about(rows: pd.DataFrame, averaging: str) -> str:
     """A figure's subtitle: targets, counts, averaging, device."""
     first = rows.iloc[0]
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
-    names = ", ".join(dict.fromkeys(str(name) for name in rows["target"]))
+    targets = dict.fromkeys(str(name) for name in rows["target"])
+    names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} targets"  # more are wider than a figure
     return f"{names} · {counts} · {averaging} · {first['device_name']}, {first['dtype']}"
 
 
