@@ -27,7 +27,7 @@ class CameraSettings:
 
     name: str = ""  # empty: the environment's first camera; joined names are several views side by side
     fovy: float = number(45.0, above=0, most=179)
-    size: int = number(96, 8, 4096)  # pixels, square
+    size: int = number(96, 8, 4096)  # pixels of a view, square
     supersample: int = number(2, 1, 16)
 
 

@@ -24,6 +24,11 @@ class View:
     fovy: float | None = None
     delay: int = 0
 
+    @property
+    def shown(self) -> str:
+        """The camera, with its field of view where it has one of its own."""
+        return self.camera if self.fovy is None else f"{self.camera}:{self.fovy:g}"
+
 
 def views_of(name: str) -> tuple[View, ...]:
     """The views of a frame of that name, from left to right; of the empty name one, of the environment's first camera.
@@ -44,7 +49,7 @@ def _view(part: str, name: str) -> View:
     fovy = float(found["fovy"]) if found and found["fovy"] else None
     if found is None or (fovy is not None and not 0 < fovy < 180):
         raise UsageError(
-            f"camera name '{name}': cameras joined with +, each with its field of view in degrees where it has one of "
-            "its own and a delay of 1 to 999 control steps where it shows the past, e.g. front+wrist:75+front@4"
+            f"camera name '{name}': '{part}' is no view; write NAME, NAME:DEGREES (above 0, below 180) or NAME@STEPS "
+            "(1 to 999), joined with +, e.g. front+wrist:75+front@4"
         )
     return View(found["camera"], fovy, int(found["delay"] or 0))

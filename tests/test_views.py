@@ -17,6 +17,7 @@ from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.environments.metaworld.world import MetaWorld
+from kerv_cli.environments.stress.base import NO_STRESS, Stress
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.settings import TargetSettings, TrainTargetSettings
 from kerv_cli.spaces import Observation
@@ -47,7 +48,7 @@ def test_a_name_says_cameras_fields_of_view_and_delays() -> None:
 
 @pytest.mark.parametrize("name", ["a+", "+a", "a@", "a@0", "a@x", "a@-1", "a:0", "a:180", "a:", "a:x", "a@4:60", "a:²"])
 def test_a_name_that_says_none_of_them_is_refused(name: str) -> None:
-    with pytest.raises(UsageError, match="cameras joined with"):
+    with pytest.raises(UsageError, match="is no view"):
         views_of(name)
 
 
@@ -77,6 +78,36 @@ def test_a_delayed_view_is_the_newest_drawn_frame_that_is_old_enough(world: Meta
     assert len(set(drawn.values())) == 5
     world.reset(2)
     assert len(set(parts())) == 1  # nothing of the episode before
+
+
+def test_recorded_frames_do_not_move_what_a_policy_sees_of_the_past(world: MetaWorld) -> None:
+    seen = []
+    for recorded in (False, True):
+        world.reset(1)
+        for step in range(13):
+            if recorded:
+                world.frame(CameraConfig(PAST, size=SIZE, supersample=1))
+            if step in (0, 5, 12):
+                seen.append(world.observe([PAST]).images[PAST].tobytes())
+            world.step([1.0, 1.0, 0.3, 0.0])
+    assert seen[:3] == seen[3:]
+
+
+def test_a_stress_changes_each_camera_and_the_past_is_what_was_seen(world: MetaWorld) -> None:
+    class Numbered(Stress):
+        def see(self, camera: str, image: np.ndarray, step: int) -> np.ndarray:
+            return np.full_like(image, 10 * step + (camera == "gripperPOV:75"))
+
+    world.stress = Numbered()
+    try:
+        world.reset(0)
+        for step in range(5):
+            image = world.observe([f"{HAND}+corner4@2"]).images[f"{HAND}+corner4@2"]
+            past = 10 * max(0, step - 2)
+            assert [int(x) for x in image[0, ::SIZE, 0]] == [10 * step, 10 * step + 1, past]
+            world.step(np.zeros(4))
+    finally:
+        world.stress = NO_STRESS
 
 
 def small(*overrides: str) -> TargetSettings:
@@ -193,3 +224,17 @@ def test_from_recording_to_rollout_and_export(tmp_path: Path) -> None:
     )
     assert wrong.exit_code == 1
     assert "show camera corner4+gripperPOV:75, the policy would be shown corner4" in wrong.output
+    for words in (
+        ["train", "drafter", "drafter=early", "policy.target=seen", "demos=one", *steps, common[-1]],
+        ["train", "drafter", "policy.target=seen", "demos=one", *steps, common[-1]],
+        ["build", "datastore", "policy.target=seen", "demos=one", common[0], common[-1]],
+        ["calibrate", "policy.target=seen", "demos=one", common[0], common[-1]],
+    ):
+        refused = CliRunner().invoke(app, words)
+        assert refused.exit_code == 1, refused.output
+        assert "show camera corner4, the target sees corner4+gripperPOV:75" in " ".join(refused.output.split())
+    visits = ["demos", "policy=vision", "policy.target=seen", "name=visits", "episodes=1", "runtime.workers=1"]
+    lone = CliRunner().invoke(app, [*visits, *one])
+    assert lone.exit_code == 2
+    assert "set world.camera.name=corner4+gripperPOV:75" in " ".join(lone.output.split())
+    run(*visits, "world.horizon=20", "expert_share=0.5", *common)

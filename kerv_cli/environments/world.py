@@ -39,7 +39,7 @@ class EpisodeWorld(ABC):
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
-        self._drawn: dict[tuple[CameraConfig, View], list[tuple[int, NDArray[np.uint8]]]] = {}  # by control step
+        self._drawn: dict[tuple[CameraConfig, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}  # of delayed views
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -117,33 +117,38 @@ class EpisodeWorld(ABC):
     def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
         """As `World.frame`."""
         self.observation  # noqa: B018 - raises before the first reset
-        config = self.camera if camera is None else self.spec.camera(camera)
-        views = views_of(config.name)
-        if config.name == views[0].camera:
-            return self._draw(config)
-        cameras = [replace(config, name=view.camera, fovy=view.fovy or config.fovy) for view in views]
-        now = {camera: self._draw(camera) for camera in dict.fromkeys(cameras)}
-        parts = [self._at(config, view, now[camera]) for view, camera in zip(views, cameras, strict=True)]
-        return np.concatenate(parts, axis=1)
-
-    def _at(self, config: CameraConfig, view: View, now: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A part of the frame `config`; now: what its camera shows. Of a delayed view the newest drawn frame that is
-        old enough, until there is one the episode's first."""
-        if not view.delay:
-            return now
-        drawn = self._drawn.setdefault((config, view), [])
-        if not drawn or drawn[-1][0] < self.steps:
-            drawn.append((self.steps, now))
-        while len(drawn) > 1 and drawn[1][0] <= self.steps - view.delay:
-            drawn.pop(0)
-        return drawn[0][1]
+        return self._picture(self.camera if camera is None else self.spec.camera(camera), observed=False)
 
     def observe(self, cameras: Sequence[str]) -> Observation:
         """As `World.observe`; images have the size of the world's own camera."""
-        images = {
-            name: self.stress.see(name, self.frame(replace(self.camera, name=name)), self.steps) for name in cameras
-        }
+        self.observation  # noqa: B018 - raises before the first reset
+        images = {name: self._picture(self.spec.camera(replace(self.camera, name=name)), True) for name in cameras}
         return self.observation.with_images(images)
+
+    def _picture(self, config: CameraConfig, observed: bool) -> NDArray[np.uint8]:
+        """A frame, put together of its views. observed: by a policy, so that a stress changes each camera's picture;
+        recorded frames have a past of their own."""
+        views = views_of(config.name)
+        now = {
+            view.shown: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
+        }
+        if observed:
+            now = {shown: self.stress.see(shown, image, self.steps) for shown, image in now.items()}
+        parts = [self._at((config, view, observed), now[view.shown]) for view in views]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def _at(self, key: tuple[CameraConfig, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A part of a frame; now: what its camera shows. A delayed view shows the newest picture that is at least
+        `delay` control steps old; before there is one, the episode's first."""
+        delay = key[1].delay
+        if not delay:
+            return now
+        drawn = self._drawn.setdefault(key, [])
+        if not drawn or drawn[-1][0] < self.steps:
+            drawn.append((self.steps, now))
+        while len(drawn) > 1 and drawn[1][0] <= self.steps - delay:
+            drawn.pop(0)
+        return drawn[0][1]
 
     def close(self) -> None:
         """As `World.close`."""

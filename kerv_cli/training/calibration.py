@@ -31,7 +31,7 @@ from kerv_cli.provenance import provenance
 from kerv_cli.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.spaces import Observation, ObservationSpace
 from kerv_cli.training.demonstrations import open_demos
-from kerv_cli.training.observations import check_frames, check_spaces, instruction_of
+from kerv_cli.training.observations import check_frames, check_shown, instruction_of
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
@@ -118,7 +118,7 @@ class CalibrationRun:
         self.path = self.artifacts.place("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
-        check_spaces(self.dataset, self.described.actions, self.described.observation, "the target")
+        check_shown(self.dataset, self.described)
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
         self.datastore = self.artifacts.place("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()

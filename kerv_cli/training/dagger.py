@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kerv_cli.decoding.build import own_decoder
 from kerv_cli.environments.demos.recording import DemoConfig
 from kerv_cli.environments.spec import EnvironmentSpec, World
-from kerv_cli.errors import CheckpointError
+from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.places import find_target
 from kerv_cli.settings import WorldSettings
 from kerv_cli.targets.checkpoint import load_target, read_target
@@ -84,11 +84,18 @@ class TargetActs:
         """The target of that name, for worlds of an environment.
 
         Raises:
-            UsageError: no such target, or as `check_world`. CheckpointError: it is damaged, or as `check_world`.
+            UsageError: no such target, frames of another camera, or as `check_world`. CheckpointError: it is damaged,
+                or as `check_world`.
         """
         folder = find_target(results, name)
         described = read_target(folder)
         described.check_world(name, spec.name, spec.actions, world.camera.size)
+        sees, shown = [spec.camera_name(camera) for camera in described.cameras], spec.camera_name(world.camera.name)
+        if sees and shown not in sees:
+            raise UsageError(
+                f"policy.target={name} sees {sees[0]}, the recording would show {shown}: set "
+                f"world.camera.name={sees[0]}"
+            )
         return cls(folder, described.sha256)
 
     def __call__(self, config: DemoConfig) -> TargetActor:

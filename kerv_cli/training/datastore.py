@@ -37,7 +37,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import covered
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import WITHIN
-from kerv_cli.training.observations import check_spaces, read_chunks, read_observations
+from kerv_cli.training.observations import check_shown, read_chunks, read_observations
 from kerv_cli.training.recorded import prompts_of, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
 
@@ -122,7 +122,7 @@ class DatastoreBuild:
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
         described = self.artifacts.description
-        check_spaces(self.dataset, described.actions, described.observation, "the target")
+        check_shown(self.dataset, described)
         self.chosen = {name: self._episodes_of(name) for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
         _refuse_foreign(self.folder)

@@ -198,8 +198,8 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
     trained = description.cameras[0] if description.cameras else ""
     if settings.observation == "vision" and not f"{camera}+".startswith(f"{trained}+"):
         raise UsageError(
-            f"train.init: the target in {folder} sees {trained}, the run {camera}: set world.camera.name to {trained}, "
-            "which other views may follow"
+            f"train.init: the target in {folder} sees {trained}, the run {camera}: world.camera.name must be "
+            f"{trained}, or begin with {trained}+"
         )
 
 

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.environments import spec_of
+from kerv_cli.environments import spec_of, specs
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.episode_file import DemoEpisode
 from kerv_cli.environments.demos.frames import EncodedFrames
 from kerv_cli.errors import CheckpointError
 from kerv_cli.settings import TargetSettings
 from kerv_cli.spaces import ActionSpace, ObservationSpace
+from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 
@@ -120,14 +121,16 @@ def check_tail(episode: DemoEpisode, steps: int, what: str) -> None:
 
 
 def check_frames(episode: DemoEpisode, size: int) -> None:
-    """Checks that an episode's frames have the policy's size in pixels.
+    """Checks that an episode's frames are views of the policy's size in pixels, side by side.
 
     Raises:
-        CheckpointError: they have another one.
+        CheckpointError: they are not.
     """
-    if episode.frames.shape[1] != size:
+    height, width = episode.frames.shape[1:3]
+    if height != size or width % size:
+        shown = f"{height}" if height == width else f"{height} x {width}"
         raise CheckpointError(
-            f"the demonstrations' frames have {episode.frames.shape[1]} pixels, the policy takes {size}: "
+            f"the demonstrations' frames have {shown} pixels, the policy takes {size}: "
             "set target.image_size or record again with world.camera.size"
         )
 
@@ -142,6 +145,24 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
     dataset.manifest.actions.check_same(actions, where, owner)
     if observation.state and observation != dataset.manifest.observation:  # without a state it reads images alone
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
+
+
+def check_shown(dataset: DemoDataset, described: TargetDescription) -> None:
+    """Refuses demonstrations of another environment than a target's, or, for a compact one that sees, of other views.
+
+    Raises:
+        CheckpointError: other actions, observations or views.
+    """
+    check_spaces(dataset, described.actions, described.observation, "the target")
+    if described.family != "compact" or not described.cameras:
+        return
+    spec, recorded = specs()[dataset.manifest.environment], dataset.manifest.config["camera"]["name"]
+    sees = spec.camera_name(described.cameras[0])
+    if recorded != sees:
+        raise CheckpointError(
+            f"the demonstrations in {dataset.path} show camera {recorded}, the target sees {sees}: record them with "
+            f"world.camera.name={sees}"
+        )
 
 
 def instruction_of(name: str) -> str:

@@ -40,7 +40,7 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
-from kerv_cli.training.observations import check_spaces, split
+from kerv_cli.training.observations import check_shown, check_spaces, split
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.recorded import teach_recorded
 
@@ -273,7 +273,7 @@ class DrafterRun(Run):
         dataset = open_demos(settings.results, settings.demos)
         self.dataset = covered(dataset, settings.task, settings.starts)
         described = read_target(self.target_folder)
-        check_spaces(self.dataset, described.actions, described.observation, "the target")
+        check_shown(self.dataset, described)
         described.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )

@@ -80,7 +80,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "frame_size": str(episode.frames.shape[1]),
     }
     height, width = episode.frames.shape[1:3]
-    if width != height:  # several views; files of one view are as they always were
+    if width != height:  # files of square frames are as they always were
         metadata["frame_width"] = str(width)
     # save_file would hide a full disk behind an error type of its own.
     data = _with_sorted_metadata(save(tensors, metadata=metadata))

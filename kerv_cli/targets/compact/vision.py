@@ -29,7 +29,7 @@ class Residual(nn.Module):
 
 
 class VisionEncoder(Packable):
-    """The convolutional stem. size: of the frames, pixels. grid: vision tokens per side. keypoints: K. channels: of the
+    """The convolutional stem. size: of a view, pixels. grid: vision tokens per side. keypoints: K. channels: of the
     first stage. width: E. Raises ValueError where size and grid do not fit."""
 
     columns: Tensor
