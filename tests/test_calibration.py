@@ -110,7 +110,7 @@ def write_dataset(
             )
         tasks[task] = {"mean_steps": float(STEPS), "failed_seeds": [], "episodes": entries}
     spaces = {"actions": SPACE.as_dict(), "observation": SPEC.observation.as_dict()}
-    described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {}}
+    described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {"camera": {"name": SPEC.cameras[0]}}}
     write_json(folder / "manifest.json", {**described, "sha256": dataset_hash(tasks), "tasks": tasks})
 
 

@@ -77,7 +77,7 @@ def write_demos(
             entry |= {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
             tasks[task]["episodes"].append(entry)
     spaces = {"actions": SPACE.as_dict(), "observation": SPEC.observation.as_dict()}
-    described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {}}
+    described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {"camera": {"name": SPEC.cameras[0]}}}
     manifest = {**described, "tasks": tasks, "sha256": dataset_hash(tasks)}
     write_json(folder / "manifest.json", manifest)
     return manifest

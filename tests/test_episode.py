@@ -68,7 +68,7 @@ def test_a_state_policy_never_draws(policies: Path, monkeypatch: pytest.MonkeyPa
     def drawn(self: MetaWorld, camera: object = None) -> np.ndarray:
         raise AssertionError("a frame was drawn that nobody reads")
 
-    monkeypatch.setattr(MetaWorld, "frame", drawn)
+    monkeypatch.setattr(MetaWorld, "_draw", drawn)
     assert len(episodes(settings(policies, "policy.target=nano-state"), 1)) == 1
     with pytest.raises(AssertionError, match="nobody reads"):
         episodes(settings(policies, "policy.target=nano-vision"), 1)
