@@ -156,13 +156,19 @@ def check_shown(dataset: DemoDataset, described: TargetDescription) -> None:
     check_spaces(dataset, described.actions, described.observation, "the target")
     if described.family != "compact" or not described.cameras:
         return
-    spec, recorded = specs()[dataset.manifest.environment], dataset.manifest.config["camera"]["name"]
-    sees = spec.camera_name(described.cameras[0])
-    if recorded != sees:
-        raise CheckpointError(
-            f"the demonstrations in {dataset.path} show camera {recorded}, the target sees {sees}: record them with "
-            f"world.camera.name={sees}"
-        )
+    sees = specs()[dataset.manifest.environment].camera_name(described.cameras[0])
+    check_camera(dataset, sees, "the target sees", f"record them with world.camera.name={sees}")
+
+
+def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> None:
+    """Refuses demonstrations whose frames are of another camera than `camera`. who, remedy: for the message.
+
+    Raises:
+        CheckpointError: they are.
+    """
+    recorded = dataset.manifest.config["camera"]["name"]
+    if recorded != camera:
+        raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
 
 
 def instruction_of(name: str) -> str:

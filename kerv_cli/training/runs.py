@@ -40,7 +40,7 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
-from kerv_cli.training.observations import check_shown, check_spaces, split
+from kerv_cli.training.observations import check_camera, check_shown, check_spaces, split
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.recorded import teach_recorded
 
@@ -169,12 +169,7 @@ class TargetRun(Run):
         spec, shown = self.spec, self.world.camera.name
         check_spaces(self.dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
         if self.settings.target.observation == "vision":
-            recorded = self.dataset.manifest.config["camera"]["name"]
-            if recorded != shown:
-                raise CheckpointError(
-                    f"the demonstrations in {self.dataset.path} show camera {recorded}, the policy would be shown "
-                    f"{shown}: set world.camera.name, or record again"
-                )
+            check_camera(self.dataset, shown, "the policy would be shown", "set world.camera.name, or record again")
 
     def find_init(self) -> Path | None:
         """Folder of the target `train.init`; None for a fresh run.

@@ -440,6 +440,5 @@ class PackedPrompt(Packed):
     def see(self, images: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
         """Tokens (1, grid², E) and points (1, 2K) of every view."""
         assert images is not None
-        views = (images,) if len(self.encoders) == 1 else images.split(self.size, -1)
-        seen = [encoder(view) for encoder, view in zip(self.encoders, views, strict=True)]
+        seen = [encoder(view) for encoder, view in zip(self.encoders, images.split(self.size, -1), strict=True)]
         return [tokens for tokens, _ in seen], [points for _, points in seen]

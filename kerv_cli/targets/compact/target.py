@@ -56,7 +56,7 @@ class CompactTarget(Packable):
     """The compact policy: encoder, trunk and head; implements `ReadableTarget`. Parameters in float32.
 
     cameras: of a vision policy, the one whose images it reads; each of its views (`views_of`) has an encoder and vision
-    tokens of its own. segments: slice of the prompt by the name of its part.
+    tokens of its own. frame_shape: of those images. segments: slice of the prompt by the name of its part.
     sha256: of the weights it was loaded with, else empty.
     """
 
@@ -76,7 +76,7 @@ class CompactTarget(Packable):
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
         self.cameras = (camera,) if s.observation == "vision" else ()
         views = len(views_of(camera)) if self.cameras else 0
-        self.segments = _segments(s, views)
+        self.segments, self.frame_shape = _segments(s, views), frame_shape(camera, s.image_size)
         felt, places = len(observation.proprioception), len(observation.places)
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.embedding = nn.Embedding(actions.tokens, s.width)
@@ -192,10 +192,9 @@ class CompactTarget(Packable):
             if camera not in observation.images:
                 raise CheckpointError(f"the target was trained on images of camera '{camera}', which were not drawn")
             image = np.ascontiguousarray(observation.images[camera])
-            if image.shape != frame_shape(camera, self.settings.image_size):
+            if image.shape != self.frame_shape:
                 raise CheckpointError(
-                    f"the image of camera '{camera}' has shape {image.shape}, the target takes "
-                    f"{frame_shape(camera, self.settings.image_size)}"
+                    f"the image of camera '{camera}' has shape {image.shape}, the target takes {self.frame_shape}"
                 )
             images = upload(image, self.device).permute(2, 0, 1)[None]
         return Inputs(images, felt, state, self.words_of(observation.instruction))
