@@ -20,7 +20,7 @@ def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: b
     """
     if settings.policy.kind == EXPERT:
         return {}
-    idle = _idle(settings) | ({} if sweep else dict.fromkeys(_OF_SWEEPS, "a rollout runs in one process"))
+    idle = idle_keys(settings) | ({} if sweep else dict.fromkeys(_OF_SWEEPS, "a rollout runs in one process"))
     found = {}
     for word in overrides:
         key = word.partition("=")[0].lstrip("+")
@@ -44,8 +44,8 @@ def _idle_timing(timing: TimingSettings) -> dict[str, str]:
     return idle
 
 
-def _idle(settings: RolloutSettings) -> dict[str, str]:
-    """Key -> why it is not read."""
+def idle_keys(settings: RolloutSettings) -> dict[str, str]:
+    """Key of a setting that has no effect -> why."""
     method = settings.parts()
     chosen = {kind: method[kind].kind for kind in METHOD_KINDS}
     idle: dict[str, str] = {}

@@ -134,6 +134,15 @@ def _put_back(folder: Path) -> None:
         os.rename(_aside(folder), folder)
 
 
+def visible(folder: Path) -> list[Path]:
+    """What lies in a folder, by name, without hidden names: temporaries and locks are no results. Empty where there is
+    no such folder."""
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError:
+        return []
+
+
 @functools.cache
 def _clean_once(folder: Path) -> None:
     """Once per process and folder: a command that goes on removes what its killed predecessor left there."""

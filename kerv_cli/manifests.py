@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kerv_cli.errors import CheckpointError, KervError
 from kerv_cli.files import read_json, sha256_of
@@ -33,8 +35,9 @@ def _forbid_unknown(kind: Any) -> None:
         _forbid_unknown(inner)
 
 
-def read(kind: type[T], value: Any, what: str) -> T:
-    """`value` (what JSON gives) as an instance of the dataclass `kind`, nested ones included.
+def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
+    """`value` (what JSON gives) as an instance of the dataclass `kind`, nested ones included. tolerant: fields that
+    this kerv does not know, e.g. of a newer one, are left out instead of refused.
 
     Raises:
         CheckpointError: a field is missing, unknown or of another type; the line names the first one.
@@ -43,7 +46,7 @@ def read(kind: type[T], value: Any, what: str) -> T:
 
     try:
         adapter: Any = _adapter(kind)  # type: ignore[arg-type]
-        checked: T = adapter.validate_python(value)
+        checked: T = adapter.validate_python(_known(kind, value) if tolerant else value)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the whole"
@@ -54,12 +57,35 @@ def read(kind: type[T], value: Any, what: str) -> T:
     return checked
 
 
+def _known(hint: Any, value: Any) -> Any:
+    """`value` without the keys that the dataclasses of this type do not have, at any depth."""
+    inner = get_args(hint)
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        hints = _hints(hint)  # type: ignore[arg-type]
+        return {name: _known(hints[name], one) for name, one in value.items() if name in hints}
+    if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
+        return {key: _known(inner[-1], one) for key, one in value.items()}
+    if isinstance(value, list | tuple) and get_origin(hint) in (list, tuple):
+        return [_known(inner[0], one) for one in value]
+    either = next((one for one in inner if dataclasses.is_dataclass(one)), None)  # X | None
+    return value if either is None else _known(either, value)
+
+
+_hints = functools.cache(get_type_hints)
+
+
 def read_file(kind: type[T], path: Path, what: str) -> T:
     """The JSON file at `path` as an instance of `kind`; errors as `read`, and a missing or unreadable file."""
     value = read_json(path)
     if not isinstance(value, Mapping):
         raise CheckpointError(f"{path} is not {what}")
-    return read(kind, value, str(path))
+    return read(kind, value, str(path), tolerant=True)
+
+
+def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
+    """Hash by which others name a datastore: over its keys, chunk and target (docs/formats.md)."""
+    text = json.dumps([key, chunk, target, sorted(files.items())])
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:

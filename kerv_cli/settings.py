@@ -233,6 +233,9 @@ class SweepSettings(CommandSettings):
     study: StudySettings = field(default_factory=StudySettings)
     # done: every planned episode; decided: settings stop when their question is answered
     until: str = choice("done", "done", "decided")
+    # what is run again although it is there: nothing | settings whose times were not taken in turn with the baseline |
+    # cells of other code | everything
+    rerun: str = choice("never", "never", "timed", "changed", "all")
     # until=decided: is the loss of success against the baseline below so many points?
     loss: float = number(3.0, above=0, most=99.9)
 
@@ -532,15 +535,16 @@ def as_plain(settings: Any) -> dict[str, Any]:
     return asdict(settings)
 
 
-def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
-    """The inverse of `as_plain` for a rollout; every part's settings become their own class.
+def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSettings:
+    """The inverse of `as_plain` for a rollout; every part's settings become their own class. tolerant: as
+    `manifests.read`.
 
     Raises:
         CheckpointError: not such settings. UnknownName: a part that is not registered here.
     """
-    settings = manifests.read(RolloutSettings, dict(plain), "a stored setting")
+    settings = manifests.read(RolloutSettings, dict(plain), "a stored setting", tolerant)
     for group in parts.PART_GROUPS:
         value = dict(getattr(settings, group))
         schema = parts.part_of(group, value["kind"]).settings
-        setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}"))
+        setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}", tolerant))
     return settings

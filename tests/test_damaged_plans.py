@@ -13,8 +13,7 @@ from studies_synthetic import run_cell, settings_of, threshold_settings, thresho
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, read_yaml
 from kerv_cli.reporting.tables import load_study
-from kerv_cli.studies.plan import is_result_of
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.studies.store import StudyStore, is_result_of
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 _LEVELS = zip("abcdefghij", "bcdefghijk", strict=True)

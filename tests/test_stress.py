@@ -29,7 +29,7 @@ from kerv_cli.registry import parts
 from kerv_cli.rollouts.policy import check
 from kerv_cli.rollouts.run import Runner, close_worlds
 from kerv_cli.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
-from kerv_cli.studies.plan import determinants, stress_of
+from kerv_cli.studies.identity import stress_of, work_of
 
 SEED, STEPS, SIZE = 50_006, 24, 48
 KINDS = ("push", "actuation", "sensor", "light", "colour", "camera", "object")
@@ -322,8 +322,8 @@ def settings(*words: str) -> RolloutSettings:
 
 
 def test_an_unstressed_cell_is_what_it_was_before_there_was_stress() -> None:
-    def whole(plain: dict[str, Any]) -> dict[str, Any]:
-        return determinants(plain, {}, "insert-peg", (SEED,), 0, "code")
+    def whole(plain: dict[str, Any]) -> str:
+        return work_of(plain, {})
 
     now, zero = as_plain(settings()), as_plain(settings("world.stress.kind=light"))
     old = {**now, "world": {key: value for key, value in now["world"].items() if key != "stress"}}

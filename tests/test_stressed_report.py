@@ -17,7 +17,8 @@ from kerv_cli.reporting.report import report
 from kerv_cli.reporting.stressed import by_kind, is_stressed, stem, summed_table, verdict
 from kerv_cli.reporting.tables import StudyData, load_study, rows_of, study_table
 from kerv_cli.settings import RolloutSettings, StressSettings, StudySettings, SweepSettings
-from kerv_cli.studies.plan import Cell, plan, stress_of
+from kerv_cli.studies.identity import stress_of
+from kerv_cli.studies.plan import Cell, plan
 from kerv_cli.studies.resolve import resolve
 from kerv_cli.studies.store import StudyStore
 

@@ -7,7 +7,6 @@ import itertools
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -31,14 +30,14 @@ from studies_synthetic import (
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import StorageError, UsageError
 from kerv_cli.settings import RuntimeSettings
-from kerv_cli.studies.adopt import adopt
 from kerv_cli.studies.block import RunEpisode
 from kerv_cli.studies.claims import is_claimed
 from kerv_cli.studies.estimate import estimate
 from kerv_cli.studies.events import BlockStarted, CellDone, CellFailed, CellReused, Event, SweepFinished, SweepStarted
 from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Block, Cell, blocks_of
+from kerv_cli.studies.plan import Cell, blocks_of
 from kerv_cli.studies.progress import ProgressDisplay
+from kerv_cli.studies.reuse import Stock, cover
 from kerv_cli.studies.store import StudyStore
 
 
@@ -168,7 +167,7 @@ def test_a_damaged_cell_is_a_failure_not_a_crash(store: StudyStore) -> None:
     (store.cells / cells[0].id / "episodes.parquet").unlink()
     outcome = execute(cells, prepare, store)
     assert labels(outcome.done) == labels(cells[1:])
-    assert "delete that folder" in outcome.failed[0].reason
+    assert "sets it aside" in outcome.failed[0].reason
 
 
 def test_a_cell_that_is_completed_meanwhile_is_not_run_again(store: StudyStore) -> None:
@@ -228,24 +227,18 @@ def test_over_processes_only_the_guilty_cells_fail(store: StudyStore) -> None:
 
 KILLED_PARENT = """
 import sys
-import kerv_cli.studies.plan
 from studies_synthetic import slow_elsewhere, threshold_study
 from kerv_cli.settings import RuntimeSettings
 from kerv_cli.studies.execute import execute
 from kerv_cli.studies.store import StudyStore
 
-kerv_cli.studies.plan.code_hash = lambda: "f" * 64
 cells = threshold_study(["reach-v3", "push-v3"])
 execute(cells, slow_elsewhere, StudyStore(sys.argv[1], "threshold"), RuntimeSettings(workers=2))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_workers_of_a_killed_sweep_end_and_complete_cells_stay(
-    store: StudyStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # parts that other tests registered here are not registered there
-    monkeypatch.setattr("kerv_cli.studies.plan.code_hash", lambda: "f" * 64)
+def test_workers_of_a_killed_sweep_end_and_complete_cells_stay(store: StudyStore, tmp_path: Path) -> None:
     assert slow_elsewhere  # what the script runs: the first task quickly, the other for minutes
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, "-c", KILLED_PARENT, str(tmp_path)], env=environment)
@@ -267,57 +260,14 @@ def test_workers_of_a_killed_sweep_end_and_complete_cells_stay(
     assert len(execute(cells, prepare, store).done) == 4
 
 
-def test_a_block_that_another_study_measured_is_taken_over_whole(store: StudyStore) -> None:
-    """`wide` measured a superset; `store` takes its blocks over, with the other run's id, and runs nothing."""
-    wide = StudyStore(store.root.parent.parent, "wide")
-    cells = threshold_study(["reach-v3"])
-    execute(cells, prepare, wide)
-    part_of_them = [cell for cell in cells if cell.label != "naive_sd"]
-
-    run, calls = count_calls()
-    outcome = execute(part_of_them, run, store)
-
-    assert (len(outcome.reused), outcome.done, outcome.failed, calls) == (3, [], [], [])
-    theirs = {wide.status_of(cell.id)["run"] for cell in cells}
-    assert {store.status_of(cell.id)["run"] for cell in part_of_them} == theirs
-    assert len(list(store.cells.iterdir())) == 3
-
-
-def test_a_block_is_not_taken_over_in_part(store: StudyStore) -> None:
-    """Ratios within it would have sides of two runs."""
-    other = StudyStore(store.root.parent.parent, "small")
-    cells = threshold_study(["reach-v3"])
-    execute(cells[:2], prepare, other)
-
-    outcome = execute(cells, prepare, store)
-
-    assert len(outcome.done) == len(cells)
-    assert len({store.status_of(cell.id)["run"] for cell in cells}) == 1
-
-
-def test_a_block_of_two_runs_is_not_taken_over_and_a_begun_one_is_completed(store: StudyStore) -> None:
-    other = StudyStore(store.root.parent.parent, "wide")
-    cells = threshold_study(["reach-v3"])
-    for some in (cells[:2], cells):  # two runs
-        execute(some, prepare, other)
-    assert not adopt(store, Block(tuple(cells)))
-
-    again = StudyStore(store.root.parent.parent, "again")
-    execute(cells, prepare, again)
-    store.cells.mkdir(parents=True)
-    shutil.copytree(again.cells / cells[0].id, store.cells / cells[0].id)  # as after a kill
-    assert adopt(store, Block(tuple(cells)))
-    assert all(store.has_cell(cell.id) for cell in cells)
-
-
 def test_estimates_say_what_they_rest_on(store: StudyStore) -> None:
     cells = threshold_study(["reach-v3", "push-v3"])
-    guess = estimate(cells, store, 1, 10.0)
+    guess = estimate(cover(cells, Stock(store)), store, 1, 10.0)
     assert (guess.seconds, guess.to_run, guess.reused, guess.measured) == (8 * 4 * 10.0, 8, 0, False)
     assert "guess" in guess.source
     execute(cells[:2], prepare, store)
     wall = {c.label: store.read_cell(c.id).episodes["wall_seconds"].mean() for c in cells[:2]}
-    found = estimate(cells, store, 2, 10.0)
+    found = estimate(cover(cells, Stock(store)), store, 2, 10.0)
     mean = (wall["ar"] + wall["naive_sd"]) / 2
     assert found.seconds == pytest.approx((4 * wall["ar"] + 4 * wall["naive_sd"] + 16 * mean) / 2)
     assert (found.to_run, found.reused, found.measured) == (6, 2, True)

@@ -14,9 +14,10 @@ from studies_synthetic import IDENTITY, settings_of, threshold_settings, thresho
 
 import kerv_cli
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import RolloutSettings
+from kerv_cli.settings import RolloutSettings, as_plain
 from kerv_cli.studies.code import _meaning, code_hash
-from kerv_cli.studies.plan import blocks_of, cell_id, parse_seeds, plan, seeds_text, unique_cells
+from kerv_cli.studies.identity import ENGINE, hash_of, work_of
+from kerv_cli.studies.plan import blocks_of, parse_seeds, plan, seeds_text, unique_cells
 from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
 
 
@@ -71,26 +72,29 @@ def test_what_determines_the_result_changes_the_id(path: str, value: Any) -> Non
         ("method", "other_name"),
         ("policy.target", "same-weights-elsewhere"),
         ("task", ["push-v3"]),
+        ("rollout.latency_ms", 5.0),
     ],
 )
 def test_what_does_not_determine_the_result_leaves_the_id(path: str, value: Any) -> None:
     assert only_id(changed(path, value)) == only_id(settings_of("spec_vla", 9))
 
 
-def test_task_weights_and_code_change_the_id(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_task_and_weights_change_the_id_and_code_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = settings_of("ar")
     before = only_id(settings)
     assert only_id(settings, task="push-v3") != before
     assert only_id(settings, identity={**IDENTITY, "drafter": "c" * 64}) != before
-    monkeypatch.setattr("kerv_cli.studies.plan.code_hash", lambda: "f" * 64)
-    assert only_id(settings) != before
+    with monkeypatch.context() as other:
+        other.setattr("kerv_cli.studies.code.code_hash", lambda: "f" * 64)
+        assert only_id(settings) == before
+    assert work_of(as_plain(settings), IDENTITY, engine=ENGINE + 1) != work_of(as_plain(settings), IDENTITY)
 
 
 def test_id_is_the_hash_of_canonical_json() -> None:
     expected = hashlib.sha256(b'{"a":1,"b":{"c":[1,2],"d":null}}').hexdigest()[:16]
-    assert cell_id({"b": {"d": None, "c": [1, 2]}, "a": 1}) == expected
+    assert hash_of({"b": {"d": None, "c": [1, 2]}, "a": 1}) == expected
     with pytest.raises(ValueError, match="JSON compliant"):
-        cell_id({"a": float("nan")})
+        hash_of({"a": float("nan")})
 
 
 def test_a_device_that_two_machines_resolve_differently_is_refused() -> None:
@@ -192,9 +196,13 @@ def test_sweeps_that_share_the_tasks_end_in_one_plan() -> None:
     assert {c.id for c in merged.cells} == {c.id for c in study_plan(["reach-v3", "push-v3"]).cells}
 
 
-def test_a_plan_with_other_episodes_replaces_the_old_one() -> None:
-    new = study_plan(["push-v3"], episodes=7)
-    assert merge_plans(study_plan(["reach-v3"]), new) == new
+def test_a_plan_with_fewer_episodes_keeps_those_of_the_tasks_that_it_does_not_name() -> None:
+    new = study_plan(["push-v3"], episodes=2)
+    merged = merge_plans(study_plan(["reach-v3"]), new)
+    assert {(cell.task, cell.seeds) for cell in merged.cells} == {
+        ("reach-v3", (100_000, 100_001)),
+        ("push-v3", (100_000, 100_001)),
+    }
 
 
 def test_a_changed_setting_replaces_only_its_own_cells() -> None:

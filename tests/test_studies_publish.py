@@ -65,6 +65,6 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, monkeypatc
 
 def test_several_machines_are_refused() -> None:
     rows = {"label": ["ar", "x"], "baseline": "ar", "pairs": [0, 3], "same_run": True, "same_block": 1.0}
-    table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip"})
+    table = pd.DataFrame(rows | {"git_commit": COMMIT, "host": ["a", "a;b"], "device_name": "chip", "engine": 1})
     assert refusals(table) == ["its cells are of 2 machines"]
     assert refusals(table.assign(host="a")) == []

@@ -268,7 +268,7 @@ def test_a_damaged_cell_is_named_with_its_remedy(store: StudyStore, cell: Cell, 
             look(cell.id)
         message = str(caught.value)
         assert str(store.cells / cell.id) in message
-        assert "delete that folder and run `kerv sweep study=threshold` again" in message
+        assert "`kerv doctor --repair` sets it aside" in message
         assert "\n" not in message
 
 

@@ -12,7 +12,8 @@ import pyarrow.parquet as pq
 
 from kerv_cli.decoding.cost import DECODE_TIMES, DecodeSequence, sequence_of
 from kerv_cli.errors import UsageError
-from kerv_cli.studies.plan import Cell, batch_of
+from kerv_cli.studies.identity import batch_of
+from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.store import StudyStore
 
 _COLUMNS = ["task", "seed", "index", "rounds", *DECODE_TIMES]

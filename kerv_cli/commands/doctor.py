@@ -16,9 +16,12 @@ if TYPE_CHECKING:
 
     from kerv_cli.environments.spec import EnvironmentSpec
     from kerv_cli.settings import DoctorSettings
+    from kerv_cli.studies.store import StudyStore
 
 
-Repair = Annotated[bool, typer.Option("--repair", help="List and remove what killed commands left in the results.")]
+Repair = Annotated[
+    bool, typer.Option("--repair", help="Remove what killed commands left in the results; set damaged cells aside.")
+]
 
 
 @edge
@@ -187,8 +190,15 @@ def _left_over(settings: DoctorSettings) -> list[Path]:
     from kerv_cli.studies.claims import void
 
     root = results_dir(settings.results)
-    claims = [path for folder in sorted(root.glob("studies/*/claims")) for path in void(folder)]
+    claims = [path for store in _stores(settings) for path in void(store.claims)]
     return [*left_over(root), *claims]
+
+
+def _stores(settings: DoctorSettings) -> list[StudyStore]:
+    from kerv_cli.places import results_dir
+    from kerv_cli.studies.store import ROLLOUTS, STUDIES, stores
+
+    return [store for family in (STUDIES, ROLLOUTS) for store in stores(results_dir(settings.results), family)]
 
 
 def _left(settings: DoctorSettings) -> Finding:
@@ -198,7 +208,7 @@ def _left(settings: DoctorSettings) -> Finding:
 
 
 def _repair(settings: DoctorSettings) -> None:
-    """Lists and removes what `_left_over` finds."""
+    """Lists and removes what `_left_over` finds; sets damaged cells aside."""
     from kerv_cli.leftovers import remove
 
     found = _left_over(settings)
@@ -208,7 +218,11 @@ def _repair(settings: DoctorSettings) -> None:
     kept = [path for path in found if path.exists()]
     if kept:
         raise StorageError(f"{kept[0]} cannot be removed: permission denied?")
-    typer.echo(f"{len(found)} left over files removed; everything else is complete or absent")
+    damages = [(store, name, error) for store in _stores(settings) for name, error in store.damages()]
+    for store, name, error in damages:
+        typer.echo(f"{str(error).split(': `')[0]}: it lies in {store.set_aside(name)} now, {store.how_to_run()}")
+    aside = f", {len(damages)} damaged cells set aside" if damages else ""
+    typer.echo(f"{len(found)} left over files removed{aside}; everything else is complete or absent")
 
 
 def _display() -> Finding:

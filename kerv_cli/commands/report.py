@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -35,15 +34,15 @@ def report(
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
     from kerv_cli.settings import ReportSettings
+    from kerv_cli.studies.resolve import study_name
 
     # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
-    words = [f"only={_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
+    words = [f"only={study_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
     settings = composed("report", words, ReportSettings, cfg)
-    from kerv_cli.commands.sweep import tell_note
+    from kerv_cli.commands.sweep import tell_table
     from kerv_cli.places import results_dir
     from kerv_cli.reporting.agreement import agreement_summary
     from kerv_cli.reporting.report import report as write_report
-    from kerv_cli.reporting.summary import summary_table
     from kerv_cli.reporting.tables import rows_of
     from kerv_cli.studies.store import StudyStore
 
@@ -56,17 +55,11 @@ def report(
         print_json({"files": written.files, "studies": tables})
         return
     for name, table in written.tables.items():
-        console().print(summary_table(table))
-        tell_note(StudyStore(results_dir(settings.results), name).read_plan().note)
+        tell_table(table, StudyStore(results_dir(settings.results), name), words)
     if written.agreement is not None:
         console().print(agreement_summary(written.agreement))
     for path in written.files:
         typer.echo(str(path))
-
-
-def _name(study: str) -> str:
-    """The study's name: of a file its stem, as `kerv sweep study=FILE.yaml` stores it."""
-    return Path(study).stem if study.endswith((".yaml", ".yml")) else study
 
 
 def _choose(settings: ReportSettings, as_json: bool) -> None:

@@ -79,7 +79,7 @@ def rollout(
 
 def _stressed(settings: Mapping[str, Any]) -> str:
     """How a setting of plain RolloutSettings is called after its label: its stress; empty without one."""
-    from kerv_cli.studies.plan import stress_of
+    from kerv_cli.studies.identity import stress_of
 
     stress = stress_of(settings)
     return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
@@ -139,11 +139,11 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     from kerv_cli.studies.rollout_runs import begin
     from kerv_cli.studies.run_file import note_invocation
 
-    store, done = begin(results, cells)
+    store, cells, done = begin(results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
     store.write_plan(resolved.study, cells)
-    note_invocation(store, arguments)
+    note_invocation(store.root, arguments)
     runtime = next(iter(resolved.settings.values())).runtime
     with ProgressDisplay(console(stderr=True)) as display:
 
@@ -222,7 +222,7 @@ def _single(data: StudyData) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.decoding.record import PHASES
     from kerv_cli.reporting.measures import is_timed
-    from kerv_cli.studies.plan import batch_of
+    from kerv_cli.studies.identity import batch_of
 
     episodes = data.episodes
     cell = data.plan.cells[0]

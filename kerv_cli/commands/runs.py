@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from kerv_cli.runs.catalogue import RunEntry
     from kerv_cli.runs.compare import Comparison, Difference
 
-HELP = "List, show, compare, repeat, export and remove sweeps, rollouts and trainings."
+HELP = "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made."
 
 app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -35,13 +35,17 @@ Filters = Annotated[
 ]
 
 
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
+
+
 def _split(words: list[str] | None, least: int = 0, most: int = 1000, what: str = "a run") -> tuple[list[str], str]:
     """(names, results folder) of the words. Raises UsageError: too few or too many names."""
     from kerv_cli.errors import UsageError
+    from kerv_cli.studies.resolve import study_name
 
     given = words or []
     results = [word.split("=", 1)[1] for word in given if word.startswith("results=")]
-    names = [word for word in given if not word.startswith("results=")]
+    names = [study_name(word.removeprefix("study=")) for word in given if not word.startswith("results=")]
     if not least <= len(names) <= most:
         raise UsageError(f"name {what}: 'kerv runs list' shows them")
     return names, results[-1] if results else "results"
@@ -94,26 +98,32 @@ def _plain(run: RunEntry) -> dict[str, Any]:
 @app.command("show")
 @edge
 def show(overrides: Words = None, as_json: AsJson = False) -> None:
-    """Show one run: its command, its figures, where it lies, how large it is."""
+    """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
     from kerv_cli.reporting.summary import summary_table
     from kerv_cli.reporting.tables import load_study, rows_of, study_table
-    from kerv_cli.runs.catalogue import TRAINED, disk_bytes, find_run, store_of
+    from kerv_cli.runs.catalogue import disk_bytes, find_runs, parents, store_of
+    from kerv_cli.runs.compare import sides
 
     names, results = _split(overrides, 1, 1)
-    run = find_run(results, names[0])
-    table = None if run.kind in TRAINED or not run.episodes else study_table(load_study(store_of(run)))
-    size = disk_bytes(run.folder)
+    chosen = sides(results, names[0])
+    run = chosen[0].run
+    table = study_table(load_study(store_of(run))) if run.has_episodes and run.episodes else None
+    if table is not None:
+        table = table[table["label"].isin([side.label for side in chosen])]
+    size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
     if as_json:
-        print_json({**_plain(run), "bytes": size, "settings": [] if table is None else rows_of(table)})
+        rows = [] if table is None else rows_of(table)
+        print_json({**_plain(run), "made_from": origin, "bytes": size, "settings": rows})
         return
     typed = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
-    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed}).items():
-        typer.echo(f"{name:<8} {value}")
+    made = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed} | made).items():
+        typer.echo(f"{name:<9} {value}")
     if table is not None:
         console().print(summary_table(table))
     elif run.figures:
-        print_table(("measure", "best validation"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
+        print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
 @app.command("compare")
@@ -174,6 +184,7 @@ def _print_results(comparison: Comparison) -> None:
 def rerun(overrides: Words = None, plan: Annotated[bool, typer.Option("--plan", help="Say what would run.")] = False,
           as_json: AsJson = False) -> None:  # fmt: skip
     """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
+    from kerv_cli.errors import UsageError
     from kerv_cli.places import check_writable
     from kerv_cli.runs.catalogue import TRAINED, find_run
 
@@ -184,6 +195,8 @@ def rerun(overrides: Words = None, plan: Annotated[bool, typer.Option("--plan", 
     if run.kind in TRAINED:
         _train_again(run, results, plan, as_json)
         return
+    if not run.has_episodes:
+        raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
     from kerv_cli.runs.again import plan_again, run_again
     from kerv_cli.runs.compare import same_tokens
 
@@ -210,14 +223,13 @@ def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None
 
 @app.command("rm")
 @edge
-def rm(overrides: Words = None,
-       yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False) -> None:  # fmt: skip
+def rm(overrides: Words = None, yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
     from kerv_cli.runs.catalogue import disk_bytes, find_run
     from kerv_cli.runs.removal import check_removable, remove
 
     names, results = _split(overrides, 1)
-    found = [find_run(results, name) for name in names]
+    found = [find_run(results, name, exact=yes) for name in names]
     for run in found:
         check_removable(run)
     total = sum(disk_bytes(run.folder) for run in found)

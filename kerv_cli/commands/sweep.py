@@ -22,12 +22,15 @@ from kerv_cli.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
+
+    from pandas import DataFrame
 
     from kerv_cli.settings import RuntimeSettings
     from kerv_cli.studies.events import Outcome
     from kerv_cli.studies.plan import Cell
     from kerv_cli.studies.resolve import ResolvedStudy
+    from kerv_cli.studies.reuse import Covered
     from kerv_cli.studies.store import StudyStore
 
 SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core takes 0.5 to 1.5
@@ -55,60 +58,82 @@ def sweep(
     print_notes(idle_overrides(resolved))
     check_executor(first.runtime)
     check_writable(first.results)
-    cells = planned_cells(resolved)
+    wanted = planned_cells(resolved)
+    from kerv_cli.studies.reuse import Stock, cover, disagreements
+    from kerv_cli.studies.run_file import interrupted_since
     from kerv_cli.studies.store import StudyStore
 
     store = StudyStore(first.results, resolved.study.name)
+    stock = Stock(store)
+    covered = cover(wanted, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
     if plan:
-        _print_plan(cells, store, first.runtime.workers)
+        _print_plan(covered, store, first.runtime.workers, as_json)
         return
-    outcome = _run(resolved, cells, store, words)
-    _tell(outcome, resolved, cells, store, words, as_json)
+    outcome = _run(resolved, covered, store, words)
+    _tell(outcome, resolved, covered.cells, store, words, as_json)
+    for line in disagreements(outcome.done, Stock(store, others=False)) if resolved.rerun != "never" else ():
+        typer.echo(f"kerv: {line}", err=True)
+    if outcome.failed:
+        raise typer.Exit(1)
 
 
-def _print_plan(cells: list[Cell], store: StudyStore, workers: int) -> None:
+def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
     from kerv_cli.studies.estimate import estimate
     from kerv_cli.studies.plan import seeds_text
 
     by_label: dict[str, list[Cell]] = {}
-    for cell in cells:
+    for cell in covered.cells:
         by_label.setdefault(cell.label, []).append(cell)
+    columns = ("setting", "to run", "reused", "tasks", "seeds", "repeats", "why")
     rows = []
     for label, own in by_label.items():
-        reused = sum(store.has_cell(cell.id) for cell in own)
+        to_run = [cell for cell in own if cell.id in covered.reasons]
         seeds = seeds_text(seed for cell in own for seed in cell.seeds)
         tasks, repeats = len({cell.task for cell in own}), len({cell.repeat for cell in own})
-        rows.append((label, len(own) - reused, reused, tasks, seeds, repeats))
-    print_table(("setting", "to run", "reused", "tasks", "seeds", "repeats"), rows, f"study {store.name}")
-    time = estimate(cells, store, workers, SECONDS_PER_EPISODE)
+        why = "; ".join(dict.fromkeys(covered.reasons[cell.id] for cell in to_run))
+        rows.append((label, len(to_run), len(own) - len(to_run), tasks, seeds, repeats, why))
+    time = estimate(covered, store, workers, SECONDS_PER_EPISODE)
+    if as_json:
+        settings = [dict(zip(columns, row, strict=True)) for row in rows]
+        print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": time.to_run,
+                    "reused": time.reused, "seconds": time.seconds, "source": time.source})  # fmt: skip
+        return
+    print_table(columns, rows, f"study {store.name}")
     typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
 
 
-def _run(resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str]) -> Outcome:
+def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
     """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
     from kerv_cli.errors import Interrupted
     from kerv_cli.rollouts.cells import CellRunner, reference_decode
     from kerv_cli.studies.execute import execute
     from kerv_cli.studies.progress import ProgressDisplay
-    from kerv_cli.studies.run_file import note_invocation
+    from kerv_cli.studies.reuse import take_over
+    from kerv_cli.studies.run_file import note_finished, note_invocation
 
     runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
+    cells = covered.cells
+    take_over(store, covered)
     if resolved.until == "done":
         store.write_plan(resolved.study, cells)
-    note_invocation(store, ["sweep", *words])
+    note_invocation(store.root, ["sweep", *words])
     here = runtime.executor == "local" and runtime.workers == 1
     with ProgressDisplay(console(stderr=True)) as display:
         runner = CellRunner(store.rollouts, on_step=display.on_step if here else None)
         try:
             if resolved.until == "decided":
-                return _until_decided(resolved, cells, store, lambda own: execute(
+                outcome = _until_decided(resolved, cells, store, lambda own: execute(
                     own, runner, store, runtime, display, reference_decode))  # fmt: skip
-            return execute(cells, runner, store, runtime, display, reference_decode)
+            else:
+                outcome = execute(cells, runner, store, runtime, display, reference_decode)
         except KeyboardInterrupt:
             kept = sum(store.has_cell(cell.id) for cell in cells)
             raise Interrupted(
                 f"interrupted: {kept} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
             ) from None
+    if not outcome.failed:
+        note_finished(store.root)
+    return outcome
 
 
 def _until_decided(
@@ -120,7 +145,7 @@ def _until_decided(
     from kerv_cli.studies.events import Outcome
 
     study, margin = resolved.study, resolved.loss / 100
-    blocks = decided.looks_of(cells)
+    blocks = decided.looks_of(cells, study.block)
     typer.echo(decided.rule(resolved.loss, len(blocks)), err=True)
     known: dict[str, decided.Verdict] = {}
     asked: list[Cell] = []
@@ -144,8 +169,18 @@ def _until_decided(
     return total
 
 
-def tell_note(note: str) -> None:
-    """Prints what a study says is to be seen in its table."""
+def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> None:
+    """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
+    command, for the one that is named."""
+    from kerv_cli.reporting.summary import not_in_turn, summary_table
+    from kerv_cli.studies.run_file import sweep_command
+
+    console().print(summary_table(table))
+    apart = not_in_turn(table)
+    if apart:
+        command = runnable(f"'{sweep_command(store.root, store.name, 'rerun=timed')}'", words)
+        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; {command} does that")
+    note = store.read_plan().note
     if note:
         typer.echo(f"\n{note}\n")
 
@@ -153,7 +188,6 @@ def tell_note(note: str) -> None:
 def _tell(
     outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
 ) -> None:
-    from kerv_cli.reporting.summary import summary_table
     from kerv_cli.reporting.tables import load_study, rows_of, study_table
 
     there = bool(outcome.done or outcome.reused)
@@ -167,8 +201,7 @@ def _tell(
                     "recordings": recordings})  # fmt: skip
     else:
         if table is not None:
-            console().print(summary_table(table))
-            tell_note(resolved.study.note)
+            tell_table(table, store, words)
         episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
         if episodes and minutes:
             typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
@@ -183,5 +216,3 @@ def _tell(
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)
-    if outcome.failed:
-        raise typer.Exit(1)

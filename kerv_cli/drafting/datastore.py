@@ -13,8 +13,6 @@ On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `project
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +31,7 @@ from kerv_cli.drafting.search import ExactIndex, Index, best
 from kerv_cli.drafting.tree import ROOT, TokenTree
 from kerv_cli.environments import spec_of
 from kerv_cli.errors import CheckpointError, UnknownName
-from kerv_cli.manifests import check_files, read_file
+from kerv_cli.manifests import check_files, content_of, read_file
 from kerv_cli.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.protocol import ReadableTarget
@@ -84,8 +82,7 @@ class Manifest:
     @property
     def content(self) -> str:
         """SHA-256 over keys, chunks and target: the same after a rebuild from the same target and demonstrations."""
-        text = json.dumps([self.key, self.chunk, self.target, sorted(self.files.items())])
-        return hashlib.sha256(text.encode()).hexdigest()
+        return content_of(self.key, self.chunk, self.target, self.files)
 
 
 def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:

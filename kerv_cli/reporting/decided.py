@@ -72,12 +72,13 @@ def verdicts(data: StudyData, labels: Sequence[str], margin: float, look: int, l
     return found
 
 
-def looks_of(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """The plan's cells by block of seeds: one look each."""
-    groups: dict[tuple[int, ...], list[Cell]] = {}
+def looks_of(cells: Sequence[Cell], block: int) -> list[list[Cell]]:
+    """The plan's cells by block of so many seeds: one look each."""
+    first = min(cell.seeds[0] for cell in cells)
+    groups: dict[int, list[Cell]] = {}
     for cell in cells:
-        groups.setdefault(cell.seeds, []).append(cell)
-    return list(groups.values())
+        groups.setdefault((cell.seeds[0] - first) // block, []).append(cell)
+    return [groups[number] for number in sorted(groups)]
 
 
 def write_verdicts(folder: Path, found: Mapping[str, Verdict], loss: float, looks: int) -> None:

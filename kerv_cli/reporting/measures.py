@@ -39,13 +39,14 @@ _RATIOS = {
 """Quotients of sums over episodes; NaN where the denominator is 0."""
 
 
-def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> dict[str, Any]:
+def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apart: bool = False) -> dict[str, Any]:
     """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
 
     success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
     (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs, where no
-    target decodes and where an episode of either side was not timed. mcnemar_p is NaN without pairs. same_run: all
-    pairs were measured in one run. same_block: share of the pairs that were measured in one block, in turn.
+    target decodes and where an episode of either side was not timed. They are of the pairs whose sides took turns in
+    one block; with apart=True of all pairs. mcnemar_p is NaN without pairs. same_run: all pairs were measured in one
+    run. same_block: share of the pairs that were measured in one block.
 
     MACRO takes each measure within every difficulty group and then the unweighted mean of the groups; the speedup is
     the ratio of the two macro means. Paired counts and p are those of all pairs in either case.
@@ -59,12 +60,13 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> d
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
     counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
     once = episodes[episodes["repeat"] == 0]
-    timed = _decodes(episodes) and is_timed(pairs, "time_method") and is_timed(pairs, "time_baseline")
+    clocked = pairs if apart else pairs[pairs["in_turn"]]
+    timed = _decodes(episodes) and is_timed(clocked, "time_method") and is_timed(clocked, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
         **_columns("success", _success(once, macro)),
-        **_columns("speedup", _speedup(pairs, "time", macro) if timed else stats.NO_ESTIMATE),
-        **_columns("episode_speedup", _speedup(pairs, "seconds", macro) if timed else stats.NO_ESTIMATE),
+        **_columns("speedup", _speedup(clocked, "time", macro) if timed else stats.NO_ESTIMATE),
+        **_columns("episode_speedup", _speedup(clocked, "seconds", macro) if timed else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
         **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
@@ -122,7 +124,8 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     """Pairs of equal task, seed, repeat, initial state and device, sorted by task, seed and repeat.
 
     Columns: task, difficulty, seed, repeat; with the suffixes _baseline and _method: time (seconds per step), seconds
-    (of the episode), success, block; same_run, same_block.
+    (of the episode), success, block; same_run, same_block; in_turn: same_block, and where the oldest episodes name no
+    block the same run.
     """
     keys = ["task", "seed", "repeat"]
     columns = [*keys, "difficulty", "run", "block", "success", "seconds", *_SAME]
@@ -135,6 +138,8 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     both["same_run"] = both["run_method"] == both["run_baseline"]
     both["same_block"] = (both["block_method"] == both["block_baseline"]) & (both["block_method"] != "")
+    unnamed = (both["block_method"] == "") & (both["block_baseline"] == "")
+    both["in_turn"] = both["same_block"] | (unnamed & both["same_run"])
     return both.rename(columns={"difficulty_method": "difficulty"})
 
 

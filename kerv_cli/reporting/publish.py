@@ -24,7 +24,7 @@ def refusals(table: pd.DataFrame) -> list[str]:
         found.append("some cells were computed by code that is not committed")
     if len(commits) > 1:
         found.append(f"its cells are of {len(commits)} commits")
-    for column, what in (("host", "machines"), ("device_name", "devices")):
+    for column, what in (("host", "machines"), ("device_name", "devices"), ("engine", "engines")):
         names = values_of(table, column)
         if len(names) > 1:
             found.append(f"its cells are of {len(names)} {what}")

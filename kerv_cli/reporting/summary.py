@@ -50,7 +50,7 @@ class SummaryTable:
         against = f"{first}, under the same stress" if several else first
         yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {against}")
         if frame["speedup"].str.endswith(APART).any():
-            yield Text(f"{APART} not all of its pairs were measured in one run")
+            yield Text(f"{APART} of those pairs alone that were measured in turn")
         untimed = list(dict.fromkeys(self.table.loc[self.table["time_per_step_ms"].isna(), "label"]))
         if untimed:
             yield Text(f"not timed, for success alone: {', '.join(map(str, untimed))}")
@@ -114,8 +114,16 @@ def _one(row: Mapping[str, Any]) -> str:
 
 
 def _apart(row: Mapping[str, Any]) -> str:
-    """The mark of a speedup of which not all pairs were measured in one run."""
-    return APART if is_number(row["speedup"]) and not row["same_run"] else ""
+    """The mark of a speedup of some of the pairs."""
+    return APART if is_number(row["speedup"]) and row["same_block"] < 1 and not row["same_run"] else ""
+
+
+def not_in_turn(table: pd.DataFrame) -> list[str]:
+    """Labels with times whose ratio to the baseline's does not exist: none of the pairs was measured in turn."""
+    timed = table["time_per_step_ms"].notna() & (table["forwards_per_step"] + table["skip_rate"] > 0)
+    rows = table[timed & (table["label"] != table["baseline"]) & (table["pairs"] > 0) & table["speedup"].isna()]
+    of_baseline = table.loc[table["label"] == table["baseline"], "time_per_step_ms"].notna().all()
+    return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
 
 
 def _p(value: float) -> str:

@@ -25,21 +25,26 @@ from kerv_cli.reporting.ceiling import (
 )
 from kerv_cli.reporting.measures import COMPARABLE, MACRO, MICRO, measure
 from kerv_cli.settings import MODEL
-from kerv_cli.studies.plan import (
+from kerv_cli.studies.identity import (
     NOT_DETERMINING,
     NOT_DETERMINING_RUNTIME,
     OBSERVATION,
-    Cell,
-    determinants,
-    seeds_text,
+    flat,
     stress_of,
     without,
+    work_of,
 )
+from kerv_cli.studies.plan import Cell, seeds_text
 from kerv_cli.studies.plan_file import StudyPlan
 from kerv_cli.studies.store import StoredCell, StudyStore
 
 _PLACE = ("executor", "workers", "device_name", "host")
-_STATUS_COLUMNS = (*_PLACE, *(f"{name}_version" for name in PACKAGES), "python_version", "git_commit", "run")
+_CODE = ("git_commit", "engine", "code", "run")
+_STATUS_COLUMNS = (*_PLACE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
+
+
+_OLDER = {"engine": 1}
+"""What a status that lacks the entry means."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +90,10 @@ def _stress(cell: Cell) -> tuple[str, int]:
     return stress["kind"], stress["level"]
 
 
-def _unstressed(cell: Cell) -> dict[str, Any]:
-    """What determines a setting, apart from its stress and the cell's task and seeds."""
+def _unstressed(cell: Cell) -> str:
+    """Hash of what determines a setting, apart from its stress."""
     plain = {**cell.settings, "world": without(cell.settings["world"], {"stress"})}
-    return determinants(plain, cell.identity, "", (), 0, "")
+    return work_of(plain, cell.identity)
 
 
 def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
@@ -108,7 +113,8 @@ def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyD
 def _labelled(cells: Sequence[Cell], found: Mapping[str, StoredCell]) -> pd.DataFrame:
     """The episodes of the cells in order, and what the tables need to know of each one's cell."""
     stored = [found[cell.id] for cell in cells]
-    episodes = pd.concat([one.episodes for one in stored], ignore_index=True)
+    own = [one.of(cell) for one, cell in zip(stored, cells, strict=True)]
+    episodes = pd.concat(own, ignore_index=True)
     groups = {task: difficulty_of(task) for task in {cell.task for cell in cells}}
     columns: dict[str, list[Any]] = {
         "label": [cell.label for cell in cells],
@@ -120,7 +126,7 @@ def _labelled(cells: Sequence[Cell], found: Mapping[str, StoredCell]) -> pd.Data
         "dtype": [cell.settings["runtime"]["dtype"] for cell in cells],
         "threads": [cell.settings["runtime"]["threads"] for cell in cells],
     }
-    lengths = [len(one.episodes) for one in stored]
+    lengths = [len(part) for part in own]
     spread = {
         name: np.repeat(np.array(values, dtype=object if isinstance(values[0], str) else None), lengths)
         for name, values in columns.items()
@@ -224,7 +230,7 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
         "stress": stress["kind"],
         "stress_level": stress["level"],
         **without(runtime, NOT_DETERMINING_RUNTIME),
-        **{key: _joined(status.get(key, "") for status in statuses) for key in _STATUS_COLUMNS},
+        **{key: _joined(status.get(key, _OLDER.get(key, "")) for status in statuses) for key in _STATUS_COLUMNS},
         "cell": ";".join(cell.id for cell in cells),
     }
     return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
@@ -232,13 +238,7 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; lists joined by semicolons."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = _joined(value) if isinstance(value, list | tuple) else value
-    return flat
+    return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings, prefix).items()}
 
 
 def _joined(values: Iterable[Any]) -> str:

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.errors import CheckpointError, KervError
-from kerv_cli.files import read_json
 from kerv_cli.manifests import read
 from kerv_cli.rollouts.cells import CellRunner, reference_decode
 from kerv_cli.rollouts.policy import check, identity_of
-from kerv_cli.runs.catalogue import ROLLOUT, RunEntry, find_run, store_of
+from kerv_cli.runs.catalogue import ROLLOUT, RunEntry, description_of, find_run, store_of
 from kerv_cli.settings import StudySettings, TrainDrafterSettings, TrainTargetSettings, settings_from
 from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import OBSERVATION, Cell, make_cell
+from kerv_cli.studies.identity import OBSERVATION
+from kerv_cli.studies.plan import Cell, make_cell
 from kerv_cli.studies.rollout_runs import new_name
 from kerv_cli.studies.run_file import note_invocation
 from kerv_cli.studies.store import ROLLOUTS, STUDIES, StudyStore
@@ -71,7 +71,7 @@ def run_again(again: Again, results: str) -> RunEntry:
         KervError: a cell failed.
     """
     again.store.write_plan(again.study, again.cells)
-    note_invocation(again.store, ["runs", "rerun", again.run.id])
+    note_invocation(again.store.root, ["runs", "rerun", again.run.id])
     outcome = execute(again.cells, CellRunner(again.store.rollouts, keep=True), again.store, gauge=reference_decode)
     if outcome.failed:
         raise KervError(outcome.failed[0].reason)
@@ -93,7 +93,11 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     from kerv_cli.training.runs import TargetRun, drafter_run
 
     path = run.folder / f"{run.kind}.json"
-    value: dict[str, Any] = dict(read_json(path))["provenance"]["settings"] | {"results": results}
+    made = description_of(run).get("settings")
+    if not isinstance(made, dict):
+        command = "target" if run.kind == "target" else "drafter"
+        raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
+    value: dict[str, Any] = made | {"results": results}
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))

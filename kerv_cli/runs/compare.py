@@ -11,8 +11,9 @@ import pandas as pd
 from kerv_cli.errors import UsageError
 from kerv_cli.reporting.measures import MICRO, measure
 from kerv_cli.reporting.tables import StudyData, flatten, is_number, load_study
-from kerv_cli.runs.catalogue import TRAINED, RunEntry, description_of, find_run, store_of
-from kerv_cli.studies.plan import NOT_DETERMINING, OBSERVATION, Cell, without
+from kerv_cli.runs.catalogue import RunEntry, description_of, find_run, store_of
+from kerv_cli.studies.identity import NOT_DETERMINING, OBSERVATION, without
+from kerv_cli.studies.plan import Cell
 
 _MEASURES = ("AL", "forwards_per_step", "time_per_step_ms", "skip_rate", "unverified_share")
 _OF_STATUS = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
@@ -55,9 +56,9 @@ def sides(results: str, name: str) -> list[Side]:
     """
     identifier, _, label = name.partition(":")
     run = find_run(results, identifier)
-    if run.kind in TRAINED:
+    if not run.has_episodes:
         if label:
-            raise UsageError(f"{run.id} is a training: it has no setting '{label}'")
+            raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
         return [Side(run.id, run)]
     labels = store_of(run).read_plan().labels
     if label and label not in labels:
@@ -73,8 +74,8 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
         UsageError: as `sides`, or a training beside episodes.
     """
     ours, theirs = sides(results, first), sides(results, second)
-    if (ours[0].run.kind in TRAINED) != (theirs[0].run.kind in TRAINED):
-        raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: one of them is a training")
+    if ours[0].run.has_episodes != theirs[0].run.has_episodes:
+        raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: one of them has no episodes")
     shared = [(a, b) for a in ours for b in theirs if a.label == b.label]
     if len(shared) > 1 or (shared and len(ours) == len(theirs) == 1):
         return shared
@@ -87,7 +88,7 @@ def compare(first: Side, second: Side) -> Comparison:
     Raises:
         UsageError: a run without complete cells. CheckpointError: a damaged one.
     """
-    if first.run.kind in TRAINED:
+    if not first.run.has_episodes:
         rows = _trained_results(first.run, second.run)
     else:
         rows = _measured(load_study(store_of(first.run)), first.label, load_study(store_of(second.run)), second.label)
@@ -102,7 +103,7 @@ def differences(first: Side, second: Side) -> list[Difference]:
 
 
 def _described(side: Side) -> dict[str, Any]:
-    if side.run.kind in TRAINED:
+    if not side.run.has_episodes:
         made = description_of(side.run)
         described: dict[str, Any] = dict(made.get("settings", {}))
         described.update((key, made[key]) for key in ("git_commit", "versions", "demos") if key in made)
@@ -134,7 +135,7 @@ def _measured(first: StudyData, ours: str, second: StudyData, theirs: str) -> li
     episodes = second.episodes[second.episodes["label"] == theirs]
     if baseline.empty or episodes.empty:
         raise UsageError("one of the two settings has no complete cell: run it to the end first")
-    a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO)
+    a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO, apart=True)
     rows = [
         _row("success", a["success"], b["success"], b, "difference", "difference"),
         _row("speedup", 1.0, b["speedup"], b, "speedup", "ratio of times per step"),

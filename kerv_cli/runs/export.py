@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.reporting.curves import read_log
 from kerv_cli.reporting.measures import MICRO
@@ -46,8 +48,8 @@ def export(run: RunEntry, to: str, folder: Path) -> list[str]:
 
 
 def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
-    """One for a training, one per setting for a sweep or a rollout."""
-    if run.kind in TRAINED:
+    """One per setting for a sweep or a rollout, one for any other run."""
+    if not run.has_episodes:
         yield _training(run)
         return
     data = load_study(store_of(run))
@@ -65,7 +67,7 @@ def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
 
 
 def _training(run: RunEntry) -> Tracked:
-    log = read_log(run.folder)
+    log = read_log(run.folder) if run.kind in TRAINED else pd.DataFrame()
     history = [
         (int(row["step"]), {name: float(value) for name, value in row.items() if name != "step" and _is_measure(value)})
         for row in rows_of(log)
@@ -79,8 +81,6 @@ def _is_measure(value: Any) -> bool:
 
 
 def _to_csv(tracked: Tracked, folder: Path) -> str:
-    import pandas as pd
-
     rows = [{"step": step, **numbers} for step, numbers in tracked.history]
     return str(write_csv(pd.DataFrame(rows), folder / f"{tracked.name.replace('/', '-').replace(' ', '_')}.csv"))
 

@@ -1,19 +1,22 @@
-"""Removes runs from a results folder."""
+"""Removes runs from a results folder: a run is there whole or it is gone."""
 
 from __future__ import annotations
 
-import secrets
+import os
 import shutil
 
 from kerv_cli.errors import UsageError
-from kerv_cli.files import storage_errors
-from kerv_cli.runs.catalogue import TRAINED, RunEntry, store_of
+from kerv_cli.files import storage_errors, sync
+from kerv_cli.leftovers import temporary_beside
+from kerv_cli.runs.catalogue import RunEntry, store_of
 from kerv_cli.studies.claims import is_claimed
 
 
 def check_removable(run: RunEntry) -> None:
-    """Raises UsageError: a process computes cells of the run at the moment."""
-    if run.kind in TRAINED or run.state == "damaged":
+    """Raises UsageError: the folder is a link, or a process computes cells of the run at the moment."""
+    if run.folder.is_symlink():
+        raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
+    if not run.has_episodes or run.state == "damaged":
         return
     store = store_of(run)
     if any(is_claimed(store.claims, cell) for cell in store.read_plan().cells):
@@ -21,12 +24,14 @@ def check_removable(run: RunEntry) -> None:
 
 
 def remove(run: RunEntry) -> None:
-    """Removes the run's folder: renamed first, so that a part of it is never taken for a run.
+    """Removes the run's folder: first it gets a temporary's name, which no command reads and which the next one that
+    looks there cleans away if this process is killed before it is done.
 
     Raises:
-        StorageError: the disk refused.
+        StorageError: the disk refused; the run is as it was.
     """
-    gone = run.folder.with_name(f".{run.folder.name}.{secrets.token_hex(4)}.tmp")
+    gone = temporary_beside(run.folder)
     with storage_errors(run.folder):
         run.folder.rename(gone)
-        shutil.rmtree(gone)
+        sync(run.folder.parent)
+    shutil.rmtree(gone, ignore_errors=True)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kerv_cli.studies.plan import Cell, blocks_of
+from kerv_cli.studies.reuse import Covered
 from kerv_cli.studies.store import StudyStore
 
 
@@ -20,22 +20,22 @@ class TimeEstimate:
     source: str  # of the figure, in words
 
 
-def estimate(cells: Sequence[Cell], store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:
-    """Time for the cells that are not complete, from the mean wall seconds per episode of the plan's complete cells.
+def estimate(covered: Covered, store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:
+    """Time for the cells that are to run, from the mean wall seconds per episode of the plan's other cells.
 
     A label with complete cells uses its own mean, others the mean over all; `prior_seconds` per episode is the guess
     where nothing is complete. Workers are taken to scale perfectly, up to one per block.
 
     Raises:
-        CheckpointError: a complete cell is damaged.
+        CheckpointError: a complete cell cannot be read.
     """
-    every_cell = [cell for block in blocks_of(cells) for cell in block.cells]
+    every_cell = [cell for block in blocks_of(covered.cells) for cell in block.cells]
     seconds: dict[str, float] = {}
     episodes: dict[str, int] = {}
     todo: list[Cell] = []
     for cell in every_cell:
-        if store.has_cell(cell.id):
-            status = store.status_of(cell.id)
+        if cell.id not in covered.reasons:
+            _, status = covered.sources.get(cell.id, store).described(cell.id)
             seconds[cell.label] = seconds.get(cell.label, 0.0) + status["wall_seconds"]
             episodes[cell.label] = episodes.get(cell.label, 0) + status["episodes"]
         else:

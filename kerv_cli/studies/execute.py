@@ -18,10 +18,11 @@ from kerv_cli.leftovers import clean
 from kerv_cli.provenance import git_commit
 from kerv_cli.settings import RuntimeSettings
 from kerv_cli.studies import events
-from kerv_cli.studies.adopt import adopt
 from kerv_cli.studies.block import BlockRun, CellResult, Gauge, Prepare, failed
 from kerv_cli.studies.claims import clean_void, is_claimed, release, running_cell
+from kerv_cli.studies.code import code_hash
 from kerv_cli.studies.executors import Executor, WorkerLost, check_executor, open_executor
+from kerv_cli.studies.identity import ENGINE
 from kerv_cli.studies.plan import Block, Cell, blocks_of
 from kerv_cli.studies.store import StudyStore
 
@@ -82,7 +83,13 @@ class _Sweep:
         self.outcome = events.Outcome()
         self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
         self.workers = runtime.workers
-        self.status = {"workers": runtime.workers, "executor": runtime.executor, "git_commit": git_commit()}
+        self.status = {
+            "workers": runtime.workers,
+            "executor": runtime.executor,
+            "git_commit": git_commit(),
+            "engine": ENGINE,
+            "code": code_hash(),
+        }
         self.waiting: deque[Block] = deque()
         self.elsewhere: list[Block] = []  # another sweep computes them
         self.running: dict[Future[Any], BlockRun] = {}
@@ -90,8 +97,6 @@ class _Sweep:
     def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
         """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
         damaged: dict[str, tuple[Cell, CellResult]] = {}
-        for block in blocks_of(cells, self.workers):
-            adopt(self.store, block)
         for cell in (cell for block in blocks_of(cells) for cell in block.cells):
             try:
                 if self.store.has_cell(cell.id):

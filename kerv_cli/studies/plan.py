@@ -1,4 +1,4 @@
-"""Cells and blocks of a study; a cell's id is the hash of everything that determines its result."""
+"""Cells and blocks of a study: what is to run, in which order. What a cell means is decided in identity.py."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from kerv_cli.errors import UsageError
-from kerv_cli.settings import MODEL, RolloutSettings
-from kerv_cli.studies.code import code_hash
-
-Identity = Mapping[str, str]
-"""Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
+from kerv_cli.settings import RolloutSettings
+from kerv_cli.studies.identity import Identity, batch_of, hash_of, without, work_of
 
 MOST_CELLS = 100_000
 """Cells of a study; more are refused before they are planned."""
@@ -27,22 +24,13 @@ MOST_SEEDS = 10_000
 FULL_BATCHES = 16
 """A block of a batch has so many times as many episodes as run at once: at its end places stay empty."""
 
-OBSERVATION = "observation"
-"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
-
-# Fields of RolloutSettings that do not change an episode's result (where it is written, how much of it is recorded,
-# names), or that enter the id otherwise (task and seeds as the cell's own, the policy by its hashes). All other fields
-# count, so that a new setting makes new cells instead of being overlooked.
-NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
-NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
-
 
 @dataclass(frozen=True)
 class Cell:
     """One setting on one task and a block of seeds, in one repeat: the unit that is stored and reused. Two labels with
     the same settings share one id."""
 
-    id: str  # 16 hex digits, see `cell_id`
+    id: str  # name of its folder: a hash of what it means, see identity.py
     label: str  # the setting's name in the study
     overrides: str  # of the configuration, as the user wrote them
     task: str
@@ -50,6 +38,20 @@ class Cell:
     settings: dict[str, Any]  # plain RolloutSettings with task = [task]
     identity: dict[str, str] = field(default_factory=dict)  # hashes of target, drafter, ...
     repeat: int = 0  # the same episodes are measured `study.repeats` times
+
+    @property
+    def work(self) -> tuple[str, str, int]:
+        """What it means apart from its seeds: setting, task and repeat."""
+        return work_of(self.settings, self.identity), self.task, self.repeat
+
+    def part(self, seeds: Sequence[int], name: str = "") -> Cell:
+        """The same work on other seeds. name: of the folder where it lies; empty: a cell that is to run."""
+        return replace(self, seeds=tuple(seeds), id=name or _name(self.work, seeds))
+
+    def again(self, taken: Collection[str]) -> Cell:
+        """The same cell under a name of its own, beside those folders: `<id>-2`, `<id>-3`, …"""
+        first = self.part(self.seeds).id
+        return replace(self, id=next(n for n in (f"{first}-{i}" for i in range(2, 10_000)) if n not in taken))
 
 
 @dataclass(frozen=True)
@@ -106,64 +108,6 @@ class Block:
         return Block(left) if left else None
 
 
-def cell_id(identity: Mapping[str, Any]) -> str:
-    """First 16 hex digits of the SHA-256 of canonical JSON.
-
-    Raises:
-        ValueError: NaN or infinity, which JSON lacks.
-        TypeError: a value that is not JSON's.
-    """
-    text = json.dumps(identity, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-    return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
-
-
-def determinants(
-    settings: Mapping[str, Any], identity: Identity, task: str, seeds: Sequence[int], repeat: int, code: str
-) -> dict[str, Any]:
-    """Everything that determines a cell's result, from plain RolloutSettings; the argument of `cell_id`. code: as
-    `code_hash`."""
-    kept = without(settings, NOT_DETERMINING)
-    kept["runtime"] = without(settings["runtime"], NOT_DETERMINING_RUNTIME)
-    if not stress_of(settings)["level"]:
-        kept["world"] = without(settings["world"], {"stress"})  # level 0 of every kind is the same world
-    hashes = {f"{name}_sha256": value for name, value in identity.items() if name != OBSERVATION}
-    return {
-        "settings": kept,
-        "policy": {"kind": settings["policy"].get("kind", MODEL), **hashes},
-        "task": task,
-        "seeds": list(seeds),
-        "repeat": repeat,
-        "code": code,
-    }
-
-
-def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
-    """Whether a stored cell's config.yaml holds what determines the result of `cell`."""
-    try:
-        own = config["settings"], config["identity"], config["task"], config["seeds"], config["repeat"], ""
-        wanted = cell.settings, cell.identity, cell.task, list(cell.seeds), cell.repeat, ""
-        return determinants(*own) == determinants(*wanted)
-    except (KeyError, TypeError, AttributeError):
-        return False
-
-
-def stress_of(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Kind and level of the stress in plain RolloutSettings; `none` where nothing is shifted."""
-    stress = settings["world"].get("stress", {})
-    level = int(stress.get("level", 0))
-    return {"kind": stress["kind"] if level else "none", "level": level}
-
-
-def batch_of(settings: Mapping[str, Any]) -> int:
-    """Episodes that run at the same time in plain RolloutSettings; with more than one they have no times."""
-    return int(settings.get("rollout", {}).get("batch", 1))
-
-
-def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
-    """The settings without those keys."""
-    return {key: value for key, value in settings.items() if key not in names}
-
-
 def make_cell(
     label: str,
     overrides: str,
@@ -173,15 +117,19 @@ def make_cell(
     seeds: Sequence[int],
     repeat: int = 0,
 ) -> Cell:
-    """The cell of one setting (plain RolloutSettings) on one task and some seeds, for this code.
+    """The cell of one setting (plain RolloutSettings) on one task and some seeds.
 
     Raises:
         ValueError: the device is still `auto`, which two machines resolve differently.
     """
     if settings["runtime"]["device"] == "auto":
         raise ValueError(f"setting '{label}': resolve runtime.device before planning")
-    name = cell_id(determinants(settings, identity, task, seeds, repeat, code_hash()))
-    return Cell(name, label, overrides, task, tuple(seeds), {**settings, "task": [task]}, dict(identity), repeat)
+    cell = Cell("", label, overrides, task, tuple(seeds), {**settings, "task": [task]}, dict(identity), repeat)
+    return cell.part(seeds)
+
+
+def _name(work: tuple[str, str, int], seeds: Sequence[int]) -> str:
+    return hash_of([*work, list(seeds)])
 
 
 def plan(

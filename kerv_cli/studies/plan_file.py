@@ -10,7 +10,8 @@ from kerv_cli.files import read_yaml, to_yaml
 from kerv_cli.manifests import read
 from kerv_cli.parts import METHOD_KINDS
 from kerv_cli.settings import RolloutSettings
-from kerv_cli.studies.plan import Cell, make_cell, parse_seeds, seeds_text
+from kerv_cli.studies.identity import complete_settings
+from kerv_cli.studies.plan import Cell, parse_seeds, seeds_text
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,9 @@ def plan_from_text(text: str) -> StudyPlan:
     Raises:
         CheckpointError, ValueError: not a plan, or one that contradicts itself.
     """
-    found = read(_File, read_yaml(text), "the plan")
+    found = read(_File, read_yaml(text), "the plan", tolerant=True)
     for label in found.labels.values():
-        read(RolloutSettings, label.settings, "the plan")
+        read(RolloutSettings, label.settings, "the plan", tolerant=True)
         wrong = [kind for kind in METHOD_KINDS if not isinstance(label.settings.get(kind, {}), dict)]
         if wrong or not label.settings.keys() & set(METHOD_KINDS):
             raise ValueError(f"a label has no settings of {' or '.join(wrong or METHOD_KINDS)}")
@@ -102,11 +103,14 @@ def plan_from_text(text: str) -> StudyPlan:
 
 
 def _cells(found: _File) -> Iterator[Cell]:
+    complete: dict[str, dict[str, Any]] = {}
     shared: dict[tuple[str, str], dict[str, Any]] = {}  # of thousands of cells: memory
     for line in found.cells:
         label, key = found.labels[line.label], (line.label, line.task)
+        if line.label not in complete:
+            complete[line.label] = complete_settings(label.settings)
         if key not in shared:
-            shared[key] = {**label.settings, "task": [line.task]}
+            shared[key] = {**complete[line.label], "task": [line.task]}
         yield Cell(
             id=line.id,
             label=line.label,
@@ -120,24 +124,18 @@ def _cells(found: _File) -> Iterator[Cell]:
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
-    """`new`, preceded by those cells of `old` that have its settings and seeds and a task that it does not name."""
+    """`new`, preceded by what `old` has of its settings and seeds on tasks that it does not name."""
     if (old.name, old.baseline) != (new.name, new.baseline):
         return new
     tasks = {cell.task for cell in new.cells}
-    first = new.cells[0].task if new.cells else ""
-    wanted = {_key(cell): cell for cell in new.cells if cell.task == first}
-    kept = tuple(
-        cell
-        for cell in old.cells
-        if cell.task not in tasks and _key(cell) in wanted and cell.id == _moved(wanted[_key(cell)], cell.task)
-    )
-    return replace(new, cells=kept + new.cells)
-
-
-def _key(cell: Cell) -> tuple[str, tuple[int, ...], int]:
-    return cell.label, cell.seeds, cell.repeat
-
-
-def _moved(cell: Cell, task: str) -> str:
-    """The id that a cell would have on another task."""
-    return make_cell(cell.label, cell.overrides, cell.settings, cell.identity, task, cell.seeds, cell.repeat).id
+    settings = {(cell.label, cell.repeat): cell.work[0] for cell in new.cells}
+    seeds: dict[tuple[str, int], set[int]] = {}
+    for cell in new.cells:
+        seeds.setdefault((cell.label, cell.repeat), set()).update(cell.seeds)
+    kept = []
+    for cell in old.cells:
+        key = cell.label, cell.repeat
+        left = [seed for seed in cell.seeds if seed in seeds.get(key, ())]
+        if left and cell.task not in tasks and cell.work[0] == settings[key]:
+            kept.append(cell.part(left, cell.id))
+    return replace(new, cells=(*kept, *new.cells))

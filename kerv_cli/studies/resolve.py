@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from kerv_cli.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
 from kerv_cli.effects import without_effect
@@ -15,18 +16,19 @@ from kerv_cli.files import read_yaml
 from kerv_cli.manifests import read
 from kerv_cli.settings import RolloutSettings, StudySettings, SweepSettings
 
-_OF_THE_SWEEP = ("study", "results", "until", "loss")
+_OF_THE_SWEEP = ("study", "results", "until", "loss", "rerun")
 
 
 @dataclass(frozen=True)
 class ResolvedStudy:
-    """A study whose settings are composed and checked. until, loss: as SweepSettings."""
+    """A study whose settings are composed and checked. until, loss, rerun: as SweepSettings."""
 
     study: StudySettings
     settings: Mapping[str, RolloutSettings]  # by label, the study's order
     overrides: Mapping[str, str]  # by label, as written
     until: str = "done"
     loss: float = 3.0
+    rerun: str = "never"
     common: tuple[str, ...] = ()  # of the command line, for every setting
 
 
@@ -58,7 +60,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     for setting in settings.values():
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
     texts = {label: " ".join(words) for label, words in written.items()}
-    return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, tuple(theirs))
+    return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, sweep.rerun, tuple(theirs))
 
 
 def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
@@ -80,7 +82,19 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
     paths = [o.split("=", 1)[1] for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))]
     if not paths:
         return list(overrides), None
+    if len(paths) > 1:
+        raise UsageError(f"study= is given twice, {paths[0]} and {paths[-1]}: leave one out")
     path = Path(paths[-1]).expanduser()
+    value = _read_study(path)
+    try:
+        study = read(StudySettings, {"name": path.stem, **value}, str(path))
+    except CheckpointError as error:
+        raise UsageError(str(error).replace(" is damaged", " is no study")) from error
+    return [o for o in overrides if not o.startswith("study=")], study
+
+
+def _read_study(path: Path) -> dict[str, Any]:
+    """The study file's values; raises as `_study_of_path`."""
     try:
         value = read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -88,11 +102,19 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
         raise UsageError(f"study={path} cannot be read: {why}") from error
     if not isinstance(value, dict):
         raise UsageError(f"study={path} is no study: it needs the keys settings and baseline, see conf/study/demo.yaml")
-    try:
-        study = read(StudySettings, {"name": path.stem, **value}, str(path))
-    except CheckpointError as error:
-        raise UsageError(str(error).replace(" is damaged", " is no study")) from error
-    return [o for o in overrides if not o.startswith("study=")], study
+    return value
+
+
+def study_name(study: str) -> str:
+    """The name under which `kerv sweep study=…` stores a study: of a file its `name:`, else its stem.
+
+    Raises:
+        UsageError: a file that is there and is no study.
+    """
+    path = Path(study).expanduser()
+    if path.suffix not in (".yaml", ".yml"):
+        return study
+    return str(_read_study(path).get("name", path.stem)) if path.is_file() else path.stem
 
 
 def _key(override: str) -> str:

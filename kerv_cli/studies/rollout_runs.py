@@ -15,7 +15,8 @@ from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.settings import RolloutSettings, StudySettings
 from kerv_cli.studies.plan import Cell, unique_cells
 from kerv_cli.studies.resolve import ResolvedStudy
-from kerv_cli.studies.store import ROLLOUTS, StudyStore
+from kerv_cli.studies.reuse import Stock, cover
+from kerv_cli.studies.store import ROLLOUTS, StudyStore, stores
 
 EPISODES_PER_CELL = 1
 """Ctrl-C loses at most the episode that runs."""
@@ -57,28 +58,19 @@ def _is_ar(settings: RolloutSettings) -> bool:
     return all(part.kind == "none" for part in drafts) and settings.method == "ar"
 
 
-def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, int]:
-    """Where the cells are stored, and how many of them are complete there: a new folder, or the newest run of the same
-    cells that was interrupted.
-
-    Raises:
-        CheckpointError: a cell of the interrupted run is damaged.
-    """
-    wanted = {cell.id for cell in cells}
-    for store in rollout_stores(results):
+def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
+    """Where the cells are stored, the cells under the names that they have there, and how many of them are complete:
+    in a new folder, or in the newest run of the same cells that was interrupted. A run that is complete is not reused:
+    a rollout is asked for in order to be run."""
+    work = {(*cell.work, cell.seeds) for cell in cells}
+    for store in reversed(stores(Path(results).expanduser(), ROLLOUTS)):
         with contextlib.suppress(UsageError, CheckpointError):
-            if {cell.id for cell in store.read_plan().cells} != wanted:
+            if {(*cell.work, cell.seeds) for cell in store.read_plan().cells} != work:
                 continue
-            done = sum(store.has_cell(name) for name in wanted)
-            if done < len(wanted):
-                return store, done
-    return StudyStore(results, new_name(results, cells), ROLLOUTS), 0
-
-
-def rollout_stores(results: str | Path) -> list[StudyStore]:
-    """The runs of `kerv rollout` in a results folder, the newest first."""
-    found = [path.parent for path in (Path(results).expanduser() / ROLLOUTS).glob("*/plan.yaml")]
-    return [StudyStore(Path(results).expanduser(), folder.name, ROLLOUTS) for folder in sorted(found, reverse=True)]
+            there = cover(cells, Stock(store, others=False))
+            if there.reasons:
+                return store, there.cells, len(there.cells) - len(there.reasons)
+    return StudyStore(results, new_name(results, cells), ROLLOUTS), list(cells), 0
 
 
 def new_name(results: str | Path, cells: Sequence[Cell]) -> str:

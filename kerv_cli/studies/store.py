@@ -15,10 +15,11 @@ import contextlib
 import functools
 import hashlib
 import json
+import os
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +30,40 @@ import pyarrow.parquet as pq
 
 from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.files import atomic_path, read_json, read_yaml, sha256_of, to_yaml, write_folder
+from kerv_cli.files import (
+    atomic_path,
+    read_json,
+    read_yaml,
+    sha256_of,
+    storage_errors,
+    sync,
+    to_yaml,
+    visible,
+    write_folder,
+)
+from kerv_cli.leftovers import clean
 from kerv_cli.limits import check_name
 from kerv_cli.settings import StudySettings
 from kerv_cli.studies import rows
 from kerv_cli.studies.claims import write_lock
-from kerv_cli.studies.plan import Cell, is_result_of
+from kerv_cli.studies.identity import work_of
+from kerv_cli.studies.plan import Cell
 from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
 from kerv_cli.studies.rows import Circumstances
+from kerv_cli.studies.run_file import sweep_command
 
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
 _READ_TOGETHER = 100  # cells whose columns are converted at once: many tables of a few rows take much memory
 _DECODE_TIMES = pa.schema([rows.DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
+
+
+class DamagedCell(CheckpointError):
+    """A cell whose files are not what was written."""
+
+
+class NewerCell(CheckpointError):
+    """A cell of a format that this kerv does not read."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +74,18 @@ class StoredCell:
     folder: Path
     config: dict[str, Any]  # the study's name and the fields of Cell
     status: dict[str, Any]  # provenance, run, seconds, sums
-    episodes: pd.DataFrame  # columns of rows.EPISODE_SCHEMA, and decode_seconds: per episode (decodes,) seconds
+    # columns of rows.EPISODE_SCHEMA, those of a newer kerv, and decode_seconds: per episode (decodes,) seconds
+    episodes: pd.DataFrame
 
+    def of(self, cell: Cell) -> pd.DataFrame:
+        """The episodes of `cell`, which may ask for some of the seeds only."""
+        if len(cell.seeds) == len(self.episodes):
+            return self.episodes
+        return self.episodes[self.episodes["seed"].isin(cell.seeds)]
+
+
+FORMAT = 1
+"""Of a cell's files. A cell of a higher one is of a newer kerv and is left alone."""
 
 STUDIES, ROLLOUTS = "studies", "rollouts"
 """Families of stores: what `kerv sweep` and what `kerv rollout` leaves, in the same files."""
@@ -73,6 +105,7 @@ class StudyStore:
         self.rollouts = self.root / "rollouts"
         self.plan_path = self.root / "plan.yaml"
         self.failures = self.root / "failures"
+        self.damaged = self.root / "damaged"  # cells that were set aside
         self.claims = self.root / "claims"
         self.jobs = self.root / "jobs"  # an executor's own files
 
@@ -101,7 +134,8 @@ class StudyStore:
             CheckpointError: the plan is damaged.
         """
         try:
-            return plan_from_text(self.plan_path.read_text(encoding="utf-8"))
+            # a folder that was renamed by hand is the study of its new name
+            return replace(plan_from_text(self.plan_path.read_text(encoding="utf-8")), name=self.name)
         except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"no study '{self.name}' in {self.root.parent}: {self.how_to_run()}") from None
         except (OSError, ValueError, CheckpointError) as error:
@@ -110,7 +144,9 @@ class StudyStore:
 
     def how_to_run(self) -> str:
         """The command that runs this study, for messages."""
-        return f"run `kerv sweep study={self.name}`" if self.family == STUDIES else f"run `kerv runs rerun {self.name}`"
+        if self.family == STUDIES:
+            return f"run `{sweep_command(self.root, self.name)}`"
+        return f"run `kerv runs rerun {self.name}`"
 
     def has_cell(self, name: str) -> bool:
         """Whether the cell is complete; its files are compared with their hashes.
@@ -132,19 +168,66 @@ class StudyStore:
         folder = self.cells / name
         try:
             status = read_json(folder / _STATUS)
+            if status.get("format", FORMAT) > FORMAT:
+                raise NewerCell(f"cell {folder} is of a newer kerv (format {status['format']}): update kerv")
             # cells from before the seal have none
             if status.get("sha256") not in (None, _seal(status)):
                 raise CheckpointError(f"{_STATUS} is not what was written")
             for file in _CELL_FILES:
                 if sha256_of(folder / file) != status["files"][file]:
                     raise CheckpointError(f"{file} is not what was written")
+        except NewerCell:
+            raise
         except (CheckpointError, KeyError, TypeError, AttributeError) as error:
             raise self._damaged(folder, error) from error
         return status
 
     def _damaged(self, folder: Path, error: Exception) -> CheckpointError:
         why = str(error).replace(f"{folder}/", "")
-        return CheckpointError(f"cell {folder} is damaged ({why}): delete that folder and {self.how_to_run()} again")
+        return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
+
+    def folders(self) -> list[Path]:
+        """Folders of its cells, damaged ones among them; none that is being written or removed."""
+        return [path for path in visible(self.cells) if path.is_dir()]
+
+    def described(self, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        """config.yaml and status.json of a cell, unchecked: ten thousand are read to plan a sweep.
+
+        Raises:
+            CheckpointError: they cannot be read.
+        """
+        folder = self.cells / name
+        try:
+            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+            return config, dict(read_json(folder / _STATUS))
+        except (OSError, ValueError) as error:
+            raise self._damaged(folder, error) from error
+
+    def set_aside(self, name: str) -> Path:
+        """Moves a damaged cell out of the way -> where it lies now. The next sweep computes it again.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        places = (self.damaged / (name if not i else f"{name}-{i}") for i in range(10_000))
+        place = next(path for path in places if not path.exists())
+        with storage_errors(place):
+            self.damaged.mkdir(exist_ok=True)
+            os.rename(self.cells / name, place)
+            sync(self.damaged)
+        return place
+
+    def damages(self) -> list[tuple[str, DamagedCell]]:
+        """Name of every cell that is not what was written -> why; one of a newer kerv is not among them."""
+        found = []
+        for folder in self.folders():
+            try:
+                self.status_of(folder.name)
+            except DamagedCell as error:
+                found.append((folder.name, error))
+            except CheckpointError:
+                continue
+        return found
 
     def write_cell(
         self,
@@ -185,7 +268,7 @@ class StudyStore:
         status: Mapping[str, Any],
         circumstances: Sequence[Circumstances],
     ) -> dict[str, bytes]:
-        config = {"study": self.name, **vars(cell), "seeds": list(cell.seeds)}
+        config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
         episodes = [
             rows.episode_row(record, at, cell.repeat) for record, at in zip(records, circumstances, strict=True)
         ]
@@ -196,6 +279,7 @@ class StudyStore:
             "decodes.parquet": rows.parquet_bytes(decodes, rows.DECODE_SCHEMA),
         }
         full = {
+            "format": FORMAT,
             "state": "complete",
             "episodes": len(records),
             "successes": sum(r.success for r in records),
@@ -213,7 +297,7 @@ class StudyStore:
         """A complete cell.
 
         Raises:
-            CheckpointError: it is absent or damaged, or its columns are those of another version.
+            CheckpointError: it is absent or damaged, or of a newer kerv.
         """
         return _stored([self._read(name)])[0]
 
@@ -225,8 +309,8 @@ class StudyStore:
         status = self.status_of(name)
         try:
             config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
-            episodes = _columns(folder / "episodes.parquet", rows.EPISODE_SCHEMA)
-            decodes = _columns(folder / "decodes.parquet", _DECODE_TIMES)
+            episodes = with_columns(_parquet(folder / "episodes.parquet"), rows.EPISODE_SCHEMA)
+            decodes = with_columns(_parquet(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
             return _ReadCell(name, folder, config, _interned(status), episodes, _split_by_seed(decodes))
         except (OSError, ValueError, pa.ArrowException) as error:
             raise self._damaged(folder, error) from error
@@ -323,17 +407,33 @@ def _interned(status: Mapping[str, Any]) -> dict[str, Any]:
     return {sys.intern(key): sys.intern(value) if isinstance(value, str) else value for key, value in status.items()}
 
 
-def _columns(path: Path, schema: pa.Schema) -> pa.Table:
-    """The columns of `schema` in a parquet file.
+def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
+    """Whether a stored cell's config.yaml holds the work of `cell` on all of its seeds, whatever the engine was."""
+    try:
+        work = work_of(config["settings"], config["identity"]), config["task"], config["repeat"]
+        return work == cell.work and set(cell.seeds) <= set(config["seeds"])
+    except (KeyError, TypeError, AttributeError, ValueError):
+        return False
+
+
+def _parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Those columns of a parquet file, or all of them."""
+    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
+    return pq.ParquetFile(path).read(columns=columns, use_threads=False)
+
+
+def with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The columns of `schema` first, then those that only the table has. A column that an older table lacks is empty.
 
     Raises:
-        ValueError: it has others.
+        ValueError: a column of another type.
     """
-    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
-    table = pq.ParquetFile(path).read(columns=schema.names, use_threads=False)
-    if not table.schema.equals(schema):
-        raise ValueError(f"{path.name} has the columns of another version")
-    return table
+    absent = [field for field in schema if field.name not in table.column_names]
+    for field in absent:
+        table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    further = [name for name in table.column_names if name not in schema.names]
+    table = table.select([*schema.names, *further])
+    return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
 
 
 def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
@@ -345,7 +445,7 @@ def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
 
 def _stored(cells: Sequence[_ReadCell]) -> list[StoredCell]:
     """The cells with their episodes as data frames, converted all at once."""
-    whole = pa.concat_tables([cell.episodes for cell in cells]).to_pandas()
+    whole = pa.concat_tables([cell.episodes for cell in cells], promote_options="default").to_pandas()
     try:
         whole["decode_seconds"] = [cell.seconds[s] for cell in cells for s in cell.episodes["seed"].to_pylist()]
     except KeyError as error:
@@ -363,11 +463,26 @@ def _seal(status: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def stores(results: Path | str, family: str = STUDIES) -> list[StudyStore]:
+    """The runs of a family in a results folder, by name; neither hidden folders nor those without a plan. What a killed
+    command left among them is removed."""
+    with contextlib.suppress(OSError):
+        clean(Path(results) / family)
+    folders = visible(Path(results) / family)
+    return [StudyStore(results, folder.name, family) for folder in folders if (folder / "plan.yaml").is_file()]
+
+
+def studies_of(store: StudyStore) -> list[StudyStore]:
+    """The other studies of the same results folder; none where the store is no study's."""
+    if store.family != STUDIES:
+        return []
+    return [other for other in stores(store.root.parent.parent) if other.name != store.name]
+
+
 def begun_studies(results: Path | str) -> list[str]:
     """Names of the studies with a readable plan and the folder of at least one planned cell."""
     names = []
-    for path in sorted((Path(results) / "studies").glob("*/plan.yaml")):
-        store = StudyStore(results, path.parent.name)
+    for store in stores(results):
         with contextlib.suppress(CheckpointError):
             if any((store.cells / cell.id).exists() for cell in store.read_plan().cells):
                 names.append(store.name)

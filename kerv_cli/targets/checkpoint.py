@@ -214,7 +214,7 @@ def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int
     value = read_json(path)
     if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
-    return read(schema, value, str(path))
+    return read(schema, value, str(path), tolerant=True)
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:

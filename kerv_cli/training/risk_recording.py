@@ -32,7 +32,7 @@ from kerv_cli.rollouts.episode import run_episode
 from kerv_cli.rollouts.run import close_worlds, open_world
 from kerv_cli.runtime import set_up
 from kerv_cli.settings import CalibrateRiskSettings, RolloutSettings, as_plain
-from kerv_cli.studies.code import code_hash
+from kerv_cli.studies.identity import ENGINE
 from kerv_cli.targets.protocol import ReadableTarget
 from kerv_cli.training.risk_records import RiskRecords, Row
 
@@ -130,7 +130,7 @@ class RiskRun:
             "recorded": [s.sources, s.scores, s.unverified, s.scale, s.features],
             "world": asdict(s.world),
             "runtime": [runtime.device, runtime.dtype, runtime.threads],
-            "code": code_hash(),
+            "engine": ENGINE,
             "versions": versions(),
         }
 

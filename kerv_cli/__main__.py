@@ -1,0 +1,5 @@
+"""`python -m kerv_cli` is `kerv`."""
+
+from kerv_cli.app import main
+
+main()
