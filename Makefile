@@ -42,8 +42,8 @@ format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
 	@$(BIN)/ruff format $(CODE)
 
-pages: setup ## fill the figures of README.md and results/README.md from results/tables
-	@$(BIN)/python scripts/figures.py README.md results/README.md
+pages: setup ## fill the figures of README.md, results/README.md and results/LOG.md from results/tables
+	@$(BIN)/python scripts/figures.py README.md results/README.md results/LOG.md
 
 lock: setup ## write requirements/*.txt from what is installed
 	@scripts/lock.sh $(BIN)/python

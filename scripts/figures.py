@@ -58,13 +58,18 @@ def _interval(row: Row, name: str, form: str, scale: float = 1.0, between: str =
     return f"{value} ({low}{between}{high})" if value and low else value
 
 
+def _is_baseline(row: Row) -> bool:
+    """A table of latencies has AR at the same latency for a baseline."""
+    return row["label"] == row.get("baseline", row.get("ar"))
+
+
 def _ratio(row: Row, name: str) -> str:
-    return "1" if row["label"] == row.get("baseline") else _interval(row, name, ".2f")
+    return "1" if _is_baseline(row) else _interval(row, name, ".2f")
 
 
 def _own(text: Callable[[Row], str]) -> Callable[[Row], str]:
     """Empty for the baseline, which is not compared with itself."""
-    return lambda row: "" if row["label"] == row["baseline"] else text(row)
+    return lambda row: "" if _is_baseline(row) else text(row)
 
 
 def _lost_won(row: Row) -> str:
@@ -167,20 +172,24 @@ def error_table(name: str) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
+def _steps_per_decode(study: str) -> dict[str, float]:
+    """Control steps that a setting executes per decode, by label: a method that drops the rest of a chunk has fewer."""
+    return {row["label"]: float(row["steps"]) / float(row["decodes"]) for row in table_of(study, macro=False)}
+
+
 def replay_table(name: str, tokens: str) -> str:
-    """Decodes of one N that `kerv bench replay` executed: a row per setting."""
-    lines = [["setting", "forwards", "ms per decode", "speedup", "cost model"], ["---"] * 5]
+    """Decodes of whole chunks, N tokens, that `kerv bench replay` executed: a row per setting. A ratio per control step
+    is the one per decode times the setting's control steps per decode in the replayed study, relative to AR's."""
+    titles = ["setting", "forwards", "ms per decode", "per control step", "per decode", "cost model, per decode"]
+    lines = [titles, ["---"] * len(titles)]
     for row in (row for row in table_of(name, macro=False) if row["tokens"] == tokens):
-        speedup = f"{_number(row, 'speedup', '.2f')} ({_number(row, 'low', '.2f')}–{_number(row, 'high', '.2f')})"
-        lines.append(
-            [
-                row["label"],
-                _number(row, "forwards", ".2f"),
-                _number(row, "seconds", ".1f", 1000),
-                "1" if row["label"] == "ar" else speedup,
-                _number(row, "model", ".2f"),
-            ]
-        )
+        steps = _steps_per_decode(row["study"])
+        texts = []
+        for scale in (steps[row["label"]] / steps["ar"], 1.0):
+            value, low, high = (_number(row, end, ".2f", scale) for end in ("speedup", "low", "high"))
+            texts.append("1" if row["label"] == "ar" else f"{value} ({low}–{high})")
+        times = [_number(row, "forwards", ".2f"), _number(row, "seconds", ".1f", 1000)]
+        lines.append([row["label"], *times, *texts, _number(row, "model", ".2f")])
     if len(lines) == 2:
         raise BadReference(f"{name} has no decodes of {tokens} tokens")
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -1,5 +1,5 @@
-"""Every command in README.md and docs/ runs: with --cfg where it has it, which composes and checks all of its settings
-and computes nothing."""
+"""Every command in README.md, docs/ and on the results page runs: with --cfg where it has it, which composes and checks
+all of its settings and computes nothing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from kerv_cli.app import app
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results/README.md"]
 _BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"^```yaml\n# (\S+\.yaml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -33,7 +33,8 @@ def commands() -> list[str]:
         text = page.read_text(encoding="utf-8")
         lines = [line.split("   #")[0].strip() for block in _BLOCK.findall(text) for line in block.splitlines()]
         lines += re.findall(r"`((?:kerv|make) [^`\n…]+)`", text)
-        found += [line for line in lines if line.startswith(("kerv ", "make "))]
+        parts = [part for line in lines for part in line.split(" && ")]
+        found += [part for part in parts if part.startswith(("kerv ", "make "))]
     return list(dict.fromkeys(found))
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = ("README.md", "results/README.md")
+PAGES = ("README.md", "results/README.md", "results/LOG.md")
 
 
 def script() -> Any:
@@ -48,6 +48,17 @@ def test_every_figure_on_a_page_is_the_tables(page: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_the_results_page_stays_a_page() -> None:
+    assert len((ROOT / "results/README.md").read_text(encoding="utf-8").splitlines()) <= 250
+
+
+@pytest.mark.parametrize("folder", ["tables", "plots"])
+def test_the_log_names_the_command_of_every_file(folder: str) -> None:
+    rows = (ROOT / "results/LOG.md").read_text(encoding="utf-8").partition("## Files")[2]
+    files = [file.name for file in (ROOT / "results" / folder).iterdir() if not file.name.startswith("demo")]  # ignored
+    assert [name for name in files if f"`{name}`" not in rows] == []
+
+
 def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures: Any) -> None:
     page = (
         "<!-- table small: setting success lost/won speedup -->\nold\n<!-- /table -->\n"
@@ -75,10 +86,12 @@ def test_errors_are_averaged_over_the_dofs_that_differ(figures: Any, tmp_path: P
 
 
 def test_replayed_decodes_of_one_length(figures: Any, tmp_path: Path) -> None:
-    rows = ("tokens,label,forwards,seconds,speedup,low,high,model", "7,ar,7,0.2,1,1,1,1", "16,sd,2,0.05,4,3.5,4.5,3.9")
+    head = "tokens,label,study,forwards,seconds,speedup,low,high,model"
+    rows = (head, "7,ar,played,7,0.2,1,1,1,1", "16,sd,played,2,0.05,4,3.5,4.5,3.9")
     (tmp_path / "replay.csv").write_text("\n".join(rows), encoding="utf-8")
+    (tmp_path / "played.csv").write_text("label,steps,decodes\nar,40,10\nsd,40,20", encoding="utf-8")
     filled = figures.filled("<!-- replay replay 16 -->\n<!-- /replay -->")
-    assert "| sd | 2.00 | 50.0 | 4.00 (3.50–4.50) | 3.90 |\n" in filled
+    assert "| sd | 2.00 | 50.0 | 2.00 (1.75–2.25) | 4.00 (3.50–4.50) | 3.90 |\n" in filled
     assert "| ar |" not in filled
     with pytest.raises(figures.BadReference, match="no decodes of 5 tokens"):
         figures.filled("<!-- replay replay 5 -->\n<!-- /replay -->")
