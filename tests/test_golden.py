@@ -1,16 +1,47 @@
-"""The shipped policy decodes what it has always decoded: tokens, forwards and successes of study=main, closed loop."""
+"""The shipped policy decodes what it has always decoded: tokens, forwards and successes of study=main, closed loop; and
+`ENGINE`, by which stored results are reused, changes with them and never without."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
 from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from kerv_cli.studies.identity import ENGINE
 
 
-def test_every_method_of_the_main_study_decodes_the_same_tokens() -> None:
+@pytest.fixture(scope="module")
+def golden() -> ModuleType:
     spec = importlib.util.spec_from_file_location("write_golden", Path(__file__).parent / "golden" / "write.py")
     assert spec is not None
     assert spec.loader is not None
-    golden = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(golden)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_method_of_the_main_study_decodes_the_same_tokens(golden: ModuleType) -> None:
     assert golden.measure() == json.loads(golden.FILE.read_text())
+
+
+def test_the_engine_is_that_of_the_golden_tokens(golden: ModuleType) -> None:
+    engines = json.loads(golden.ENGINES.read_text())
+    assert engines[str(ENGINE)] == golden.hash_of(json.loads(golden.FILE.read_text()))
+    assert len(set(engines.values())) == len(engines), "it was raised without a change of tokens"
+
+
+@pytest.mark.parametrize(
+    ("engine", "digest", "told"),
+    [
+        (2, "b", ""),
+        (3, "c", ""),
+        (2, "c", "tokens changed: raise ENGINE from 2"),
+        (3, "b", "ENGINE was raised and no token changed"),
+        (1, "a", "ENGINE 1 is an earlier one"),
+    ],
+)
+def test_tokens_and_engine_change_together(golden: ModuleType, engine: int, digest: str, told: str) -> None:
+    assert golden.refusal({"1": "a", "2": "b"}, engine, digest) == told

@@ -8,6 +8,7 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -279,3 +280,63 @@ def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     shutil.copy(results / "artifacts/target/nano-state/log.csv", folder)
     assert save_curves(folder).read_bytes().startswith(b"\x89PNG")
+
+
+# --- removal ---
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from kerv_cli.runs.catalogue import find_run
+from kerv_cli.runs.removal import remove
+
+left = int(sys.argv[3])
+
+def kill_at(event, arguments):
+    global left
+    if event in ("os.rename", "os.remove", "os.rmdir", "shutil.rmtree"):
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), 9)
+
+run = find_run(sys.argv[1], sys.argv[2])
+sys.addaudithook(kill_at)
+remove(run)
+"""
+
+
+@pytest.mark.parametrize("moment", [0, 1, 2, 5, 9])
+def test_a_run_whose_removal_is_killed_is_whole_or_gone(results: Path, tmp_path: Path, moment: int) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
+    before = sorted(path.relative_to(copy) for path in (copy / "rollouts" / name).rglob("*"))
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(copy), name, str(moment)], check=False)
+    assert killed.returncode == -9
+    names = [run["id"] for run in listed(copy)]
+    if moment == 0:
+        assert sorted(path.relative_to(copy) for path in (copy / "rollouts" / name).rglob("*")) == before
+    else:
+        assert name not in names
+    works("doctor", "--repair", f"results={copy}")
+    (tmp_path / "one.yaml").write_text("settings: {ar: method=ar policy=state policy.target=nano-state task=reach-v3}")
+    works("sweep", f"study={tmp_path}/one.yaml", "--plan", f"results={copy}")
+    assert not [path for path in (copy / "rollouts").iterdir() if path.name.startswith(".")], "nothing hidden stays"
+
+
+def test_removal_refuses_links_and_parts_of_names(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "results"
+    shutil.copytree(results, copy)
+    name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
+    elsewhere = tmp_path / "elsewhere"
+    (copy / "rollouts" / name).rename(elsewhere)
+    (copy / "rollouts" / name).symlink_to(elsewhere)
+    refused = kerv("runs", "rm", "-y", name, f"results={copy}")
+    assert refused.exit_code == 2
+    assert "is a link to" in refused.stderr
+    assert (elsewhere / "plan.yaml").is_file()
+    for part in (name[:8], "last"):
+        refused = kerv("runs", "rm", "-y", part, f"results={copy}")
+        assert refused.exit_code == 2
+        assert "unknown run" in refused.stderr

@@ -84,9 +84,12 @@ def print_notes(idle: Mapping[str, str]) -> None:
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
 
 
-def print_plan(text: str) -> None:
+def print_plan(text: str, as_json: bool = False) -> None:
     """Prints what would be done, for --plan; the command ends."""
-    typer.echo(text)
+    if as_json:
+        print_json({"plan": text})
+    else:
+        typer.echo(text)
     raise typer.Exit(0)
 
 

@@ -70,7 +70,11 @@ def rollout(
     if plan:
         total = sum(len(cell.seeds) for cell in cells)
         names = ", ".join(f"{label}{_stressed(asdict(own))}" for label, own in resolved.settings.items())
-        typer.echo(f"{names}: {len(resolve_tasks(first.task))} tasks, {total} episodes, about {3 * total} s (a guess)")
+        tasks = resolve_tasks(first.task)
+        if as_json:
+            print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
+        else:
+            typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, about {3 * total} s (a guess)")
         return
     arguments = ["rollout", *(["-m"] if multirun else []), *words]
     store = run_cells(resolved, cells, first.results, arguments)

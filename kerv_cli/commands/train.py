@@ -64,7 +64,7 @@ def score(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
 
 def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     if plan:
-        common.print_plan(run.plan())
+        common.print_plan(run.plan(), as_json)
     with progress_bar(loading) as advance:
         run.load(advance)
     begun = False

@@ -428,11 +428,13 @@ def with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     Raises:
         ValueError: a column of another type.
     """
-    absent = [field for field in schema if field.name not in table.column_names]
-    for field in absent:
+    if table.schema.equals(schema):
+        return table
+    there, names = set(table.column_names), list(schema.names)
+    for field in (field for field in schema if field.name not in there):
         table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    further = [name for name in table.column_names if name not in schema.names]
-    table = table.select([*schema.names, *further])
+    further = [name for name in table.column_names if name not in set(names)]
+    table = table.select([*names, *further])
     return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
 
 

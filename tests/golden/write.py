@@ -1,4 +1,5 @@
-"""Writes tests/golden/main.json: `python tests/golden/write.py`. Only when a change is meant to change results."""
+"""Writes tests/golden/main.json and engines.json: `python tests/golden/write.py`, when a change is meant to change
+tokens and has raised `ENGINE`; in no other case."""
 
 from __future__ import annotations
 
@@ -8,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.rollouts.run import close_worlds, run_task
+from kerv_cli.studies.identity import ENGINE
 from kerv_cli.studies.resolve import resolve
 
 FILE = Path(__file__).with_name("main.json")
+ENGINES = Path(__file__).with_name("engines.json")
+"""ENGINE -> hash of the golden file that it was raised for."""
 TASKS = ("drawer-close-v3", "window-open-v3")
 SEEDS = (100_000,)
 
@@ -33,5 +37,23 @@ def measure() -> dict[str, Any]:
     return found
 
 
+def hash_of(golden: dict[str, Any]) -> str:
+    """Of the contents of main.json."""
+    return hashlib.sha256(json.dumps(golden, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def refusal(engines: dict[str, str], engine: int, digest: str) -> str:
+    """Why these golden tokens and this ENGINE do not belong together; empty where they do. engines: as in ENGINES."""
+    if engine < max(map(int, engines)):
+        return f"ENGINE {engine} is an earlier one"
+    if str(engine) in engines:
+        return "" if engines[str(engine)] == digest else f"tokens changed: raise ENGINE from {engine}"
+    return "ENGINE was raised and no token changed" if digest in engines.values() else ""
+
+
 if __name__ == "__main__":
-    FILE.write_text(json.dumps(measure(), indent=1) + "\n")
+    measured, known = measure(), json.loads(ENGINES.read_text())
+    if told := refusal(known, ENGINE, hash_of(measured)):
+        raise SystemExit(told)
+    FILE.write_text(json.dumps(measured, indent=1) + "\n")
+    ENGINES.write_text(json.dumps(known | {str(ENGINE): hash_of(measured)}, indent=1) + "\n")
