@@ -352,8 +352,9 @@ def _add(
     register(Part(kind, name, build and f"kerv_cli.{build}", settings, wanted, check, colour, traits))
 
 
-for _name in ("metaworld", "insertion"):
-    _add("environment", _name, f"environments.{_name}.spec:SPEC", names=f"kerv_cli.environments.{_name}.tasks:NAMES")
+_add(
+    "environment", "metaworld", "environments.metaworld.spec:SPEC", names="kerv_cli.environments.metaworld.tasks:NAMES"
+)
 for _name, _module, _class, _needs in (
     ("push", "push", "Push", ("actions", "position")),
     ("actuation", "actuation", "Actuation", ("actions",)),

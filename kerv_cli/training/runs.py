@@ -18,7 +18,7 @@ from kerv_cli.drafting.eagle import Drafter, save_drafter
 from kerv_cli.drafting.early import EarlyDrafter, save_early
 from kerv_cli.environments import resolve_tasks, settled, spec_of
 from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.places import artifact, find_target
 from kerv_cli.provenance import provenance
 from kerv_cli.runtime import set_up
