@@ -311,7 +311,6 @@ class DemosSettings(TaskSettings):
     policy: PolicySettings = field(default_factory=PolicySettings)  # what acts; the expert labels (DAgger)
     expert_share: float = number(0.3, 0, 1)  # of a target's chunks: those that the expert executes
     frame_stride: int = number(2, 1, 10_000)
-    ways: list[str] = field(default_factory=list)  # left, right, above: one per episode; none: the scripted way alone
     world: WorldSettings = field(default_factory=WorldSettings)
 
 

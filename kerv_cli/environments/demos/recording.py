@@ -26,7 +26,6 @@ from kerv_cli.environments.camera import CameraConfig, choose_backend
 from kerv_cli.environments.demos.dataset import FORMAT, DemoManifest, dataset_hash, episode_path, with_environment
 from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.environments.demos.ways import Detour, check_ways, way_of
 from kerv_cli.environments.spec import EnvironmentSpec, Expert, World
 from kerv_cli.errors import CheckpointError, KervError, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
@@ -57,7 +56,6 @@ class DemoConfig:
         horizon: control steps within which the expert must succeed; 0: the environment's.
         policy: hash of the actor's weights; empty: the expert acts.
         expert_share: probability that the expert acts for one of the actor's chunks.
-        ways: names of `ways.WAYS`, one of which every episode takes; none: the scripted expert as it is.
     """
 
     tasks: tuple[str, ...]
@@ -74,7 +72,6 @@ class DemoConfig:
     horizon: int = 0
     policy: str = ""
     expert_share: float = 0.0
-    ways: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
@@ -96,7 +93,6 @@ class DemoConfig:
             raise UsageError(f"demonstrations: {wrong[0]}")
         ends = self.first_seed, self.first_seed + self.episodes - 1
         self.spec.seeds.check(ends, "training", "demonstrations")
-        check_ways(self.ways, self.spec)
 
     @property
     def spec(self) -> EnvironmentSpec:
@@ -146,8 +142,6 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None 
     """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
     late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
     expert = world.spec.expert(world.task)
-    if config.ways:
-        expert = Detour(expert, world.spec, way_of(world.task, seed, config.ways))
     mover: Actor = actor or NoisyExpert(config)
     observation = world.reset(seed)
     mover.reset(world, seed)
@@ -271,8 +265,6 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
     del settings["workers"]
     if not config.policy:
         del settings["policy"], settings["expert_share"]  # as recordings without an actor always were
-    if not config.ways:
-        del settings["ways"]  # as in recordings from before there were ways, which go on
     spec = config.spec
     versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
     identity = {
