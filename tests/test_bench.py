@@ -210,10 +210,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path, monkeypatch: pytest.
     document = json.loads(told.splitlines()[-1])
     path = tmp_path / "bench/nano-float32.json"
     assert document == json.loads(path.read_text())
-    assert {"card", "cold_start", "phases", "ceilings", "ties", "host", "shares", "profile", "git_commit"} <= set(
-        document
-    )
-    assert {work["method"]: work["forwards"] for work in document["host"]["methods"]}["ar"] == 4  # one control step
+    assert {"card", "cold_start", "phases", "ceilings", "ties", "profile", "git_commit"} <= set(document)
     assert next(p["name"] for p in document["phases"] if p["kind"] == "verify") == "one token"
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).one_token == single
