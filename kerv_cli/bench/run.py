@@ -14,7 +14,6 @@ from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
 from kerv_cli.bench.phases import Phase, Stage, costs, flipped, measure
 from kerv_cli.bench.profile import profile_of
-from kerv_cli.errors import UsageError
 from kerv_cli.places import results_dir
 from kerv_cli.provenance import stamp
 from kerv_cli.settings import BenchSettings
@@ -65,18 +64,6 @@ class Bench:
         }
 
 
-def check(settings: BenchSettings) -> None:
-    """Refuses numbers that cannot be measured.
-
-    Raises:
-        UsageError: the first of them.
-    """
-    if settings.repeats < 3:
-        raise UsageError(f"repeats={settings.repeats}: at least 3, medians are over them")
-    if not settings.tokens or min(settings.tokens) < 3 or max(settings.tokens) > 256:
-        raise UsageError(f"tokens={settings.tokens}: chunks of 3 to 256 tokens, e.g. tokens=[7,16]")
-
-
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
     """Bytes, operations and floors of the model on this machine; needs no forward of the trunk."""
     prompt, s = model.target.max_prompt, model.target.settings
@@ -100,8 +87,7 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
 
 
 def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, float], float]:
-    """The model, its machine, the card and the seconds that opening took. Errors as `open_model` and `check`."""
-    check(settings)
+    """The model, its machine, the card and the seconds that opening took. Errors as `open_model`."""
     began = time.perf_counter()
     model = open_model(settings)
     synchronise(model.target.device)

@@ -29,6 +29,7 @@ from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
 from kerv_cli.environments.spec import EnvironmentSpec, Expert, World
 from kerv_cli.errors import CheckpointError, KervError, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
+from kerv_cli.limits import check_settings, limits, number
 from kerv_cli.manifests import read
 from kerv_cli.spaces import Observation
 
@@ -59,38 +60,29 @@ class DemoConfig:
     """
 
     tasks: tuple[str, ...]
-    episodes: int
+    episodes: int = field(metadata=limits(1))
     first_seed: int = 0
-    perturbed: float = 0.5
-    noise_low: float = 0.2
-    noise_high: float = 0.6
-    burst_probability: float = 0.02
+    perturbed: float = number(0.5, 0, 1)
+    noise_low: float = number(0.2, 0)
+    noise_high: float = number(0.6, 0)
+    burst_probability: float = number(0.02, 0, 1)
     camera: CameraConfig = field(default_factory=CameraConfig)
-    frame_stride: int = 1
-    tail: int = 8
-    workers: int = 2
+    frame_stride: int = number(1, 1)
+    tail: int = number(8, 0)
+    workers: int = number(2, 1)
     horizon: int = 0
     policy: str = ""
-    expert_share: float = 0.0
+    expert_share: float = number(0.0, 0, 1)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
         object.__setattr__(self, "camera", self.spec.camera(self.camera))
         object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon))
-        most = self.spec.horizon
-        checks = {
-            f"episodes must be 1 or more, not {self.episodes}": self.episodes >= 1,
-            f"perturbed must lie between 0 and 1, not {self.perturbed}": 0.0 <= self.perturbed <= 1.0,
-            "noise must satisfy 0 <= noise_low <= noise_high": 0.0 <= self.noise_low <= self.noise_high,
-            "burst_probability must lie between 0 and 1": 0.0 <= self.burst_probability <= 1.0,
-            f"frame_stride must be 1 or more, not {self.frame_stride}": self.frame_stride >= 1,
-            f"tail must lie between 0 and {most - 1}, not {self.tail}": 0 <= self.tail < most,
-            f"workers must be 1 or more, not {self.workers}": self.workers >= 1,
-            f"expert_share must lie between 0 and 1, not {self.expert_share}": 0.0 <= self.expert_share <= 1.0,
-        }
-        wrong = [message for message, holds in checks.items() if not holds]
-        if wrong:
-            raise UsageError(f"demonstrations: {wrong[0]}")
+        check_settings(self, "demonstrations")
+        if self.noise_low > self.noise_high:
+            raise UsageError("demonstrations: noise must satisfy noise_low <= noise_high")
+        if self.tail >= self.spec.horizon:
+            raise UsageError(f"demonstrations: tail={self.tail}: an episode has {self.spec.horizon} control steps")
         ends = self.first_seed, self.first_seed + self.episodes - 1
         self.spec.seeds.check(ends, "training", "demonstrations")
 
