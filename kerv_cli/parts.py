@@ -352,8 +352,9 @@ def _add(
     register(Part(kind, name, build and f"kerv_cli.{build}", settings, wanted, check, colour, traits))
 
 
-for _name in ("metaworld", "insertion"):
-    _add("environment", _name, f"environments.{_name}.spec:SPEC", names=f"kerv_cli.environments.{_name}.tasks:NAMES")
+_add(
+    "environment", "metaworld", "environments.metaworld.spec:SPEC", names="kerv_cli.environments.metaworld.tasks:NAMES"
+)
 for _name, _module, _class, _needs in (
     ("push", "push", "Push", ("actions", "position")),
     ("actuation", "actuation", "Actuation", ("actions",)),
@@ -442,17 +443,17 @@ _add("skip", "parallel", _BUILD + "parallel_pass", colour=0x17BECF, parallel=Tru
 _add("skip", "streak", _BUILD + "streak_skip", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
 _risk: dict[str, Any] = {"takes_draft": True, "merges": True, "retrieves": True}
 _add("skip", "risk", _BUILD + "risk_skip", RiskSkipSettings, needs_of_risk, check_risk, colour=0x3B6FB6, **_risk)
-for _name, _needed in (
-    ("odds", ("early",)),
-    ("entropy", ("early",)),
-    ("familiarity", ("early",)),
-    ("steadiness", ()),
-    ("agreement_hold", ()),
-    ("agreement_retrieval", ("datastore",)),
-    ("similarity", ("datastore",)),
-    ("learned", ("early", "score")),
+for _name, _score, _needed in (
+    ("odds", "Odds", ("early",)),
+    ("entropy", "Entropy", ("early",)),
+    ("familiarity", "Familiarity", ("early",)),
+    ("steadiness", "Steadiness", ()),
+    ("agreement_hold", "agreement_hold", ()),
+    ("agreement_retrieval", "agreement_retrieval", ("datastore",)),
+    ("similarity", "Similarity", ("datastore",)),
+    ("learned", "Learned", ("early", "score")),
 ):
-    _add("score", _name, "decoding.scores:" + _name, needs=_needed)
+    _add("score", _name, "decoding.scores:" + _score, needs=_needed)
 _add("skip", "always", _BUILD + "always_skip", takes_draft=True)  # what prefill_draft drafts is never verified
 _add(
     *("skip", "similarity", _BUILD + "similarity_skip", SimilaritySkipSettings),

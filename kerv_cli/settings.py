@@ -314,7 +314,6 @@ class DemosSettings(TaskSettings):
     policy: PolicySettings = field(default_factory=PolicySettings)  # what acts; the expert labels (DAgger)
     expert_share: float = number(0.3, 0, 1)  # of a target's chunks: those that the expert executes
     frame_stride: int = number(2, 1, 10_000)
-    ways: list[str] = field(default_factory=list)  # left, right, above: one per episode; none: the scripted way alone
     world: WorldSettings = field(default_factory=WorldSettings)
 
 
@@ -399,9 +398,14 @@ class BenchSettings(RunSettings):
 
     model: str = "mt10-vision"  # target=: a policy, or a shape of conf/target with random weights
     dtype: str = "auto"  # of a shape: float32 | bfloat16 | auto, the faster one here; a policy has runtime.dtype
-    repeats: int = number(30, 1, 100_000)  # of every measurement; medians and 95th percentiles are over them
-    tokens: list[int] = field(default_factory=lambda: [7, 16], metadata=limits(1, 1024))  # N, of a chunk
+    repeats: int = number(30, 3, 100_000)  # of every measurement; medians and 95th percentiles are over them
+    tokens: list[int] = field(default_factory=lambda: [7, 16], metadata=limits(3, 256))  # N, of a chunk
     drafter_depth: int = number(6, 1, 1024)  # tokens of the drafter's chain whose time counts in the ceilings
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError without a chunk to measure."""
+        if not self.tokens:
+            raise UsageError(f"{prefix}tokens=[]: name at least one N")
 
 
 @dataclass
@@ -409,7 +413,7 @@ class BenchReplaySettings(BenchSettings):
     """`kerv bench replay`: a study's recorded decodes, executed on another target."""
 
     recorded: str = "main"  # study=: whose decodes
-    decodes: int = number(40, 1, 1_000_000)  # of every setting, evenly over tasks and seeds
+    decodes: int = number(40, 2, 1_000_000)  # of every setting, evenly over tasks and seeds
     model: str = "vla-150m"
     profiles: dict[str, str] = field(
         default_factory=dict

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import examples.insertion  # noqa: F401 - registers the environment with seven degrees of freedom
 import pytest
 
 from kerv_cli import registry
@@ -13,12 +14,12 @@ from kerv_cli import registry
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 ENVIRONMENTS = dict(registry.parts("environment"))
-"""kerv's own, taken before test modules are imported."""
+"""kerv's own and the example `insertion`, taken before test modules are imported."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def registered_environments() -> Iterator[None]:
-    """A module begins with kerv's own environments, and what it registers is gone when it ends.
+    """A module begins with these environments, and what it registers is gone when it ends.
 
     Opening a dataset of a recording, or importing an example, registers an environment for the process, and which
     modules share a process is decided anew in every parallel run.

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from examples.tiny_openvla import write_checkpoint
 from test_openvla import imported, loaded, shown
 from test_public_drafter import LANGUAGE, PATCHES, with_convention
 from torch import Tensor
@@ -22,7 +23,6 @@ from torch import Tensor
 from kerv_cli.drafting.public import MASKS, POSITIONS, Convention, PublicDrafter, PublicShape
 from kerv_cli.settings import DrafterSettings
 from kerv_cli.targets.openvla.target import OpenVLATarget
-from kerv_cli.targets.openvla.tiny import write_checkpoint
 from kerv_cli.training.distillation import Distillation, TeacherStates, acceptance_length, greedy
 
 OBSERVATIONS, STEPS = 64, 600

@@ -45,6 +45,7 @@ from kerv_cli.studies.block import RunEpisode
 from kerv_cli.studies.execute import execute
 from kerv_cli.studies.plan import Cell, blocks_of, make_cell
 from kerv_cli.studies.store import StudyStore
+from kerv_cli.targets.compact.packed import pack
 
 HOME = np.zeros(3)
 
@@ -91,7 +92,7 @@ def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, ba
     policy = target()
     if packed:
         policy.requires_grad_(False)
-        policy.pack()
+        pack(policy)
         assert policy.trunk.packed is not None
     alone, together = decoded(Decoder(policy), shown(batch))
     assert len({one.tokens for one in alone}) > batch / 2

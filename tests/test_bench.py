@@ -210,10 +210,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path, monkeypatch: pytest.
     document = json.loads(told.splitlines()[-1])
     path = tmp_path / "bench/nano-float32.json"
     assert document == json.loads(path.read_text())
-    assert {"card", "cold_start", "phases", "ceilings", "ties", "host", "shares", "profile", "git_commit"} <= set(
-        document
-    )
-    assert {work["method"]: work["forwards"] for work in document["host"]["methods"]}["ar"] == 4  # one control step
+    assert {"card", "cold_start", "phases", "ceilings", "ties", "profile", "git_commit"} <= set(document)
     assert next(p["name"] for p in document["phases"] if p["kind"] == "verify") == "one token"
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).one_token == single
@@ -228,11 +225,12 @@ def test_the_command_ends_with_one_document(tmp_path: Path, monkeypatch: pytest.
     [
         (["target=vla-15m"], "did you mean vla-150m"),
         (["target=nano", "dtype=int4"], "dtype=int4: known are auto"),
-        (["repeats=1"], "at least 3"),
-        (["tokens=[1]"], "chunks of 3 to 256 tokens"),
+        (["repeats=1"], "repeats=1: from 3 to 100000"),
+        (["tokens=[1]"], "tokens=1: from 3 to 256"),
+        (["tokens=[]"], "tokens=[]: name at least one N"),
         (["target=openvla-7b", "dtype=float32"], "GB are free on cpu"),
         (["replay", "study=nothing"], "no study 'nothing'"),
-        (["replay", "decodes=1"], "at least 2"),
+        (["replay", "decodes=1"], "decodes=1: from 2 to"),
         (["replay", "profiles=1"], "profiles"),
         (["replay", "projections.mine=[1]"], "GB/s and TFLOP/s"),
     ],

@@ -22,7 +22,6 @@ from kerv_cli.decoding.boundary import (
 from kerv_cli.decoding.build import Context
 from kerv_cli.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.registry import find
-from kerv_cli.reporting.curvature import pseudo_radius
 
 WINDOW = 15
 RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)
@@ -42,6 +41,11 @@ def boundary_of(kind: str, **values: Any) -> Boundary:
 
     built: Boundary = part.built(chosen, Context(None, artifact))  # type: ignore[arg-type]
     return built
+
+
+def pseudo_radius(points: np.ndarray) -> float:
+    """The "radius" of HeiSD's public code (docs/methods.md §4.4): a constant times the mean speed of points (n, 3)."""
+    return 10.0 * path_length(points) / (len(points) - 1)
 
 
 def rotation(rng: np.random.Generator) -> np.ndarray:

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples.insertion import SPEC as INSERTION
+from examples.insertion.world import InsertionWorld
 from examples.own_policy import OwnPolicy, Remembered
 from examples.own_target import MockTarget
 from test_decoding_lossless import RandomTrees, decode, plain_greedy
@@ -18,8 +20,6 @@ from typer.testing import CliRunner
 
 from kerv_cli.app import app
 from kerv_cli.environments.conformance import check_environment
-from kerv_cli.environments.insertion.spec import SPEC as INSERTION
-from kerv_cli.environments.insertion.world import InsertionWorld
 from kerv_cli.findings import Finding
 from kerv_cli.spaces import Observation
 from kerv_cli.targets.conformance import check_target

@@ -23,6 +23,7 @@ from kerv_cli.files import sha256_of
 from kerv_cli.settings import DrafterSettings, TargetSettings
 from kerv_cli.spaces import ActionSpace, Group, Observation
 from kerv_cli.targets.checkpoint import load_target, save_tensors
+from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.protocol import Target
@@ -44,7 +45,7 @@ def random_target(seed: int, layers: int, heads: int, chunk: int, fixed: bool = 
     torch.nn.init.normal_(target.embedding.weight, std=1.0)
     target = target.eval().requires_grad_(False)
     if seed % 2:
-        target.pack()
+        pack(target)
     if fixed:
         target.new_cache = functools.partial(target.new_cache, fixed=True)  # type: ignore[method-assign]
     return target

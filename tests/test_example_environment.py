@@ -65,12 +65,19 @@ def test_an_environment_may_have_no_experts(spec: EnvironmentSpec) -> None:
         dataclasses.replace(spec, expert_class="").expert("push-point")
 
 
-def test_a_plugin_is_named_by_an_environment_variable() -> None:
-    code = "from kerv_cli.environments import resolve_tasks; print(*resolve_tasks(['POINT']))"
+@pytest.mark.parametrize(
+    ("plugin", "suite", "tasks"),
+    [
+        ("examples.point_mass", "POINT", "push-point"),
+        ("examples.insertion", "INSERTION", "insert-peg fetch-peg"),
+    ],
+)
+def test_a_plugin_is_named_by_an_environment_variable(plugin: str, suite: str, tasks: str) -> None:
+    code = f"from kerv_cli.environments import resolve_tasks; print(*resolve_tasks(['{suite}']))"
     paths = os.pathsep.join([str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "KERV_PLUGINS": "examples.point_mass", "PYTHONPATH": paths}
+    environment = {**os.environ, "KERV_PLUGINS": plugin, "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert (done.stdout, done.stderr) == ("push-point\n", "")
+    assert (done.stdout, done.stderr) == (f"{tasks}\n", "")
 
 
 def test_rollouts_do_not_need_rerun() -> None:

@@ -1,4 +1,4 @@
-"""The insertion environment: seven DoFs, tasks that need rotation, from demonstrations to a recording."""
+"""The example with a simulator: seven DoFs, tasks that need rotation, from demonstrations to a recording."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from examples.insertion import SPEC
 
 from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.insertion.spec import SPEC
 from kerv_cli.environments.spec import World
 from kerv_cli.errors import KervError
 from kerv_cli.rollouts.episode import run_episode

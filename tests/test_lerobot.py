@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from examples.tiny_openvla import write_checkpoint
 from test_openvla import imported, kerv
 from typer.testing import CliRunner
 
@@ -19,7 +20,6 @@ from kerv_cli.environments.camera import CameraConfig
 from kerv_cli.environments.demos.dataset import DemoDataset
 from kerv_cli.environments.demos.lerobot.reading import _groups
 from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.targets.openvla.tiny import write_checkpoint
 
 SIZE = 56
 

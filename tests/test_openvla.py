@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples.tiny_openvla import ROBOT, TINY, write_checkpoint
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -31,7 +32,6 @@ from kerv_cli.targets.openvla.importing import import_checkpoint
 from kerv_cli.targets.openvla.layout import layout, published, unread
 from kerv_cli.targets.openvla.loading import OpenVLAModel
 from kerv_cli.targets.openvla.target import OpenVLATarget
-from kerv_cli.targets.openvla.tiny import ROBOT, TINY, write_checkpoint
 
 FOUR = {"q01": [-1.0] * 4, "q99": [1.0] * 4}
 

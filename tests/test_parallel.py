@@ -17,6 +17,7 @@ from kerv_cli.rollouts.policy import check, decoder_for
 from kerv_cli.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.spaces import Observation
 from kerv_cli.targets.checkpoint import save_target
+from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.imitation import check_init, continued_target
@@ -64,7 +65,7 @@ def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed: b
     policy = target("target.parallel=true")
     wanted = oracle(policy, policy.encode(some_observation()))
     if packed:
-        policy.pack()
+        pack(policy)
     decoder = Decoder(policy, Parts(skip=ParallelPass(policy)))
     decoder.reset("", 0, np.zeros(3))
     record = decoder.decode(some_observation())

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from examples.tiny_openvla import write_checkpoint
 from safetensors.torch import load_file, save_file
 from test_decoding_lossless import decode, plain_greedy
 from test_openvla import imported, kerv, loaded, shown
@@ -21,7 +22,6 @@ from kerv_cli.drafting.eagle import load_drafter
 from kerv_cli.drafting.public import Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.openvla.config import Language
 from kerv_cli.targets.openvla.target import OpenVLATarget
-from kerv_cli.targets.openvla.tiny import write_checkpoint
 
 LANGUAGE = Language(704, 64, 96, 1, 4)
 KERV, TEXT, PROMPT = Convention(), Convention("text"), Convention(mask="prompt")

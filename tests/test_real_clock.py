@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples.insertion import SPEC as INSERTION
 from examples.point_mass import SPEC, PointWorld
 from studies_synthetic import still_episode
 from typer.testing import CliRunner
@@ -18,7 +19,6 @@ from kerv_cli.app import app
 from kerv_cli.config import compose
 from kerv_cli.decoding.cost import Profile
 from kerv_cli.decoding.record import DecodeRecord, Delay, EpisodeRecord, Round
-from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.errors import KervError
 from kerv_cli.rollouts import policy as policies_of

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples.insertion import SPEC as INSERTION
 from PIL import Image
 from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, verify
 
 from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
-from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.errors import KervError, StorageError, UsageError
 from kerv_cli.registry import parts
 from kerv_cli.viewing import rerun_log, viewer

@@ -245,6 +245,16 @@ def test_a_dataset_of_format_1_is_metaworlds_and_can_be_gone_on_with(copied):
         DemoDataset.open(copied)
 
 
+def test_a_dataset_of_experts_with_several_ways_is_read_and_not_gone_on_with(copied):
+    for name in ("manifest.json", "recording.json"):
+        value = json.loads((copied / name).read_text())
+        value["config"]["ways"] = ["left", "right"]
+        (copied / name).write_text(json.dumps(value))
+    assert DemoDataset.open(copied).load(0).steps
+    with pytest.raises(UsageError, match=r"ways=\['left', 'right'\], not None: choose another folder"):
+        record(CONFIG, copied)
+
+
 def test_noise_is_what_it_was_in_every_dataset_so_far():
     """Datasets recorded before must come out bit-equal when they are recorded again."""
     perturb = Perturbation("reach-v3", 1, SPEC.actions, (0.2, 0.6), 0.02)

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from examples.insertion import SPEC as INSERTION
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.errors import CheckpointError, UsageError
 from kerv_cli.manifests import read

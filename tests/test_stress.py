@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples.insertion import SPEC as INSERTION
 
 from kerv_cli.config import compose
 from kerv_cli.environments import stress as stressing
 from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.insertion.spec import SPEC as INSERTION
 from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.environments.recorded import register_recorded
 from kerv_cli.environments.spec import EnvironmentSpec
@@ -31,6 +31,7 @@ from kerv_cli.rollouts.run import Runner, close_worlds
 from kerv_cli.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
 from kerv_cli.studies.identity import stress_of, work_of
 
+TESTS = Path(__file__).parent
 SEED, STEPS, SIZE = 50_006, 24, 48
 KINDS = ("push", "actuation", "sensor", "light", "colour", "camera", "object")
 SEEN, FELT = ("sensor", "light", "colour", "camera"), ("push", "actuation", "object")
@@ -379,7 +380,9 @@ def test_what_an_environment_cannot_do_is_refused() -> None:
 
 def kerv(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env={**os.environ})
+    paths = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "KERV_PLUGINS": "examples.insertion", "PYTHONPATH": os.pathsep.join(paths)}
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env=environment)
 
 
 WORDS = ["policy=expert", "task=insert-peg", "episodes=2", "record=0", "world.stress.kind=push"]

@@ -1,25 +1,19 @@
-"""Prediction errors and the picture of curvature, from a calibration file to table, plot and page."""
+"""Prediction errors, from a calibration file to table, plot and page."""
 
 from __future__ import annotations
 
-import html
-import math
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
 from kerv_cli.artifacts import MadeFor
 from kerv_cli.decoding.calibration_file import Calibration, Demonstrations, save_calibration
-from kerv_cli.decoding.record import EpisodeRecord
 from kerv_cli.drafting.kinematics import FILTERS, Noise
 from kerv_cli.environments.metaworld.spec import SPEC
 from kerv_cli.errors import CheckpointError
 from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.reporting.curvature import RADII, radius_table
 from kerv_cli.reporting.prediction import (
     calibrated_targets,
     predicting_targets,
@@ -64,13 +58,11 @@ def calibrate(results: Path, name: str = "made-here") -> Path:
 
 
 def write_study(results: Path, name: str) -> None:
-    """One method fills what was rejected; two choose their proposer."""
+    """One method fills what was rejected."""
     settings = {"ar": settings_of("ar", episodes=1), "kerv": settings_of("kerv", 9, episodes=1)}
-    settings["wide"] = settings_of("kerv", 15, episodes=1)
     for s in settings.values():
         s.policy.target = "made-here"
     settings["kerv"].rectifier = part("rectifier", "compensate")
-    settings["kerv"].boundary, settings["wide"].boundary = part("boundary", "fused"), part("boundary", "always_drafter")
     cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar")
     store = StudyStore(results, name)
     for cell in cells:
@@ -146,78 +138,23 @@ def test_the_page_shows_what_its_methods_use(tmp_path: Path) -> None:
     write_study(tmp_path, "used")
     written = names(tmp_path, report(tmp_path, "used").files)
     assert {"report/tables/prediction_made-here.csv", "report/plots/prediction_made-here.png"} <= set(written)
-    assert {"report/tables/boundary_radius.csv", "report/plots/boundary_radius.png"} <= set(written)
     assert len(written) == len(set(written))
     page = (tmp_path / "studies/used/report.html").read_text(encoding="utf-8")
     assert "Prediction of the next actions, made-here" in page
     assert "0.0750 (25 %)" in page
-    assert "Synthetic arcs and lines" in page
     ids = [part.split('"')[0] for part in page.split(' id="')[1:]]
     assert len(ids) == len(set(ids))
     table = pd.read_csv(tmp_path / "report/tables/prediction_made-here.csv")
     assert list(table.columns[:6]) == ["target", "predictor", "task", "dof", "steps_ahead", "error"]
 
 
-def test_what_the_policy_itself_executed_is_predicted_too(tmp_path: Path) -> None:
-    """Its actions rise by 0.01 a step: a line is exact, holding is wrong by 0.01 a step."""
-    calibrate(tmp_path)
-    settings = {"kerv": settings_of("kerv", 9, episodes=2), "ar": settings_of("ar", episodes=2)}
-    for s in settings.values():
-        s.policy.target = "made-here"
-    settings["kerv"].rectifier = part("rectifier", "compensate")
-    cells = plan(settings, ["reach-v3"], IDENTITY, baseline="ar")
-    store = StudyStore(tmp_path, "own")
-    for cell in cells:
-        rising = [ramp(record) if cell.label == "ar" else record for record in run_cell(cell)]
-        store.write_cell(cell, rising, STATUS)
-    store.write_plan(StudySettings("own", "own", "ar"), cells)
-
-    written = names(tmp_path, report(tmp_path, "own").files)
-
-    assert {"report/tables/own_own_actions.csv", "report/plots/own_own_actions.png"} <= set(written)
-    table = pd.read_csv(tmp_path / "report/tables/own_own_actions.csv")
-    errors = table.set_index(["predictor", "task", "dof", "steps_ahead"])
-    assert set(table["task"]) == {"reach-v3"}
-    assert errors.loc[("hold", "reach-v3", "dx", 2), "error"] == pytest.approx(0.02, abs=1e-6)
-    assert errors.loc[("linear", "reach-v3", "dx", 2), "error"] == pytest.approx(0.0, abs=1e-6)
-    assert errors.loc[("hold", "reach-v3", "dz", 1), "labels_error"] == pytest.approx(0.1 * 3)
-    assert (table["run"] == "r1").all()
-    assert "the policy's own actions" in html.unescape((store.root / "report.html").read_text(encoding="utf-8"))
-
-
-def ramp(record: EpisodeRecord) -> EpisodeRecord:
-    """Rising actions in every DoF; the last chunk goes beyond its end, where the action is another."""
-    values = -0.9 + 0.01 * np.arange(record.steps + 4, dtype=np.float32)[:, None].repeat(4, axis=1)
-    values[record.steps - 2 :] = 1.0
-    chunks = (values[4 * i : 4 * i + 4] for i in range(len(record.decodes)))
-    decodes = tuple(replace(d, actions=chunk) for d, chunk in zip(record.decodes, chunks, strict=True))
-    return replace(record, decodes=decodes, steps=record.steps - 2)
-
-
 def test_without_a_study_every_calibration_is_reported(tmp_path: Path) -> None:
     calibrate(tmp_path)
     assert names(tmp_path, report(tmp_path).files) == [
-        f"{folder}/{name}.{kind}"
-        for name in ("prediction_made-here", "boundary_radius")
+        f"{folder}/prediction_made-here.{kind}"
         for folder, kind in (("report/tables", "csv"), ("report/plots", "png"), ("report/plots", "svg"))
-        if (name, kind) != ("boundary_radius", "svg")  # too large
     ]
 
 
 def names(results: Path, written: list[Path]) -> list[str]:
     return [path.relative_to(results).as_posix() for path in written]
-
-
-def test_the_drawn_radius_separates_arcs_from_lines_and_the_other_follows_speed() -> None:
-    table = radius_table()
-    arcs, lines = table[table["path"] == "arc"], table[table["path"] == "line"]
-    assert set(arcs["true_radius_m"]) == set(RADII)
-    assert (lines["true_radius_m"] == math.inf).all()
-    for _, same_speed in table.groupby("speed_m_per_step"):
-        # the slowest arc of 0.3 m is 28 mm long and 0.3 mm high: 0.1 mm of noise can pass it off as a line
-        bent = same_speed[same_speed["true_radius_m"] <= 0.2]["radius_m"]
-        assert bent.max() < same_speed[same_speed["path"] == "line"]["radius_m"].min()
-    assert (arcs["radius_m"] / arcs["true_radius_m"]).median() == pytest.approx(1.0, abs=0.01)
-    assert (table["pseudo_radius_m"] / table["speed_m_per_step"]).to_list() == pytest.approx(
-        [10.0] * len(table), rel=0.06
-    )

@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.decoding.acceptance import accept_by_distance
+from kerv_cli.decoding.proposers import rows_of
 from kerv_cli.drafting.tree import ROOT, TokenTree, merge, visible_in_prefill, visible_in_verification
+from kerv_cli.drafting.unread import ancestors
 from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 
@@ -158,3 +160,22 @@ def test_tree_forward_equals_forwarding_every_path_alone() -> None:
             alone = torch.cat([prefix, root, nodes[:, tree.path_to(node)]], 1)
             expected = trunk(alone, torch.arange(alone.shape[1]))[0, -1]
             assert torch.allclose(together[0, 1 + node], expected, atol=1e-5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), keep=st.integers(1, 4))
+def test_a_merged_trees_nodes_have_their_chains_rows(data: st.DataObject, keep: int) -> None:
+    chains = data.draw(st.lists(st.lists(st.integers(0, 2), min_size=1, max_size=5), min_size=1, max_size=4))
+    tree = merge(chains[:keep])
+    flat = [tuple(chain[: i + 1]) for chain in chains for i in range(len(chain))]
+    for node, row in enumerate(rows_of(tree, chains)):
+        assert flat[row] == tuple(tree.tokens[i] for i in tree.path_to(node))
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), n=st.integers(1, 12))
+def test_ancestors_of_tensors_are_those_of_the_tree(data: st.DataObject, n: int) -> None:
+    parents = [data.draw(st.integers(ROOT, i - 1)) for i in range(n)]
+    tree = TokenTree.build([0] * n, parents)
+    found = ancestors(torch.tensor(parents), max(tree.depths) + 1)
+    assert (found.numpy() == tree.ancestors()).all()

@@ -38,14 +38,13 @@ _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encode
 @dataclass(frozen=True)
 class Model:
     """What is measured. name: as asked for. target: a ReadableTarget. drafter: EAGLE-style, of the target's width.
-    observation: any, of the target's environment. is_shape: its weights are random. artifacts: a policy's."""
+    observation: any, of the target's environment. is_shape: its weights are random."""
 
     name: str
     target: Any
     drafter: Drafter
     observation: Observation
     is_shape: bool
-    artifacts: Artifacts | None = None
 
     @property
     def trunk_weights(self) -> int:
@@ -133,7 +132,7 @@ def open_model(settings: BenchSettings) -> Model:
             raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
         raise
     beside = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target)
-    return Model(settings.model, target, beside, blank(target), False, artifacts)
+    return Model(settings.model, target, beside, blank(target), False)
 
 
 def _policies(results: str) -> list[str]:

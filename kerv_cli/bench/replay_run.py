@@ -131,8 +131,6 @@ def replay(settings: BenchReplaySettings) -> Replay:
         UsageError: a number out of range, no such study, chunks shorter than N, too little memory for the shape.
         CheckpointError: a damaged cell or policy.
     """
-    if settings.decodes < 2:
-        raise UsageError(f"decodes={settings.decodes}: at least 2 of every setting")
     for name, figures in settings.projections.items():
         if len(figures) != 2 or min(figures) <= 0:
             raise UsageError(f"projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")

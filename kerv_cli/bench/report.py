@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.bench.ceilings import MethodCeiling
-from kerv_cli.bench.host import HostWork
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.phases import Phase
-from kerv_cli.bench.shares import DecodeShare
 
 
 def card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -50,41 +48,6 @@ def ceiling_rows(found: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str
             row = by_method.setdefault(ceiling.method, [])
             row += [ceiling.how, f"{ceiling.free:.2f}", f"{ceiling.drafted:.2f}"]
     return [(method, *row) for method, row in by_method.items()]
-
-
-def host_rows(work: Sequence[HostWork], here: float, projected: float) -> list[tuple[str, ...]]:
-    """One row per method. here, projected: seconds of one token of this target, and of the projected 7B."""
-    return [
-        (
-            own.method,
-            str(own.forwards),
-            f"{1e3 * own.seconds:.2f}",
-            f"{1e3 * own.per_round:.3f}",
-            f"{100 * own.per_round / here:.0f}",
-            f"{100 * own.per_round / projected:.0f}",
-        )
-        for own in work
-    ]
-
-
-HOST_COLUMNS = ("method", "forwards", "ms / decode", "ms / forward", "% of a token here", "% of a 7B's, projected")
-
-
-def share_rows(shares: Sequence[DecodeShare]) -> list[tuple[str, ...]]:
-    """One row per method: what a decode on this CPU consists of."""
-    return [
-        (
-            own.method,
-            f"{1e3 * own.seconds:.2f}",
-            f"{100 * own.products / own.seconds:.0f}",
-            f"{100 * (own.operations - own.products) / own.seconds:.0f}",
-            f"{100 * own.rest:.0f}",
-        )
-        for own in shares
-    ]
-
-
-SHARE_COLUMNS = ("method", "ms / decode", "products, attention %", "other operations %", "all but products %")
 
 
 def comparison_rows(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, ...]]:

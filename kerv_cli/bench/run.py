@@ -10,13 +10,10 @@ from typing import Any
 import torch
 
 from kerv_cli.bench.ceilings import MethodCeiling, ceilings
-from kerv_cli.bench.host import PROJECTED_BANDWIDTH, PROJECTED_SHAPE, HostWork, measure_host, projected_token
 from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
 from kerv_cli.bench.phases import Phase, Stage, costs, flipped, measure
 from kerv_cli.bench.profile import profile_of
-from kerv_cli.bench.shares import DecodeShare, measure_shares
-from kerv_cli.errors import UsageError
 from kerv_cli.places import results_dir
 from kerv_cli.provenance import stamp
 from kerv_cli.settings import BenchSettings
@@ -27,7 +24,7 @@ FLIP_CHUNKS = 8
 @dataclass(frozen=True)
 class Bench:
     """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N. ties: flipped
-    tokens, and compared ones. host: of every method at the largest N. shares: of a policy on a CPU."""
+    tokens, and compared ones."""
 
     model: Model
     machine: Machine
@@ -36,18 +33,11 @@ class Bench:
     phases: list[Phase]
     ceilings: dict[int, list[MethodCeiling]]
     ties: tuple[int, int]
-    host: list[HostWork]
-    shares: list[DecodeShare]
 
     @property
     def dtype(self) -> str:
         """Number format of the trunk."""
         return str(self.model.dtype).removeprefix("torch.")
-
-    @property
-    def token(self) -> float:
-        """Seconds of one token, median."""
-        return next(phase.seconds for phase in self.phases if phase.kind == "verify" and phase.rows == 1)
 
     @property
     def title(self) -> str:
@@ -70,27 +60,8 @@ class Bench:
             "phases": [phase.as_dict() for phase in self.phases],
             "ceilings": {str(n): [asdict(c) for c in found] for n, found in self.ceilings.items()},
             "ties": {"flipped": self.ties[0], "compared": self.ties[1]},
-            "host": {
-                "token_here": self.token,
-                "token_projected": projected_token(),
-                "projection": f"{PROJECTED_SHAPE}, bfloat16, {PROJECTED_BANDWIDTH / 1e9:.0f} GB/s",
-                "methods": [{**asdict(work), "per_round": work.per_round} for work in self.host],
-            },
-            "shares": [{**asdict(share), "rest": share.rest} for share in self.shares],
             "profile": profile_of(int(self.card["prompt"]), self.phases).as_dict(),
         }
-
-
-def check(settings: BenchSettings) -> None:
-    """Refuses numbers that cannot be measured.
-
-    Raises:
-        UsageError: the first of them.
-    """
-    if settings.repeats < 3:
-        raise UsageError(f"repeats={settings.repeats}: at least 3, medians are over them")
-    if not settings.tokens or min(settings.tokens) < 3 or max(settings.tokens) > 256:
-        raise UsageError(f"tokens={settings.tokens}: chunks of 3 to 256 tokens, e.g. tokens=[7,16]")
 
 
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
@@ -116,8 +87,7 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
 
 
 def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, float], float]:
-    """The model, its machine, the card and the seconds that opening took. Errors as `open_model` and `check`."""
-    check(settings)
+    """The model, its machine, the card and the seconds that opening took. Errors as `open_model`."""
     began = time.perf_counter()
     model = open_model(settings)
     synchronise(model.target.device)
@@ -140,9 +110,7 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
     found = {n: ceilings(profile, n) for n in settings.tokens}
     card = card_of(model, machine, max(settings.tokens))
     ties = flipped(model, FLIP_CHUNKS, max(settings.tokens))
-    host = measure_host(model.target.device, max(settings.tokens), settings.repeats)
-    shares = measure_shares(model, settings.repeats)
-    return Bench(model, machine, card, cold, phases, found, ties, host, shares)
+    return Bench(model, machine, card, cold, phases, found, ties)
 
 
 def place_of(results: str, model: str, dtype: str, kind: str) -> Path:

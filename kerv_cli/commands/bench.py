@@ -62,12 +62,6 @@ def _measure(settings: BenchSettings, as_json: bool) -> None:
     print_table(("method", *columns), report.ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
     flipped, compared = done.ties
     typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
-    from kerv_cli.bench.host import PROJECTED_BANDWIDTH, projected_token
-
-    about = f"host work at N = {max(settings.tokens)}; 7B: weights at {PROJECTED_BANDWIDTH / 1e12} TB/s, a projection"
-    print_table(report.HOST_COLUMNS, report.host_rows(done.host, done.token, projected_token()), about)
-    if done.shares:
-        print_table(report.SHARE_COLUMNS, report.share_rows(done.shares), "what a decode of this policy consists of")
     document, path = done.document(), place_of(settings.results, model.name, done.dtype, ".json")
     write_json(path, document)
     report.plot_roofline(path.with_suffix(".png"), done.title, done.machine, done.phases)

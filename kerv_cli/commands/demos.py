@@ -56,7 +56,6 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
         horizon=settings.world.horizon,
         policy=actor.sha256 if actor else "",
         expert_share=settings.expert_share if actor else 0.0,
-        ways=tuple(settings.ways),
     )
     try:
         with progress_bar("demonstrations") as advance:

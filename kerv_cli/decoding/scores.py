@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -37,34 +36,35 @@ class Score(Protocol):
         """The score; −inf where it cannot be told."""
 
 
-class Odds:
-    """Log of the early drafter's estimate that the whole draft is accepted."""
+class _OfEarly:
+    """Reads the method's own early drafter where it has one, so that nothing is drafted twice."""
 
-    def __init__(self, early: EarlyProposer) -> None:
-        self.early = early
+    def __init__(self, settings: Any, context: Context) -> None:
+        draft = context.built.get("prefill_draft")
+        of_merged = draft.sources if isinstance(draft, MergedProposer) else [draft]
+        own = [source for source in of_merged if isinstance(source, EarlyProposer)]
+        self.early = own[0] if own else EarlyProposer(context.artifact("early"), context.target)
+
+
+class Odds(_OfEarly):
+    """score=odds: log of the early drafter's estimate that the whole draft is accepted."""
 
     def of(self, draft: Draft) -> float:
         """As `Score.of`; nats, at most 0."""
         return math.log(max(self.early.drafted(draft.chunk).odds, LEAST_ODDS))
 
 
-class Entropy:
-    """Negative mean entropy of the early drafter's tokens, nats."""
-
-    def __init__(self, early: EarlyProposer) -> None:
-        self.early = early
+class Entropy(_OfEarly):
+    """score=entropy: negative mean entropy of the early drafter's tokens, nats."""
 
     def of(self, draft: Draft) -> float:
         """As `Score.of`."""
         return -self.early.drafted(draft.chunk).entropy
 
 
-class Familiarity:
-    """Negative mean square of the early drafter's standardised features: how far the observation is from what the
-    drafter was trained on, in standard deviations. It does not look at the draft."""
-
-    def __init__(self, early: EarlyProposer) -> None:
-        self.early = early
+class Familiarity(_OfEarly):
+    """score=familiarity: negative mean square of the early drafter's standardised features, how far the observation is
+    from what the drafter was trained on, in standard deviations. It does not look at the draft."""
 
     def of(self, draft: Draft) -> float:
         """As `Score.of`."""
@@ -91,10 +91,10 @@ class Agreement:
 
 
 class Similarity:
-    """Cosine of the best stored observation (HeiSD's score)."""
+    """score=similarity: cosine of the best stored observation (HeiSD's score)."""
 
-    def __init__(self, retrieval: RetrievalProposer) -> None:
-        self.retrieval = retrieval
+    def __init__(self, settings: Any, context: Context) -> None:
+        self.retrieval = _retrieval(context)
 
     def of(self, draft: Draft) -> float:
         """As `Score.of`."""
@@ -102,9 +102,12 @@ class Similarity:
 
 
 class Steadiness:
-    """Negative kinematic variability of the draft itself: its mean absolute change from action to action, the last
-    executed one included, over the moving DoFs; normalised action units. KERV's and HeiSD's premise is that steady
-    motion is predictable."""
+    """score=steadiness: negative kinematic variability of the draft itself, its mean absolute change from action to
+    action, the last executed one included, over the moving DoFs; normalised action units. KERV's and HeiSD's premise is
+    that steady motion is predictable."""
+
+    def __init__(self, settings: Any, context: Context) -> None:
+        """Reads nothing but the draft."""
 
     def of(self, draft: Draft) -> float:
         """As `Score.of`."""
@@ -117,35 +120,18 @@ class Steadiness:
 
 
 class Learned:
-    """Negative loss that a small network expects, from the pooled prompt and other scores (`kerv train score`)."""
+    """score=learned: negative loss that a small network expects, from the pooled prompt and other scores (`kerv train
+    score`)."""
 
-    def __init__(self, model: LearnedScore, target: ReadableTarget, inputs: Sequence[Score]) -> None:
-        self.model, self.target, self.inputs = model, target, inputs
+    def __init__(self, settings: Any, context: Context) -> None:
+        self.model: LearnedScore = context.artifact("score")
+        self.target: ReadableTarget = context.target
+        self.inputs = [find("score", name).built(NoSettings(name), context) for name in self.model.inputs]
 
     def of(self, draft: Draft) -> float:
         """As `Score.of`."""
         known = [score.of(draft) for score in self.inputs]
         return -self.model.expected_loss(self.target.pooled(draft.chunk.prompt), known)
-
-
-def odds(settings: Any, context: Context) -> Score:
-    """score=odds."""
-    return Odds(_early(context))
-
-
-def entropy(settings: Any, context: Context) -> Score:
-    """score=entropy."""
-    return Entropy(_early(context))
-
-
-def familiarity(settings: Any, context: Context) -> Score:
-    """score=familiarity."""
-    return Familiarity(_early(context))
-
-
-def steadiness(settings: Any, context: Context) -> Score:
-    """score=steadiness."""
-    return Steadiness()
 
 
 def agreement_hold(settings: Any, context: Context) -> Score:
@@ -155,25 +141,8 @@ def agreement_hold(settings: Any, context: Context) -> Score:
 
 def agreement_retrieval(settings: Any, context: Context) -> Score:
     """score=agreement_retrieval."""
-    return Agreement(RetrievalProposer(context.artifact("datastore"), context.target, 1, 1))
+    return Agreement(_retrieval(context))
 
 
-def similarity(settings: Any, context: Context) -> Score:
-    """score=similarity."""
-    return Similarity(RetrievalProposer(context.artifact("datastore"), context.target, 1, 1))
-
-
-def learned(settings: Any, context: Context) -> Score:
-    """score=learned."""
-    model: LearnedScore = context.artifact("score")
-    return Learned(
-        model, context.target, [find("score", name).built(NoSettings(name), context) for name in model.inputs]
-    )
-
-
-def _early(context: Context) -> EarlyProposer:
-    """The method's own early drafter where it has one, so that nothing is drafted twice."""
-    draft = context.built.get("prefill_draft")
-    of_merged = draft.sources if isinstance(draft, MergedProposer) else [draft]
-    own = [source for source in of_merged if isinstance(source, EarlyProposer)]
-    return own[0] if own else EarlyProposer(context.artifact("early"), context.target)
+def _retrieval(context: Context) -> RetrievalProposer:
+    return RetrievalProposer(context.artifact("datastore"), context.target, 1, 1)

@@ -142,14 +142,6 @@ def draft_tree(
     return _keep_best(*found, nodes, depth)
 
 
-def grow_tree(
-    drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
-) -> TokenTree:
-    """As `draft_tree`, read at once."""
-    found = draft_tree(drafter, target, state, depth, top_k, nodes)
-    return found if isinstance(found, TokenTree) else found.now()
-
-
 def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> Tensor:
     """The greedy draft tokens (depth,) on the device, without the bookkeeping of a tree."""
     base = state.cache.length

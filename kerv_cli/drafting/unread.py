@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from kerv_cli.drafting.tree import TokenTree
-from kerv_cli.targets.transfer import read
 
 Placed = tuple[TokenTree, Sequence[int]]
 """A draft that was read, and the row of each of its nodes."""
@@ -61,10 +60,6 @@ class Unread:
         seen = torch.ones(before + n, before + n, dtype=torch.bool, device=self.tokens.device).tril_()
         seen[before:, before:] = self.visible
         return seen.numpy() if seen.device.type == "cpu" else seen
-
-    def now(self) -> TokenTree:
-        """The tree, read at once."""
-        return self.placed(*read(self.numbers))[0]
 
 
 def chain_of(tokens: np.ndarray) -> Placed:

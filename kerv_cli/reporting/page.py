@@ -27,7 +27,7 @@ LOSS = 3.0
 
 @dataclass(frozen=True)
 class Section:
-    """An extra section of the page: prediction errors, curvature."""
+    """An extra section of the page: prediction errors, latency, stress."""
 
     title: str
     note: str

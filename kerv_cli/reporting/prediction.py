@@ -84,11 +84,11 @@ def prediction_table(predictions: Predictions) -> pd.DataFrame:
         "demos_sha256": calibration.demos.sha256,
         "git_commit": calibration.provenance.get("git_commit", ""),
     }
-    return pd.DataFrame(error_rows(predictions.target, errors, calibration.demos.tasks)).assign(**origin)
+    return pd.DataFrame(_rows(predictions.target, errors, calibration.demos.tasks)).assign(**origin)
 
 
-def error_rows(target: str, errors: Errors, episodes: Mapping[str, Mapping[str, int]]) -> list[dict[str, Any]]:
-    """Errors as rows. episodes: task -> how many were held_out and how many training."""
+def _rows(target: str, errors: Errors, episodes: Mapping[str, Mapping[str, int]]) -> list[dict[str, Any]]:
+    """episodes: task -> how many were held_out and how many training."""
     rows = []
     for predictor, tasks in errors.items():
         for task, dofs in tasks.items():
@@ -135,9 +135,8 @@ def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows.values())
 
 
-def prediction_figure(title: str, table: pd.DataFrame, of: str = "held-out episodes") -> Figure:
-    """Error against steps ahead, one line per predictor, and every task's error one step ahead. of: the episodes that
-    were predicted."""
+def prediction_figure(title: str, table: pd.DataFrame) -> Figure:
+    """Error against steps ahead, one line per predictor, and every task's error one step ahead."""
     means = predicted_means(table)
     predictors, tasks = list(dict.fromkeys(means["predictor"])), list(dict.fromkeys(means["task"]))
     with mpl.rc_context(STYLE):
@@ -149,7 +148,7 @@ def prediction_figure(title: str, table: pd.DataFrame, of: str = "held-out episo
         handles, labels = ahead.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
         held_out = table.drop_duplicates("task")["held_out_episodes"].sum()
-        about = f"mean of {', '.join(predicted_dofs(table))} · {len(tasks)} tasks, {held_out:.0f} {of}"
+        about = f"mean of {', '.join(predicted_dofs(table))} · {len(tasks)} tasks, {held_out:.0f} held-out episodes"
         about += f" · from the last {table['window'][0]} steps"
         entitle(figure, title, about)
     return figure

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -14,11 +12,9 @@ from kerv_cli.errors import UsageError
 from kerv_cli.files import atomic_path
 from kerv_cli.reporting import prediction
 from kerv_cli.reporting.agreement import agreement_table
-from kerv_cli.reporting.curvature import radius_figure, radius_table
 from kerv_cli.reporting.drawing import save_plot
 from kerv_cli.reporting.latency import latency_figure, latency_summary, latency_table
 from kerv_cli.reporting.measures import MICRO
-from kerv_cli.reporting.own_actions import own_errors
 from kerv_cli.reporting.page import Section, render
 from kerv_cli.reporting.plots import about, study_figures
 from kerv_cli.reporting.publish import check_publishable
@@ -42,9 +38,8 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
 
     In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
     plots/<study>*.png and, where small, .svg. Always studies/<study>/report.html. Tables and plots of
-    prediction_<target> are added for a study whose methods predict actions, and of boundary_radius for one that
-    compares boundaries; with `against`, the results folder of another run of the study, tables/<study>_agreement.csv.
-    The same cells give the same bytes.
+    prediction_<target> are added for a study whose methods predict actions; with `against`, the results folder of
+    another run of the study, tables/<study>_agreement.csv. The same cells give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
@@ -68,7 +63,6 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
         reporter.report_study(name)
     for target in calibrated:
         reporter.prediction_section(target)
-    reporter.curvature_section()
     return reporter.report
 
 
@@ -99,10 +93,7 @@ class _Reporter:
         drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
         sections = [self.latency_section(data), self.stress_section(whole, name)]
-        for target in prediction.predicting_targets(settings):
-            sections += [self.prediction_section(target), self.own_actions_section(store, data, target)]
-        if _varies_boundary(settings):
-            sections.append(self.curvature_section())
+        sections += [self.prediction_section(target) for target in prediction.predicting_targets(settings)]
         page = store.root / "report.html"
         written = self.report.files[before:]
         with atomic_path(page) as temporary:
@@ -138,21 +129,6 @@ class _Reporter:
             table=prediction.prediction_summary(table),
         )
 
-    def own_actions_section(self, store: StudyStore, data: StudyData, target: str) -> Section | None:
-        """Writes the prediction errors on what the study's autoregressive episodes executed; None without any."""
-        found = prediction.read_predictions(self.results, target)
-        table = own_errors(store, data, found) if found is not None else None
-        if found is None or table is None:
-            return None
-        name, title = f"{store.name}_own_actions", f"Prediction of the policy's own actions, {target}"
-        self._save_table(table, name)
-        return Section(
-            title=title,
-            note=f"As above, on what the autoregressive episodes of this study executed: tables/{name}.csv.",
-            figure=self._save_plot(prediction.prediction_figure(title, table, "episodes of the policy"), name),
-            table=prediction.prediction_summary(table),
-        )
-
     def latency_section(self, data: StudyData) -> Section | None:
         """Writes success at the latencies of a study whose world goes on; None where it waits."""
         table = latency_table(data)
@@ -180,20 +156,6 @@ class _Reporter:
         note = f"Points against the baseline under the same stresses, same episodes: tables/{name}.csv."
         return Section(title, note, self._save_plot(figure, name))
 
-    def curvature_section(self) -> Section:
-        """Writes table and plot of the boundary's radius on known paths, ours and the public code's."""
-        name = "boundary_radius"
-        section = self._sections.get(name)
-        if section is None:
-            table = radius_table()
-            self._save_table(table, name)
-            section = self._sections[name] = Section(
-                title="Radius of curvature",
-                note="Synthetic arcs and lines. The public code's “radius” is a constant times the speed.",
-                figure=self._save_plot(radius_figure(table), name),
-            )
-        return section
-
     def _save_table(self, table: pd.DataFrame, name: str) -> None:
         self.report.files.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
 
@@ -212,8 +174,3 @@ def _prediction_note(predictions: prediction.Predictions, table: pd.DataFrame) -
         f"Calibration {predictions.sha256[:12]}, predicted from the last {predictions.calibration.window} steps; "
         f"per task and DoF: tables/{predictions.name}.csv."
     )
-
-
-def _varies_boundary(settings: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether the study compares boundaries; `always` stands for none."""
-    return len({str(s["boundary"]) for s in settings if s["boundary"]["kind"] != "always"}) > 1

@@ -57,14 +57,6 @@ def episode_windows(
     check_tail(episode, horizon, f"predictions of {horizon} steps")
     labels = actions.normalise(episode.labels)
     source = labels[:steps] if history == "labels" else actions.normalise(episode.executed)
-    return windows_of(source, labels, window, horizon, steps)
-
-
-def windows_of(
-    source: np.ndarray, labels: np.ndarray, window: int, horizon: int, steps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """(past (n, window, D), future (n, horizon, D)) of the moments window … steps − 1 of an episode: the past is from
-    `source` (≥ steps, D), the future from `labels` (≥ steps + horizon − 1, D)."""
     if steps <= window:
         dofs = source.shape[1]
         return np.zeros((0, window, dofs)), np.zeros((0, horizon, dofs))

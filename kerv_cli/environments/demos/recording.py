@@ -26,10 +26,10 @@ from kerv_cli.environments.camera import CameraConfig, choose_backend
 from kerv_cli.environments.demos.dataset import FORMAT, DemoManifest, dataset_hash, episode_path, with_environment
 from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.environments.demos.ways import Detour, check_ways, way_of
 from kerv_cli.environments.spec import EnvironmentSpec, Expert, World
 from kerv_cli.errors import CheckpointError, KervError, UsageError
 from kerv_cli.files import read_json, sha256_of, write_json
+from kerv_cli.limits import check_settings, limits, number
 from kerv_cli.manifests import read
 from kerv_cli.spaces import Observation
 
@@ -57,46 +57,34 @@ class DemoConfig:
         horizon: control steps within which the expert must succeed; 0: the environment's.
         policy: hash of the actor's weights; empty: the expert acts.
         expert_share: probability that the expert acts for one of the actor's chunks.
-        ways: names of `ways.WAYS`, one of which every episode takes; none: the scripted expert as it is.
     """
 
     tasks: tuple[str, ...]
-    episodes: int
+    episodes: int = field(metadata=limits(1))
     first_seed: int = 0
-    perturbed: float = 0.5
-    noise_low: float = 0.2
-    noise_high: float = 0.6
-    burst_probability: float = 0.02
+    perturbed: float = number(0.5, 0, 1)
+    noise_low: float = number(0.2, 0)
+    noise_high: float = number(0.6, 0)
+    burst_probability: float = number(0.02, 0, 1)
     camera: CameraConfig = field(default_factory=CameraConfig)
-    frame_stride: int = 1
-    tail: int = 8
-    workers: int = 2
+    frame_stride: int = number(1, 1)
+    tail: int = number(8, 0)
+    workers: int = number(2, 1)
     horizon: int = 0
     policy: str = ""
-    expert_share: float = 0.0
-    ways: tuple[str, ...] = ()
+    expert_share: float = number(0.0, 0, 1)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
         object.__setattr__(self, "camera", self.spec.camera(self.camera))
         object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon))
-        most = self.spec.horizon
-        checks = {
-            f"episodes must be 1 or more, not {self.episodes}": self.episodes >= 1,
-            f"perturbed must lie between 0 and 1, not {self.perturbed}": 0.0 <= self.perturbed <= 1.0,
-            "noise must satisfy 0 <= noise_low <= noise_high": 0.0 <= self.noise_low <= self.noise_high,
-            "burst_probability must lie between 0 and 1": 0.0 <= self.burst_probability <= 1.0,
-            f"frame_stride must be 1 or more, not {self.frame_stride}": self.frame_stride >= 1,
-            f"tail must lie between 0 and {most - 1}, not {self.tail}": 0 <= self.tail < most,
-            f"workers must be 1 or more, not {self.workers}": self.workers >= 1,
-            f"expert_share must lie between 0 and 1, not {self.expert_share}": 0.0 <= self.expert_share <= 1.0,
-        }
-        wrong = [message for message, holds in checks.items() if not holds]
-        if wrong:
-            raise UsageError(f"demonstrations: {wrong[0]}")
+        check_settings(self, "demonstrations")
+        if self.noise_low > self.noise_high:
+            raise UsageError("demonstrations: noise must satisfy noise_low <= noise_high")
+        if self.tail >= self.spec.horizon:
+            raise UsageError(f"demonstrations: tail={self.tail}: an episode has {self.spec.horizon} control steps")
         ends = self.first_seed, self.first_seed + self.episodes - 1
         self.spec.seeds.check(ends, "training", "demonstrations")
-        check_ways(self.ways, self.spec)
 
     @property
     def spec(self) -> EnvironmentSpec:
@@ -146,8 +134,6 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None 
     """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
     late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
     expert = world.spec.expert(world.task)
-    if config.ways:
-        expert = Detour(expert, world.spec, way_of(world.task, seed, config.ways))
     mover: Actor = actor or NoisyExpert(config)
     observation = world.reset(seed)
     mover.reset(world, seed)
@@ -271,8 +257,6 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
     del settings["workers"]
     if not config.policy:
         del settings["policy"], settings["expert_share"]  # as recordings without an actor always were
-    if not config.ways:
-        del settings["ways"]  # as in recordings from before there were ways, which go on
     spec = config.spec
     versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
     identity = {

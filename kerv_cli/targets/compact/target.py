@@ -33,7 +33,7 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.packed import Packable, PackedPrompt, load_packed, pack
+from kerv_cli.targets.compact.packed import Packable, PackedPrompt, load_packed
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
@@ -162,10 +162,6 @@ class CompactTarget(Packable):
     def dtype(self) -> torch.dtype:
         """Number format of the weights."""
         return self.head.weight.dtype
-
-    def pack(self) -> None:
-        """Prepares for inference, see `packed.pack`."""
-        pack(self)
 
     def pack_weights(self) -> PackedPrompt | None:
         """As `Packable.pack_weights`; None for a state policy and in other number formats than float32."""

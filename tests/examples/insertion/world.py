@@ -13,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.insertion.pose import (
+from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.environments.world import MujocoWorld
+
+from .pose import (
     GRASP,
     PEG_HALF,
     Pose,
@@ -24,8 +27,6 @@ from kerv_cli.environments.insertion.pose import (
     quaternion_of,
     turn_between,
 )
-from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.environments.world import MujocoWorld
 
 INSERTED = 0.03
 """Metres that the tip must be below the mouth."""
@@ -95,7 +96,7 @@ class InsertionWorld(MujocoWorld):
         return Pose(self._data.mocap_pos[0].copy(), self._data.mocap_quat[0].copy())
 
     def _state(self) -> NDArray[np.float64]:
-        """The privileged state (19,), laid out as in `spec.py`."""
+        """The privileged state (19,), laid out as in the spec."""
         hand, peg, slot = self._hand, self._peg, self._slot
         felt = [hand.position, hand.vector, [self._opening]]
         return np.concatenate([*felt, peg.position, slot.position, slot.vector, peg.vector])

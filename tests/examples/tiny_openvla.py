@@ -1,7 +1,7 @@
 """A tiny random checkpoint in exactly the published layout: names, files, tokenizer, statistics. For tests and for a
 first look without 15 GB:
 
-    python -m kerv_cli.targets.openvla.tiny DIR
+    PYTHONPATH=tests python -m examples.tiny_openvla DIR
     kerv build target target=openvla checkpoint=DIR
 """
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.insertion.pose import GRASP, PEG_HALF, Pose, limited, misfit, turn_between
 from kerv_cli.environments.spec import EnvironmentSpec
 from kerv_cli.spaces import Observation
+
+from .pose import GRASP, PEG_HALF, Pose, limited, misfit, turn_between
 
 HOVER = 0.03
 """Metres above the slot's mouth or the grasp at which the hand waits until it is aligned."""

@@ -1,13 +1,15 @@
 """Insertion: a free-flying gripper with OpenVLA's seven degrees of freedom, and a flat peg that fits a slot one way
 only.
 
-It is a small second environment beside Meta-World, with other spaces and with tasks that need rotation.
+A simulator of one's own beside Meta-World, with other spaces and with tasks that need rotation.
+`KERV_PLUGINS=examples.insertion kerv rollout task=INSERTION policy=expert` runs it; the folder above this one must be
+importable.
 """
 
 from __future__ import annotations
 
-from kerv_cli.environments.insertion.tasks import DIFFICULTIES, SUITES, TASKS
-from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.environments.spec import EnvironmentSpec, Task
+from kerv_cli.registry import Part, register
 from kerv_cli.spaces import ActionSpace, Group, ObservationSpace, Place
 
 SPEC = EnvironmentSpec(
@@ -30,13 +32,17 @@ SPEC = EnvironmentSpec(
         centre=(0.0, 0.0, 0.12),
         extra=tuple(range(13, 19)),
     ),
-    tasks=TASKS,
-    suites=SUITES,
-    difficulties=DIFFICULTIES,
+    tasks={
+        "insert-peg": Task("insert-peg", "turn the peg and push it into the tilted slot", "easy"),
+        "fetch-peg": Task("fetch-peg", "pick up the peg and put it into the slot", "hard"),
+    },
+    suites={"INSERTION": ("insert-peg", "fetch-peg")},
+    difficulties=("easy", "hard"),
     horizon=120,
     cameras=("front", "top", "wrist"),
-    world_class="kerv_cli.environments.insertion.world:InsertionWorld",
-    expert_class="kerv_cli.environments.insertion.expert:InsertionExpert",
+    world_class=f"{__name__}.world:InsertionWorld",
+    expert_class=f"{__name__}.expert:InsertionExpert",
     packages=("mujoco",),
     grip=(0.0, 1.0),
 )
+register(Part("environment", SPEC.name, f"{__name__}:SPEC"))
