@@ -1,5 +1,5 @@
 """`python -m kerv_cli` is `kerv`."""
 
-from kerv_cli.app import main
+from kerv_cli.cli.app import main
 
 main()

@@ -16,10 +16,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-from kerv_cli.decoding.record import Round
-from kerv_cli.reporting.drawing import INK, MUTED, STYLE, figure_bytes, new_figure
-from kerv_cli.studies.store import StudyStore
-from kerv_cli.viewing.token_outcomes import OUTCOMES, TokenOutcome, round_outcomes
+from kerv_cli.engine.record import Round
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.drawing import INK, MUTED, STYLE, figure_bytes, new_figure
+from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, round_outcomes
 
 DOFS = ("dx", "dy", "dz", "grip")  # Meta-World's
 

@@ -61,7 +61,7 @@ step() {
 
 skip() { printf '%s\tskipped: %s\n' "$1" "$2" | tee -a "$OUT/steps.tsv"; }
 
-kerv() { local name=$1 most=$2; shift 2; step "$name" "$most" "$PYTHON" -m kerv_cli.app "$@" "results=$OUT" "runtime.device=$DEVICE"; }
+kerv() { local name=$1 most=$2; shift 2; step "$name" "$most" "$PYTHON" -m kerv_cli.cli.app "$@" "results=$OUT" "runtime.device=$DEVICE"; }
 
 missing=$("$PYTHON" - <<'PY'
 import importlib.util as found

@@ -35,7 +35,7 @@ from torture_cases import PLANNED, TASK, damage, wrong_request  # noqa: E402
 from torture_runs import Ended, Kill, learn, load, names_below, run, warm  # noqa: E402
 from torture_states import state  # noqa: E402
 
-from kerv_cli.config import conf_dir  # noqa: E402
+from kerv_cli.base.config import conf_dir  # noqa: E402
 
 LONGEST = 10.0  # seconds of CPU that a wrong request or a damaged file may take
 HANGS = 300.0  # seconds after which a command that waits for something is ended; a busy machine is slow, too

@@ -104,7 +104,7 @@ def _be_command(words: list[str], output: int, kill_at: int, log: Path | None) -
     writes = _count_writes(kill_at)
     code: object = 0
     try:
-        from kerv_cli.app import app
+        from kerv_cli.cli.app import app
 
         app(words)
     except SystemExit as error:
@@ -144,9 +144,9 @@ def load() -> None:
     """Imports and computes what every command needs, so that forks need not."""
     import torch
 
-    from kerv_cli.environments.camera import choose_backend
-    from kerv_cli.provenance import stamp
-    from kerv_cli.studies.code import code_hash
+    from kerv_cli.base.provenance import stamp
+    from kerv_cli.lab.code import code_hash
+    from kerv_cli.worlds.camera import choose_backend
 
     torch.set_num_threads(1)
     choose_backend()
@@ -168,8 +168,8 @@ def learn(log: Path) -> int:
 
 def warm(task: str) -> None:
     """Draws the task's placements of the first seeds of training and evaluation, and parses a grid."""
-    from kerv_cli.config import expand
-    from kerv_cli.environments import spec_of
+    from kerv_cli.base.config import expand
+    from kerv_cli.worlds import spec_of
 
     expand("threshold.r=1,2 world.horizon=range(1,3) task=[a,b] a.b={c:1}")
     with spec_of(task).open_world(task) as world:

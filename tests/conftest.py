@@ -9,7 +9,7 @@ from pathlib import Path
 import examples.insertion  # noqa: F401 - registers the environment with seven degrees of freedom
 import pytest
 
-from kerv_cli import registry
+from kerv_cli.base import registry
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -33,13 +33,13 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     """A nano target and its drafter below `results`, as `kerv train` leaves them."""
     import torch
 
-    from kerv_cli.config import compose
-    from kerv_cli.drafting.eagle import Drafter, save_drafter
-    from kerv_cli.environments.metaworld.spec import SPEC
-    from kerv_cli.settings import DrafterSettings, TrainTargetSettings
+    from kerv_cli.base.config import compose
+    from kerv_cli.base.settings import DrafterSettings, TrainTargetSettings
+    from kerv_cli.methods.eagle import Drafter, save_drafter
     from kerv_cli.targets.checkpoint import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
+    from kerv_cli.worlds.metaworld.spec import SPEC
 
     torch.manual_seed(seed)
     settings = compose("train_target", ["target=nano", f"target.observation={observation}"], TrainTargetSettings)

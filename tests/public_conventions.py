@@ -20,8 +20,8 @@ from test_openvla import imported, loaded, shown
 from test_public_drafter import LANGUAGE, PATCHES, with_convention
 from torch import Tensor
 
-from kerv_cli.drafting.public import MASKS, POSITIONS, Convention, PublicDrafter, PublicShape
-from kerv_cli.settings import DrafterSettings
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.methods.public import MASKS, POSITIONS, Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.openvla.target import OpenVLATarget
 from kerv_cli.training.distillation import Distillation, TeacherStates, acceptance_length, greedy
 

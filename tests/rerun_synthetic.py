@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kerv_cli.decoding.record import PHASES, DecodeRecord, EpisodeRecord, Round
-from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 DOFS = 4
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.environments import settled
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.registry import find
-from kerv_cli.settings import RolloutSettings, StudySettings
-from kerv_cli.studies.block import Prepare, RunEpisode
-from kerv_cli.studies.plan import Cell, plan
+from kerv_cli.base.registry import find
+from kerv_cli.base.settings import RolloutSettings, StudySettings
+from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.lab.block import Prepare, RunEpisode
+from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.worlds import settled
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 TOKENS = 16
 IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}

@@ -16,15 +16,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, random_prompt, random_target
 
-from kerv_cli.decoding.acceptance import Acceptance
-from kerv_cli.decoding.chunk import Chunk
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import Stateless
-from kerv_cli.decoding.thresholds import Fixed
-from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.spaces import ActionSpace, Observation
-from kerv_cli.targets.protocol import Target
+from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.acceptance import Acceptance
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.proposers import Stateless
+from kerv_cli.methods.thresholds import Fixed
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 GROUP_LIMIT, TOKEN_LIMIT = 12, 7
 

@@ -13,23 +13,23 @@ from typing import Any
 import pytest
 from test_calibration import TASKS, write_dataset
 
-from kerv_cli.artifacts import Artifacts, MadeFor
-from kerv_cli.config import compose
-from kerv_cli.decoding.risk_file import RiskManifest, save_risk
-from kerv_cli.drafting.datastore import Datastore
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.early import EarlyDrafter, save_early
-from kerv_cli.drafting.learned_score import LearnedScore, save_score
-from kerv_cli.errors import CheckpointError, UnknownName
-from kerv_cli.parts import QdrantSearchSettings
-from kerv_cli.rollouts.policy import check, decoder_for, identity_of, unseen_tasks
-from kerv_cli.settings import (
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.settings import (
     BuildDatastoreSettings,
     CalibrateSettings,
     DrafterSettings,
     PolicySettings,
     RolloutSettings,
 )
+from kerv_cli.lab.policy import check, decoder_for, identity_of, unseen_tasks
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.datastore import Datastore
+from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.early import EarlyDrafter, save_early
+from kerv_cli.methods.learned_score import LearnedScore, save_score
+from kerv_cli.methods.parts import QdrantSearchSettings
+from kerv_cli.methods.risk_file import RiskManifest, save_risk
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild

@@ -21,31 +21,31 @@ from test_episode import settings
 from test_parallel import some_observation, target
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
+from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.settings import DrafterSettings, RuntimeSettings
+from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.sequences import read_study
-from kerv_cli.decoding.batched import BatchDecoder, Lane
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import EarlyProposer
-from kerv_cli.decoding.record import UNTIMED, EpisodeRecord
-from kerv_cli.decoding.thresholds import Fixed
-from kerv_cli.decoding.verify_skip import AlwaysSkip, ParallelPass
-from kerv_cli.drafting.early import EarlyDrafter
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import KervError, UsageError
-from kerv_cli.reporting.plots import study_figures
-from kerv_cli.reporting.summary import summary_frame
-from kerv_cli.reporting.tables import load_study, study_table
-from kerv_cli.rollouts import policy as policies_of
-from kerv_cli.rollouts import run
-from kerv_cli.rollouts.cells import CellRunner
-from kerv_cli.rollouts.together import Wanted, run_together
-from kerv_cli.settings import DrafterSettings, RuntimeSettings
-from kerv_cli.spaces import Observation
-from kerv_cli.studies.block import RunEpisode
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Cell, blocks_of, make_cell
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.cli.app import app
+from kerv_cli.engine.batched import BatchDecoder, Lane
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.record import UNTIMED, EpisodeRecord
+from kerv_cli.lab import policy as policies_of
+from kerv_cli.lab import run
+from kerv_cli.lab.block import RunEpisode
+from kerv_cli.lab.cells import CellRunner
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.plan import Cell, blocks_of, make_cell
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.together import Wanted, run_together
+from kerv_cli.methods.early import EarlyDrafter
+from kerv_cli.methods.proposers import EarlyProposer
+from kerv_cli.methods.thresholds import Fixed
+from kerv_cli.methods.verify_skip import AlwaysSkip, ParallelPass
+from kerv_cli.report.plots import study_figures
+from kerv_cli.report.summary import summary_frame
+from kerv_cli.report.tables import load_study, study_table
 from kerv_cli.targets.compact.packed import pack
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 HOME = np.zeros(3)
 

@@ -13,7 +13,8 @@ import torch
 from studies_synthetic import prepare, threshold_settings, threshold_study
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.settings import BenchSettings
 from kerv_cli.bench.ceilings import ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import layer_weights, open_model
@@ -21,11 +22,10 @@ from kerv_cli.bench.phases import Phase, Stage, costs, flipped
 from kerv_cli.bench.profile import profile_of, projected
 from kerv_cli.bench.replay import Player
 from kerv_cli.bench.sequences import Recorded
-from kerv_cli.decoding.cost import DecodeSequence, Forward, Profile, predicted, read_profile, sequence_of
-from kerv_cli.errors import CheckpointError
-from kerv_cli.settings import BenchSettings
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.cli.app import app
+from kerv_cli.engine.cost import DecodeSequence, Forward, Profile, predicted, read_profile, sequence_of
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.store import StudyStore
 
 NANO = BenchSettings(model="nano", dtype="float32")
 

@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.decoding.boundary import (
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.registry import find
+from kerv_cli.methods.boundary import (
     STILL,
     Boundary,
     BoundaryRanges,
@@ -19,9 +21,7 @@ from kerv_cli.decoding.boundary import (
     path_length,
     radius_of_curvature,
 )
-from kerv_cli.decoding.build import Context
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.registry import find
+from kerv_cli.methods.build import Context
 
 WINDOW = 15
 RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)

@@ -16,12 +16,20 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from kerv_cli.artifacts import MadeFor
-from kerv_cli.commands.calibrate import calibrate
-from kerv_cli.config import compose
-from kerv_cli.decoding.boundary import BoundaryRanges
-from kerv_cli.decoding.build import Context
-from kerv_cli.decoding.calibration_file import (
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.places import find_target
+from kerv_cli.base.registry import find
+from kerv_cli.base.settings import CalibrateSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.calibrate import calibrate
+from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.record import Round
+from kerv_cli.methods.artifacts import MadeFor
+from kerv_cli.methods.boundary import BoundaryRanges
+from kerv_cli.methods.build import Context
+from kerv_cli.methods.calibration_file import (
     BoundarySection,
     Calibration,
     Demonstrations,
@@ -32,19 +40,8 @@ from kerv_cli.decoding.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from kerv_cli.decoding.chunk import Chunk, Situation
-from kerv_cli.decoding.record import Round
-from kerv_cli.drafting.kinematics import PREDICTORS, ActionHistory, Noise
-from kerv_cli.environments.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
-from kerv_cli.environments.demos.episode_file import DemoEpisode, save_episode
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.parts import FixedThresholdSettings, KinematicThresholdSettings
-from kerv_cli.places import find_target
-from kerv_cli.registry import find
-from kerv_cli.settings import CalibrateSettings
-from kerv_cli.spaces import Observation
+from kerv_cli.methods.kinematics import PREDICTORS, ActionHistory, Noise
+from kerv_cli.methods.parts import FixedThresholdSettings, KinematicThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.training.calibration import CalibrationRun, reference_level
 from kerv_cli.training.predictor_fit import (
@@ -55,6 +52,9 @@ from kerv_cli.training.predictor_fit import (
     moving_errors,
     prediction_errors,
 )
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
+from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 TASKS = ("reach-v3", "drawer-close-v3")
 SPACE = SPEC.actions

@@ -16,26 +16,26 @@ from hypothesis import strategies as st
 from test_calibration import STEPS, TASKS, made_up_episode, write_dataset
 from typer.testing import CliRunner
 
-from kerv_cli.commands.calibrate import calibrate
-from kerv_cli.config import compose
-from kerv_cli.decoding.boundary import BoundaryRanges
-from kerv_cli.decoding.calibration_file import (
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.files import write_json
+from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.cli.calibrate import calibrate
+from kerv_cli.methods.boundary import BoundaryRanges
+from kerv_cli.methods.calibration_file import (
     NEVER,
     Calibration,
     Variability,
     load_calibration,
     save_calibration,
 )
-from kerv_cli.drafting.datastore import Datastore, Manifest, Shard
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, UnknownName
-from kerv_cli.files import write_json
-from kerv_cli.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
-from kerv_cli.spaces import ActionSpace
+from kerv_cli.methods.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 SPACE = SPEC.actions
 BIN = 2 / SPACE.tokens

@@ -11,16 +11,16 @@ import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, run_cell, settings_of
 
-from kerv_cli.errors import UsageError
-from kerv_cli.reporting import decided
-from kerv_cli.reporting.choose import choices, pareto, sentence, short
-from kerv_cli.reporting.decided import LARGER, OPEN, SMALLER, confidence_of_a_look, verdict_of
-from kerv_cli.reporting.measures import MICRO
-from kerv_cli.reporting.statistics import PairedCounts, paired_difference, ratio
-from kerv_cli.reporting.tables import load_study
-from kerv_cli.settings import StudySettings
-from kerv_cli.studies.plan import plan
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import StudySettings
+from kerv_cli.lab.plan import plan
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report import decided
+from kerv_cli.report.choose import choices, pareto, sentence, short
+from kerv_cli.report.decided import LARGER, OPEN, SMALLER, confidence_of_a_look, verdict_of
+from kerv_cli.report.measures import MICRO
+from kerv_cli.report.statistics import PairedCounts, paired_difference, ratio
+from kerv_cli.report.tables import load_study
 
 
 def row(label: str, speedup: float, counts: PairedCounts, r: float = math.nan, task: str = "all") -> dict[str, object]:

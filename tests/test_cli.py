@@ -17,7 +17,7 @@ FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
 
 def kerv(*arguments: str, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *arguments]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env={**os.environ, **env})
 
 
@@ -31,7 +31,8 @@ def one_line(run: subprocess.CompletedProcess[str], code: int) -> str:
 
 
 def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
-    code = "import sys, kerv_cli.app; print(sorted({'torch', 'mujoco', 'hydra', 'pandas', 'rerun'} & set(sys.modules)))"
+    heavy = "{'torch', 'mujoco', 'hydra', 'pandas', 'rerun'}"
+    code = f"import sys, kerv_cli.cli.app; print(sorted({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
     run = kerv("--help")
     assert run.returncode == 0
@@ -169,7 +170,7 @@ def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:
 
 
 def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
-    from kerv_cli.commands.completing import completions
+    from kerv_cli.cli.completing import completions
 
     assert "method=spec_vla" in completions("rollout", [], "method=s")
     assert completions("rollout", [], "me") == ["method="]
@@ -185,7 +186,7 @@ def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
 
 
 def test_bash_completes_behind_an_equals_sign_without_a_start_up_file(tmp_path: Path) -> None:
-    from kerv_cli.commands.completing import script
+    from kerv_cli.cli.completing import script
 
     (tmp_path / "kerv").write_text(f'#!/bin/sh\nexec {sys.executable} -W ignore -c "{BE_KERV}" "$@"\n')
     (tmp_path / "kerv").chmod(0o755)
@@ -198,7 +199,7 @@ def test_bash_completes_behind_an_equals_sign_without_a_start_up_file(tmp_path: 
     assert run.stdout.split() == ["spec_vla", "spec_vla_paper"], run.stderr
 
 
-BE_KERV = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.app import main; main()"
+BE_KERV = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.cli.app import main; main()"
 
 
 def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import time
 import pytest
 import torch
 
-from kerv_cli.decoding.chunk import Clock
-from kerv_cli.decoding.record import PHASES
+from kerv_cli.engine.chunk import Clock
+from kerv_cli.engine.record import PHASES
 
 
 class Event:

@@ -15,18 +15,15 @@ from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer, EarlyProposer
-from kerv_cli.drafting.eagle import load_drafter, read_drafter
-from kerv_cli.drafting.early import load_early
-from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, UnknownName
-from kerv_cli.places import shipped_dir
-from kerv_cli.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
-from kerv_cli.spaces import Observation, ObservationSpace, Place
-from kerv_cli.targets.attention import attention_mask
+from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.places import shipped_dir
+from kerv_cli.base.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.spaces import Observation, ObservationSpace, Place
+from kerv_cli.engine.attention import attention_mask
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.eagle import load_drafter, read_drafter
+from kerv_cli.methods.early import load_early
+from kerv_cli.methods.proposers import DrafterProposer, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
@@ -36,6 +33,9 @@ from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.training import runs
 from kerv_cli.training.imitation import Imitation, imitation_job, load_samples, new_target
 from kerv_cli.training.loop import Loop
+from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 ARM = ObservationSpace(
     proprioception=("x", "y", "z", "qw", "qx", "qy", "qz", "open"),

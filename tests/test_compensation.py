@@ -10,16 +10,16 @@ import torch
 from examples.own_target import MockTarget
 from test_decoding_lossless import plain_greedy
 
-from kerv_cli.decoding.chunk import Chunk, Situation
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import Stateless
-from kerv_cli.decoding.rectify import Compensation, assemble
-from kerv_cli.drafting.kinematics import ActionHistory, Hold, Linear
-from kerv_cli.drafting.tree import TokenTree
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.parts import CompensateSettings
-from kerv_cli.registry import find
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import find
+from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.tree import TokenTree
+from kerv_cli.methods.kinematics import ActionHistory, Hold, Linear
+from kerv_cli.methods.parts import CompensateSettings
+from kerv_cli.methods.proposers import Stateless
+from kerv_cli.methods.rectify import Compensation, assemble
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 D, N = 4, 16
 SPACE = SPEC.actions

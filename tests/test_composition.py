@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from kerv_cli import parts as p
-from kerv_cli.config import compose, groups
-from kerv_cli.decoding.build import check, needs
-from kerv_cli.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.registry import NoSettings
-from kerv_cli.rollouts.policy import check as check_rollout
-from kerv_cli.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.base.config import compose, groups
+from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.lab.policy import check as check_rollout
+from kerv_cli.methods import parts as p
+from kerv_cli.methods.build import check, needs
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {

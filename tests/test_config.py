@@ -6,12 +6,12 @@ from itertools import chain
 
 import pytest
 
-from kerv_cli import settings as s
-from kerv_cli.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
-from kerv_cli.errors import UsageError
-from kerv_cli.parts import part_of
-from kerv_cli.registry import parts
-from kerv_cli.studies.resolve import resolve
+from kerv_cli.base import settings as s
+from kerv_cli.base.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.registry import parts
+from kerv_cli.lab.resolve import resolve
+from kerv_cli.methods.parts import part_of
 
 SCHEMAS = {
     "rollout": s.RolloutSettings,

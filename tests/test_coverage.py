@@ -10,16 +10,16 @@ import pytest
 from test_calibration import write_dataset
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.config import compose, conf_dir
-from kerv_cli.environments import resolve_tasks
-from kerv_cli.files import read_yaml
-from kerv_cli.settings import (
+from kerv_cli.base.config import compose, conf_dir
+from kerv_cli.base.files import read_yaml
+from kerv_cli.base.settings import (
     BuildDatastoreSettings,
     CalibrateRiskSettings,
     RolloutSettings,
     TrainDrafterSettings,
 )
+from kerv_cli.cli.app import app
+from kerv_cli.worlds import resolve_tasks
 
 COVERS = {"three": 3, "five": 5, "seven": 7}
 COMMANDS = {

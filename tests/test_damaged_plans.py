@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from studies_synthetic import run_cell, settings_of, threshold_settings, threshold_study
 
-from kerv_cli.errors import CheckpointError
-from kerv_cli.files import read_json, read_yaml
-from kerv_cli.reporting.tables import load_study
-from kerv_cli.studies.store import StudyStore, is_result_of
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_json, read_yaml
+from kerv_cli.lab.store import StudyStore, is_result_of
+from kerv_cli.report.tables import load_study
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 _LEVELS = zip("abcdefghij", "bcdefghijk", strict=True)

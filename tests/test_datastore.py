@@ -19,21 +19,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from kerv_cli.commands import build as command
-from kerv_cli.drafting.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
-from kerv_cli.drafting.tree import ROOT, TokenTree, merge
-from kerv_cli.environments.demos.dataset import FORMAT, dataset_hash, episode_path
-from kerv_cli.environments.demos.episode_file import DemoEpisode, save_episode
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
-from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.parts import QdrantSearchSettings
-from kerv_cli.registry import NoSettings
-from kerv_cli.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
-from kerv_cli.spaces import ActionSpace, Observation
+from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UnknownName, UsageError
+from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
+from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.cli import build as command
+from kerv_cli.engine.tree import ROOT, TokenTree, merge
+from kerv_cli.methods.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
+from kerv_cli.methods.parts import QdrantSearchSettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import DatastoreBuild, directions, leave_one_out
+from kerv_cli.worlds.demos.dataset import FORMAT, dataset_hash, episode_path
+from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 SPACE = SPEC.actions
 TASKS = ("drawer-close-v3", "reach-v3")

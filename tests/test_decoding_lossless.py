@@ -13,20 +13,20 @@ from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.decoding.chunk import Chunk
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.files import sha256_of
-from kerv_cli.settings import DrafterSettings, TargetSettings
-from kerv_cli.spaces import ActionSpace, Group, Observation
+from kerv_cli.base.files import sha256_of
+from kerv_cli.base.settings import DrafterSettings, TargetSettings
+from kerv_cli.base.spaces import ActionSpace, Group, Observation
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.proposers import DrafterProposer, JacobiProposer
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.targets.protocol import Target
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 

@@ -14,9 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file
 
-from kerv_cli.artifacts import artifact_folder
-from kerv_cli.config import compose
-from kerv_cli.drafting.early import (
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.methods.artifacts import artifact_folder
+from kerv_cli.methods.early import (
     EarlyDrafter,
     choose,
     choose_with_odds,
@@ -25,14 +27,7 @@ from kerv_cli.drafting.early import (
     read_early,
     save_early,
 )
-from kerv_cli.drafting.kinematics import ActionHistory
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.methods.kinematics import ActionHistory
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
@@ -48,6 +43,11 @@ from kerv_cli.training.early_distillation import (
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.observations import split
 from kerv_cli.training.runs import EarlyRun, drafter_run
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
@@ -297,7 +297,7 @@ def test_a_share_of_the_observations_is_spread_evenly(nano: CompactTarget, share
 @pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
 def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
     """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
-    from kerv_cli.decoding.decoder import Decoder
+    from kerv_cli.engine.decoder import Decoder
 
     target = load_target(results / "artifacts/target" / name)[0]
     dataset = DemoDataset.open(results / "artifacts/demos/few")
@@ -326,7 +326,7 @@ def test_a_single_episode_cannot_be_held_out() -> None:
 def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results: Path) -> None:
     words = ["train", "drafter", "drafter=early", "demos=few", "policy.target=nano-vision", "policy.early=whole"]
     words += ["drafter.width=32", "drafter.rank=8", "train.batch=8", "train.steps=4", "train.held_out=0.34"]
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *words, f"results={results}"]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words, f"results={results}"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     assert "accepted_r9" in done.stdout

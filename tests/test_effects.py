@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from kerv_cli.config import compose
-from kerv_cli.effects import without_effect
-from kerv_cli.settings import RolloutSettings, StudySettings
-from kerv_cli.studies.resolve import ResolvedStudy, idle_overrides
+from kerv_cli.base.config import compose
+from kerv_cli.base.settings import RolloutSettings, StudySettings
+from kerv_cli.lab.effects import without_effect
+from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
 
 
 @pytest.mark.parametrize(

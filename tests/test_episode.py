@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kerv_cli.config import compose
-from kerv_cli.decoding.record import PHASES, EpisodeRecord
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.environments.metaworld.world import MetaWorld
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.rollouts import policy as policies_of
-from kerv_cli.rollouts import run
-from kerv_cli.settings import EVALUATION_SEED, RolloutSettings
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.settings import EVALUATION_SEED, RolloutSettings
+from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.lab import policy as policies_of
+from kerv_cli.lab import run
+from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.metaworld.world import MetaWorld
 
 
 def settings(results: Path, *overrides: str) -> RolloutSettings:

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kerv_cli import registry
-from kerv_cli.environments import resolve_tasks, spec_of, task_names
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.errors import KervError, UsageError
-from kerv_cli.rollouts.episode import run_episode
-from kerv_cli.rollouts.expert import ExpertDecoder
-from kerv_cli.viewing.rerun_log import save_episode
-from kerv_cli.viewing.viewer import read_back
+from kerv_cli.base import registry
+from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.lab.episode import run_episode
+from kerv_cli.lab.expert import ExpertDecoder
+from kerv_cli.report.viewing.rerun_log import save_episode
+from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.worlds import resolve_tasks, spec_of, task_names
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.spec import EnvironmentSpec
 
 TESTS = Path(__file__).parent
 
@@ -73,7 +73,7 @@ def test_an_environment_may_have_no_experts(spec: EnvironmentSpec) -> None:
     ],
 )
 def test_a_plugin_is_named_by_an_environment_variable(plugin: str, suite: str, tasks: str) -> None:
-    code = f"from kerv_cli.environments import resolve_tasks; print(*resolve_tasks(['{suite}']))"
+    code = f"from kerv_cli.worlds import resolve_tasks; print(*resolve_tasks(['{suite}']))"
     paths = os.pathsep.join([str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "KERV_PLUGINS": plugin, "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
@@ -81,6 +81,6 @@ def test_a_plugin_is_named_by_an_environment_variable(plugin: str, suite: str, t
 
 
 def test_rollouts_do_not_need_rerun() -> None:
-    modules = "kerv_cli.rollouts.cells, kerv_cli.rollouts.run, kerv_cli.rollouts.expert"
+    modules = "kerv_cli.lab.cells, kerv_cli.lab.run, kerv_cli.lab.expert"
     code = f"import sys, {modules}; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

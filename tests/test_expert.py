@@ -13,19 +13,19 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from kerv_cli.decoding.record import PHASES, EpisodeRecord
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.environments.spec import World
-from kerv_cli.errors import KervError, UnknownName
-from kerv_cli.reporting.measures import MACRO, MICRO, measure
-from kerv_cli.rollouts.episode import run_episode
-from kerv_cli.rollouts.expert import ExpertDecoder
-from kerv_cli.settings import EVALUATION_SEED
-from kerv_cli.spaces import Observation
-from kerv_cli.studies.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, parquet_bytes
-from kerv_cli.viewing.facts import summary
-from kerv_cli.viewing.rerun_log import save_episode
-from kerv_cli.viewing.viewer import read_back
+from kerv_cli.base.errors import KervError, UnknownName
+from kerv_cli.base.settings import EVALUATION_SEED
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.lab.episode import run_episode
+from kerv_cli.lab.expert import ExpertDecoder
+from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, parquet_bytes
+from kerv_cli.report.measures import MACRO, MICRO, measure
+from kerv_cli.report.viewing.facts import summary
+from kerv_cli.report.viewing.rerun_log import save_episode
+from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.spec import World
 
 NAME = "window-close-v3"
 STAMPS = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}

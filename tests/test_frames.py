@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from kerv_cli.environments.demos.episode_file import DemoEpisode, load_episode, save_episode
-from kerv_cli.environments.demos.frames import EncodedFrames
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError
-from kerv_cli.settings import TargetSettings
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.settings import TargetSettings
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.observations import Observations, read_observations
+from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
+from kerv_cli.worlds.demos.frames import EncodedFrames
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 SIZE = 96
 

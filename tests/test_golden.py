@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from kerv_cli.studies.identity import ENGINE
+from kerv_cli.lab.identity import ENGINE
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from examples.insertion import SPEC
 
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.spec import World
-from kerv_cli.errors import KervError
-from kerv_cli.rollouts.episode import run_episode
-from kerv_cli.rollouts.expert import ExpertDecoder
-from kerv_cli.viewing.rerun_log import save_episode
-from kerv_cli.viewing.viewer import read_back
+from kerv_cli.base.errors import KervError
+from kerv_cli.lab.episode import run_episode
+from kerv_cli.lab.expert import ExpertDecoder
+from kerv_cli.report.viewing.rerun_log import save_episode
+from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.spec import World
 
 TASKS = tuple(SPEC.tasks)
 ROTATION = slice(3, 6)

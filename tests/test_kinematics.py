@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kerv_cli.drafting.kinematics import (
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.methods.kinematics import (
     FILTERS,
     HORIZON,
     PREDICTORS,
@@ -27,7 +28,6 @@ from kerv_cli.drafting.kinematics import (
     build_predictor,
     kalman_weights,
 )
-from kerv_cli.errors import UnknownName, UsageError
 
 DOFS = 4
 HELD = (False, False, False, True)

@@ -10,14 +10,14 @@ import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, episode, settings_of
 
-from kerv_cli.decoding.record import Delay, EpisodeRecord
-from kerv_cli.reporting.latency import latency_figure, latency_summary, latency_table
-from kerv_cli.reporting.report import report
-from kerv_cli.reporting.tables import load_study
-from kerv_cli.settings import RolloutSettings, StudySettings, TimingSettings
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Cell, plan
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.settings import RolloutSettings, StudySettings, TimingSettings
+from kerv_cli.engine.record import Delay, EpisodeRecord
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.latency import latency_figure, latency_summary, latency_table
+from kerv_cli.report.report import report
+from kerv_cli.report.tables import load_study
 
 SHARE = {"ar": 1.0, "spec_vla": 0.4}
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from kerv_cli import files
-from kerv_cli.errors import StorageError
-from kerv_cli.files import atomic_path, write_folder
-from kerv_cli.leftovers import clean, is_left_over, left_over, temporary_beside
+from kerv_cli.base import files
+from kerv_cli.base.errors import StorageError
+from kerv_cli.base.files import atomic_path, write_folder
+from kerv_cli.base.leftovers import clean, is_left_over, left_over, temporary_beside
 
 
 def of_process(path: Path, pid: int, host: str = "") -> Path:
@@ -122,7 +122,7 @@ def test_a_folder_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
 SIGKILLED = """
 import os, signal, sys
 from pathlib import Path
-from kerv_cli import files
+from kerv_cli.base import files
 calls = {"sync": 0}
 sync = files.sync
 def counted(path):

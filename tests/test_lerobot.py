@@ -15,11 +15,11 @@ from examples.tiny_openvla import write_checkpoint
 from test_openvla import imported, kerv
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.lerobot.reading import _groups
-from kerv_cli.environments.demos.recording import DemoConfig, record
+from kerv_cli.cli.app import app
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.lerobot.reading import _groups
+from kerv_cli.worlds.demos.recording import DemoConfig, record
 
 SIZE = 56
 

@@ -9,14 +9,14 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from kerv_cli import settings as s
-from kerv_cli.config import MOST_POINTS, PART_GROUPS, compose, expand
-from kerv_cli.drafting.kinematics import MINIMUM
-from kerv_cli.errors import UsageError
-from kerv_cli.limits import check_settings
-from kerv_cli.places import artifact, find_target, results_dir
-from kerv_cli.registry import parts
-from kerv_cli.studies.resolve import resolve
+from kerv_cli.base import settings as s
+from kerv_cli.base.config import MOST_POINTS, PART_GROUPS, compose, expand
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import check_settings
+from kerv_cli.base.places import artifact, find_target, results_dir
+from kerv_cli.base.registry import parts
+from kerv_cli.lab.resolve import resolve
+from kerv_cli.methods.kinematics import MINIMUM
 
 SCHEMAS = {
     "rollout": s.RolloutSettings,

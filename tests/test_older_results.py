@@ -13,8 +13,8 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.files import read_json
+from kerv_cli.base.files import read_json
+from kerv_cli.cli.app import app
 
 ARCHIVE = Path(__file__).parent / "fixtures" / "results-0.1.0.tar.xz"
 STUDY = """

@@ -19,12 +19,12 @@ from safetensors.torch import load_file, save_file
 from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.decoding.decoder import Decoder
-from kerv_cli.decoding.proposers import DrafterProposer, JacobiProposer
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.settings import BuildTargetSettings, DrafterSettings
-from kerv_cli.spaces import Observation
+from kerv_cli.base.settings import BuildTargetSettings, DrafterSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
+from kerv_cli.engine.decoder import Decoder
+from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.proposers import DrafterProposer, JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Language, Shape, Statistics, action_space, read_shape
 from kerv_cli.targets.openvla.image import cropped, pixels_of
@@ -324,7 +324,7 @@ def test_strict_decoding_equals_ar(
         truth = plain_greedy(target, prompt)
     trees = RandomTrees(truth, seed, nodes, target.actions.tokens)
     first = RandomTrees(truth, seed + 1, nodes, target.actions.tokens) if inside else None
-    from kerv_cli.decoding.decoder import Parts
+    from kerv_cli.engine.decoder import Parts
 
     result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
     assert result.tokens == truth
@@ -522,7 +522,7 @@ def test_weights_that_changed_after_the_import_are_refused(checkpoint: Path, tmp
     ],
 )
 def test_a_wrong_image_is_refused(target: OpenVLATarget, image: np.ndarray | None, said: str) -> None:
-    from kerv_cli.errors import KervError
+    from kerv_cli.base.errors import KervError
 
     images = {} if image is None else {"primary": image}
     with pytest.raises(KervError, match=said):
@@ -530,7 +530,7 @@ def test_a_wrong_image_is_refused(target: OpenVLATarget, image: np.ndarray | Non
 
 
 def test_too_long_an_instruction_is_refused(target: OpenVLATarget) -> None:
-    from kerv_cli.errors import UsageError
+    from kerv_cli.base.errors import UsageError
 
     with pytest.raises(UsageError, match="at most 120 are taken"):
         target.encode(shown(0, "turn " * 90))

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.drafting.early import EarlyDrafter, save_early
-from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.settings import DrafterSettings
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.cli.app import app
+from kerv_cli.methods.early import EarlyDrafter, save_early
 from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.worlds.demos.recording import DemoConfig, record
 
 TARGET = "policy.target=nano-state"
 

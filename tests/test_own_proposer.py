@@ -19,19 +19,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
-from kerv_cli.artifacts import Artifacts
-from kerv_cli.config import compose, groups
-from kerv_cli.decoding.build import check, needs
-from kerv_cli.decoding.build import compose as compose_decoder
-from kerv_cli.decoding.chunk import Situation
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import MergedProposer, PredictionProposer
-from kerv_cli.drafting.kinematics import ActionHistory, Hold
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, KervError, UsageError
-from kerv_cli.rollouts.policy import identity_of
-from kerv_cli.settings import RolloutSettings, as_plain, settings_from
-from kerv_cli.spaces import Observation
+from kerv_cli.base.config import compose, groups
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.chunk import Situation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.lab.policy import identity_of
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.build import check, needs
+from kerv_cli.methods.build import compose as compose_decoder
+from kerv_cli.methods.kinematics import ActionHistory, Hold
+from kerv_cli.methods.proposers import MergedProposer, PredictionProposer
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 
 def settings_of(results: Path, *overrides: str, name: str = "mine") -> RolloutSettings:
@@ -184,7 +184,7 @@ def test_it_is_a_choice_like_any_other() -> None:
 
 def test_the_command_knows_it_without_loading_anything_heavy() -> None:
     path = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    code = "import sys; from kerv_cli.app import main\ntry: main()\nfinally: print('torch' in sys.modules)"
+    code = "import sys; from kerv_cli.cli.app import main\ntry: main()\nfinally: print('torch' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code, "rollout", "--cfg", "proposer=follow", "proposer.depth=3"],
         env={**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": "examples.own_proposer"},

@@ -11,16 +11,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.settings import DrafterSettings, TargetSettings
-from kerv_cli.spaces import Observation, ObservationSpace, Place
+from kerv_cli.base.settings import DrafterSettings, TargetSettings
+from kerv_cli.base.spaces import Observation, ObservationSpace, Place
+from kerv_cli.engine.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.methods.eagle import Drafter
 from kerv_cli.targets.compact import packed
 from kerv_cli.targets.compact.packed import FastLinear, has_blocked_layouts, pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 

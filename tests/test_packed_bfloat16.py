@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kerv_cli.drafting.tree import TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.engine.tree import TokenTree, visible_in_prefill, visible_in_verification
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.trunk import Trunk

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from kerv_cli.config import compose
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.verify_skip import ParallelPass
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import UsageError
-from kerv_cli.rollouts.policy import check, decoder_for
-from kerv_cli.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
-from kerv_cli.spaces import Observation
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import RolloutSettings, TargetSettings, TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.lab.policy import check, decoder_for
+from kerv_cli.methods.verify_skip import ParallelPass
 from kerv_cli.targets.checkpoint import save_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.imitation import check_init, continued_target
 from kerv_cli.training.runs import drafter_run
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 WORDS = WordTokenizer.build(["pull the drawer open"])
 
@@ -128,7 +128,7 @@ def test_target_and_method_must_fit(results: Path, words: str, message: str) -> 
 
 
 def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from kerv_cli.environments.demos.dataset import DemoDataset
+    from kerv_cli.worlds.demos.dataset import DemoDataset
 
     same = type("M", (), {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name})
     demos = type("D", (), {"manifest": same, "path": Path("demos")})()

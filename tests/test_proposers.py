@@ -11,10 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
-from kerv_cli.decoding.boundary import Random
-from kerv_cli.decoding.chunk import Chunk, Situation
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import (
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.tree import TokenTree
+from kerv_cli.methods.boundary import Random
+from kerv_cli.methods.datastore import Datastore, Manifest, prompt_key
+from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.early import EarlyDraft
+from kerv_cli.methods.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
+from kerv_cli.methods.parts import SimilaritySkipSettings
+from kerv_cli.methods.proposers import (
     DrafterProposer,
     EarlyProposer,
     HybridProposer,
@@ -23,17 +31,9 @@ from kerv_cli.decoding.proposers import (
     RetrievalProposer,
     Stateless,
 )
-from kerv_cli.decoding.verify_skip import SkipLevels, VerifySkip
-from kerv_cli.drafting.datastore import Datastore, Manifest, prompt_key
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.early import EarlyDraft
-from kerv_cli.drafting.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
-from kerv_cli.drafting.tree import TokenTree
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import UsageError
-from kerv_cli.parts import SimilaritySkipSettings
-from kerv_cli.settings import DrafterSettings
+from kerv_cli.methods.verify_skip import SkipLevels, VerifySkip
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 SPACE = SPEC.actions
 D = SPACE.dofs

@@ -15,20 +15,20 @@ from examples.point_mass import SPEC, PointWorld
 from studies_synthetic import still_episode
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.config import compose
-from kerv_cli.decoding.cost import Profile
-from kerv_cli.decoding.record import DecodeRecord, Delay, EpisodeRecord, Round
-from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
-from kerv_cli.errors import KervError
-from kerv_cli.rollouts import policy as policies_of
-from kerv_cli.rollouts import run
-from kerv_cli.rollouts.clock import RealClock, displacement, predictor
-from kerv_cli.rollouts.episode import run_episode
-from kerv_cli.rollouts.latency import Constant, Measured, Profiled, steps_of
-from kerv_cli.settings import EVALUATION_SEED, RolloutSettings
-from kerv_cli.spaces import Observation
-from kerv_cli.studies.rows import Circumstances, decode_rows, episode_row
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.settings import EVALUATION_SEED, RolloutSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
+from kerv_cli.engine.cost import Profile
+from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Round
+from kerv_cli.lab import policy as policies_of
+from kerv_cli.lab import run
+from kerv_cli.lab.clock import RealClock, displacement, predictor
+from kerv_cli.lab.episode import run_episode
+from kerv_cli.lab.latency import Constant, Measured, Profiled, steps_of
+from kerv_cli.lab.rows import Circumstances, decode_rows, episode_row
+from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 
 HZ = SPEC.actions.control_hz
 TASK = "drawer-open-v3"
@@ -411,7 +411,7 @@ def test_an_impossible_profile_is_refused(results: Path, phases: dict[str, Any],
 
 
 def test_settings_without_effect_are_named(policies: Path) -> None:
-    from kerv_cli.effects import without_effect
+    from kerv_cli.lab.effects import without_effect
 
     def idle(*words: str) -> list[str]:
         return list(without_effect(compose("rollout", words, RolloutSettings), words))

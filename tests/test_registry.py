@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 
-from kerv_cli import registry
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.parts import METHOD_KINDS, PREFILL, STATES
-from kerv_cli.registry import Part, find, kinds, load, parts, register
+from kerv_cli.base import registry
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import Part, find, kinds, load, parts, register
+from kerv_cli.methods.parts import METHOD_KINDS, PREFILL, STATES
 
 PLUGIN = """
 from dataclasses import dataclass
 
-from kerv_cli.registry import Part, register
+from kerv_cli.base.registry import Part, register
 
 
 @dataclass
@@ -58,7 +58,7 @@ def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) 
     assert "\n" not in str(refused.value)
     with pytest.raises(UsageError, match="proposer 'drafter' is registered twice"):
         register(Part("proposer", "drafter", "elsewhere:build"))
-    assert find("proposer", "drafter").build == "kerv_cli.decoding.build:drafter"
+    assert find("proposer", "drafter").build == "kerv_cli.methods.build:drafter"
     register(Part("threshold", "mine", "two:build"))  # another kind: another name
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
@@ -94,7 +94,7 @@ def test_every_proposer_says_when_it_can_draft() -> None:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("kerv_cli.parts:nothing_there", "kerv_cli.parts has no nothing_there"),
+        ("kerv_cli.methods.parts:nothing_there", "kerv_cli.methods.parts has no nothing_there"),
         ("kerv_cli.nowhere:build", "kerv_cli.nowhere"),
     ],
 )
@@ -108,7 +108,7 @@ def test_what_is_not_there_gets_one_line(name: str, says: str) -> None:
 def kerv(*words: str, folder: Path, plugins: str = "") -> subprocess.CompletedProcess[str]:
     path = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": plugins}
-    command = [sys.executable, "-c", "from kerv_cli.app import main; main()", *words]
+    command = [sys.executable, "-c", "from kerv_cli.cli.app import main; main()", *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
 
 
@@ -132,7 +132,7 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
         ("not_there", "kerv: plugin not_there cannot be imported (No module named 'not_there')"),
         (
             "collides",
-            "kerv: proposer 'drafter' is registered twice: kerv_cli.decoding.build:drafter and collides:build",
+            "kerv: proposer 'drafter' is registered twice: kerv_cli.methods.build:drafter and collides:build",
         ),
     ],
 )
@@ -160,7 +160,7 @@ def test_an_installed_package_registers_by_an_entry_point(
 
 def test_parts_are_known_without_anything_heavy() -> None:
     heavy = "{'torch', 'mujoco', 'numpy', 'pyarrow', 'hydra', 'pydantic'}"
-    asked = "import sys; from kerv_cli.registry import parts; assert len(parts('proposer')) > 9; "
+    asked = "import sys; from kerv_cli.base.registry import parts; assert len(parts('proposer')) > 9; "
     done: Any = subprocess.run(
         [sys.executable, "-c", f"{asked}print(*({heavy} & set(sys.modules)))"],
         env={**os.environ, "KERV_PLUGINS": ""},

@@ -18,15 +18,15 @@ from PIL import Image
 from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, verify
 
-from kerv_cli.decoding.record import PHASES, EpisodeRecord, Round
-from kerv_cli.errors import KervError, StorageError, UsageError
-from kerv_cli.registry import parts
-from kerv_cli.viewing import rerun_log, viewer
-from kerv_cli.viewing.facts import readable
-from kerv_cli.viewing.rerun_log import save_episode
-from kerv_cli.viewing.together import save_together
-from kerv_cli.viewing.token_outcomes import chunk_size, outcomes_of
-from kerv_cli.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
+from kerv_cli.base.errors import KervError, StorageError, UsageError
+from kerv_cli.base.registry import parts
+from kerv_cli.engine.record import PHASES, EpisodeRecord, Round
+from kerv_cli.report.viewing import rerun_log, viewer
+from kerv_cli.report.viewing.facts import readable
+from kerv_cli.report.viewing.rerun_log import save_episode
+from kerv_cli.report.viewing.together import save_together
+from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of
+from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
 
 
 def saved(record: EpisodeRecord, folder: Path, method: str = "spec_vla") -> Path:

@@ -19,15 +19,15 @@ from studies_synthetic import (
     threshold_study,
 )
 
-from kerv_cli.reporting.summary import not_in_turn
-from kerv_cli.reporting.tables import load_study, study_table
-from kerv_cli.settings import RolloutSettings
-from kerv_cli.studies import identity
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Cell, plan
-from kerv_cli.studies.reuse import Covered, Stock, cover, disagreements, take_over
-from kerv_cli.studies.run_file import interrupted_since, note_finished, note_invocation
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.lab import identity
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.reuse import Covered, Stock, cover, disagreements, take_over
+from kerv_cli.lab.run_file import interrupted_since, note_finished, note_invocation
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.summary import not_in_turn
+from kerv_cli.report.tables import load_study, study_table
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_other_code_a_rename_and_a_new_part_run_nothing_again(
 ) -> None:
     cells = threshold_study(["reach-v3"])
     swept(store, cells)
-    monkeypatch.setattr("kerv_cli.studies.reuse.code_hash", lambda: "f" * 64)
+    monkeypatch.setattr("kerv_cli.lab.reuse.code_hash", lambda: "f" * 64)
     assert not cover(cells, Stock(store)).reasons
     assert set(cover(cells, Stock(store), "changed").reasons.values()) == {"other code"}
 
@@ -147,7 +147,7 @@ def test_reasons_name_what_changed(store: StudyStore, monkeypatch: pytest.Monkey
     assert why(same, weights={**IDENTITY, "target": "c" * 64}) == "weights of mt10-vision changed"
     monkeypatch.setattr(identity, "ENGINE", 4)
     monkeypatch.setattr(identity.work_of, "__defaults__", (4,))
-    monkeypatch.setattr("kerv_cli.studies.reuse.ENGINE", 4)
+    monkeypatch.setattr("kerv_cli.lab.reuse.ENGINE", 4)
     assert why(same) == "engine 1 → 4"
 
 

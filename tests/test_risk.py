@@ -17,18 +17,18 @@ from test_streak import ByPlace, near
 from test_unverified import SHOWN, Near
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.decoding.audit import Audit, Evidence
-from kerv_cli.decoding.certification import certify, episodes_needed, hoeffding_bentkus, p_value
-from kerv_cli.decoding.chunk import Chunk
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.loss import chunk_loss, target_tokens
-from kerv_cli.decoding.record import DecodeRecord
-from kerv_cli.decoding.risk import RiskSkip
-from kerv_cli.decoding.scores import Draft
-from kerv_cli.parts import RiskSkipSettings
-from kerv_cli.reporting.risk import auc, coverage
-from kerv_cli.rollouts.episode import run_episode
+from kerv_cli.cli.app import app
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.loss import chunk_loss, target_tokens
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.lab.episode import run_episode
+from kerv_cli.methods.audit import Audit, Evidence
+from kerv_cli.methods.certification import certify, episodes_needed, hoeffding_bentkus, p_value
+from kerv_cli.methods.parts import RiskSkipSettings
+from kerv_cli.methods.risk import RiskSkip
+from kerv_cli.methods.scores import Draft
+from kerv_cli.report.risk import auc, coverage
 from kerv_cli.training import risk_recording
 
 # --- the certificate
@@ -268,8 +268,8 @@ def kerv(*words: str) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
-    from kerv_cli.drafting.early import EarlyDrafter, save_early
-    from kerv_cli.settings import DrafterSettings
+    from kerv_cli.base.settings import DrafterSettings
+    from kerv_cli.methods.early import EarlyDrafter, save_early
     from kerv_cli.targets.checkpoint import load_target
 
     results = tmp_path_factory.mktemp("risk")

@@ -20,10 +20,10 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.rollouts.cells import CellRunner
-from kerv_cli.runs.catalogue import find_runs, matching
-from kerv_cli.runs.export import TRACKERS, export
+from kerv_cli.cli.app import app
+from kerv_cli.lab.catalogue import find_runs, matching
+from kerv_cli.lab.cells import CellRunner
+from kerv_cli.report.export import TRACKERS, export
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
 
@@ -164,8 +164,8 @@ def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
 
 
 def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    from kerv_cli.commands.rollout import warn_unseen
-    from kerv_cli.studies.rollout_runs import resolve_rollout
+    from kerv_cli.cli.rollout import warn_unseen
+    from kerv_cli.lab.rollout_runs import resolve_rollout
 
     resolved = resolve_rollout(["method=ar,spec_vla", "task=coffee-button,reach"], multirun=True)
     warn_unseen(resolved, ("coffee-button-v3", "reach-v3"))
@@ -274,7 +274,7 @@ def test_csv_and_a_missing_package(results: Path, tmp_path: Path) -> None:
 
 
 def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
-    from kerv_cli.reporting.curves import save_curves
+    from kerv_cli.report.curves import save_curves
 
     folder = tmp_path / "target" / "mine"
     folder.mkdir(parents=True)
@@ -288,8 +288,8 @@ def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from kerv_cli.runs.catalogue import find_run
-from kerv_cli.runs.removal import remove
+from kerv_cli.lab.catalogue import find_run
+from kerv_cli.lab.removal import remove
 
 left = int(sys.argv[3])
 

@@ -11,15 +11,15 @@ from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.decoding.acceptance import Acceptance, accept_by_distance, accept_by_group
-from kerv_cli.decoding.build import Context
-from kerv_cli.decoding.chunk import Chunk
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import Stateless
-from kerv_cli.drafting.tree import ROOT, TokenTree
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.registry import find
-from kerv_cli.spaces import ActionSpace, Group
+from kerv_cli.base.registry import find
+from kerv_cli.base.spaces import ActionSpace, Group
+from kerv_cli.engine.acceptance import Acceptance, accept_by_distance, accept_by_group
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.build import Context
+from kerv_cli.methods.proposers import Stateless
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 POSITION_GRIPPER = SPEC.actions
 

@@ -21,16 +21,16 @@ from typer.testing import CliRunner
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from kerv_cli.app import app
-from kerv_cli.artifacts import Artifacts
-from kerv_cli.config import compose as compose_settings
-from kerv_cli.decoding.decoder import Decoder
-from kerv_cli.serving.policy import served
-from kerv_cli.serving.server import PolicyServer
-from kerv_cli.serving.session import Interface, Session
-from kerv_cli.serving.wire import packed, unpacked
-from kerv_cli.settings import PolicySettings, ServeSettings
-from kerv_cli.spaces import Observation
+from kerv_cli.base.config import compose as compose_settings
+from kerv_cli.base.settings import PolicySettings, ServeSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
+from kerv_cli.engine.decoder import Decoder
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.serve.policy import served
+from kerv_cli.serve.server import PolicyServer
+from kerv_cli.serve.session import Interface, Session
+from kerv_cli.serve.wire import packed, unpacked
 
 
 def encoded(value: Any) -> Any:
@@ -278,7 +278,7 @@ def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path)
     words = ["serve", "policy.target=nano-state", f"results={policies}", "port=0"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen([sys.executable, "-m", "kerv_cli.app", *words], stderr=log, env=environment)
+        process = subprocess.Popen([sys.executable, "-m", "kerv_cli.cli.app", *words], stderr=log, env=environment)
         try:
             until_slow = time.monotonic() + 60
             while "listens on" not in (said := (tmp_path / "log").read_text()) and time.monotonic() < until_slow:

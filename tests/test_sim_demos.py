@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.dataset import DemoDataset, DemoManifest
-from kerv_cli.environments.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, KervError, UsageError
-from kerv_cli.manifests import read_file
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.manifests import read_file
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
+from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 CONFIG = DemoConfig(
     tasks=("reach",), episodes=6, frame_stride=10, camera=CameraConfig(size=24, supersample=1), workers=1, tail=5

@@ -5,8 +5,8 @@ import os
 
 import pytest
 
-from kerv_cli.errors import CheckpointError, StorageError
-from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
+from kerv_cli.base.errors import CheckpointError, StorageError
+from kerv_cli.base.files import atomic_path, read_json, sha256_of, write_json
 
 
 def test_a_file_appears_complete_and_nothing_else_stays(tmp_path):

@@ -7,15 +7,15 @@ from collections import Counter
 
 import pytest
 
-from kerv_cli.environments import resolve_tasks, spec_of, specs, task_names
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.environments.metaworld.tasks import DIFFICULTIES, SUITES, TASKS
-from kerv_cli.environments.spec import Seeds
-from kerv_cli.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.worlds import resolve_tasks, spec_of, specs, task_names
+from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.metaworld.tasks import DIFFICULTIES, SUITES, TASKS
+from kerv_cli.worlds.spec import Seeds
 
 
 def test_the_names_are_those_of_metaworld():
-    from kerv_cli.environments.camera import load_mujoco
+    from kerv_cli.worlds.camera import load_mujoco
 
     load_mujoco()
     from metaworld.policies import ENV_POLICY_MAP
@@ -105,6 +105,6 @@ def test_seeds_of_one_purpose_are_refused_for_another():
 
 def test_completion_and_tables_load_nothing_heavy():
     heavy = "('numpy', 'mujoco', 'metaworld')"
-    listed = "import sys; from kerv_cli.environments import task_names; print(len(list(task_names())))"
+    listed = "import sys; from kerv_cli.worlds import task_names; print(len(list(task_names())))"
     code = f"{listed}; sys.exit(any(m in sys.modules for m in {heavy}))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

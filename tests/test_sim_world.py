@@ -9,10 +9,10 @@ import time
 import numpy as np
 import pytest
 
-from kerv_cli.environments import camera as camera_module
-from kerv_cli.environments.camera import CameraConfig, box_average, choose_backend
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import KervError, RenderingUnavailable, UnknownName, UsageError
+from kerv_cli.base.errors import KervError, RenderingUnavailable, UnknownName, UsageError
+from kerv_cli.worlds import camera as camera_module
+from kerv_cli.worlds.camera import CameraConfig, box_average, choose_backend
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 # One task for nearly all: a benchmark's 50 placements cost up to a second per seed block. Its poses are stale at reset.
 TASK = "window-close"
@@ -273,8 +273,8 @@ def run_python(code, **environment):
 
 def test_physics_works_where_nothing_can_be_drawn():
     code = f"""
-from kerv_cli.errors import RenderingUnavailable
-from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.base.errors import RenderingUnavailable
+from kerv_cli.worlds.metaworld.spec import SPEC
 world = SPEC.open_world("{TASK}")
 world.reset(0)
 world.step([0, 0, 0, 0])
@@ -291,7 +291,7 @@ def test_open_cameras_are_closed_before_the_interpreter_ends():
     """Otherwise a context may outlive the display, which prints an EGLError."""
     code = f"""
 import atexit
-from kerv_cli.environments.metaworld.spec import SPEC
+from kerv_cli.worlds.metaworld.spec import SPEC
 world = SPEC.open_world("{TASK}")
 atexit.register(lambda: print([camera._renderer for camera in world._cameras.values()]))  # runs last
 world.reset(0)

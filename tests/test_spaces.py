@@ -11,11 +11,11 @@ from examples.insertion import SPEC as INSERTION
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.manifests import read
-from kerv_cli.spaces import ActionSpace, Group, ObservationSpace
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.manifests import read
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
 from kerv_cli.targets.compact.text import PAD, UNKNOWN, WordTokenizer
+from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 
 WIDTH = 2 / 255  # of a bin
 SPACE = METAWORLD.actions

@@ -10,12 +10,12 @@ import torch
 from examples.own_target import MockTarget
 from test_unverified import SHOWN, Near
 
-from kerv_cli.decoding.acceptance import Acceptance
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import MergedProposer
-from kerv_cli.decoding.thresholds import Fixed
-from kerv_cli.decoding.verify_skip import StreakSkip
-from kerv_cli.parts import StreakSkipSettings
+from kerv_cli.engine.acceptance import Acceptance
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.parts import StreakSkipSettings
+from kerv_cli.methods.proposers import MergedProposer
+from kerv_cli.methods.thresholds import Fixed
+from kerv_cli.methods.verify_skip import StreakSkip
 
 
 def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:

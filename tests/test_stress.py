@@ -15,21 +15,21 @@ import numpy as np
 import pytest
 from examples.insertion import SPEC as INSERTION
 
-from kerv_cli.config import compose
-from kerv_cli.environments import stress as stressing
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.metaworld.spec import SPEC as METAWORLD
-from kerv_cli.environments.recorded import register_recorded
-from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.environments.stress.base import Draws, Spells, objects
-from kerv_cli.environments.stress.colour import scenery_of
-from kerv_cli.environments.world import MujocoWorld
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.registry import parts
-from kerv_cli.rollouts.policy import check
-from kerv_cli.rollouts.run import Runner, close_worlds
-from kerv_cli.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
-from kerv_cli.studies.identity import stress_of, work_of
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import parts
+from kerv_cli.base.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
+from kerv_cli.lab.identity import stress_of, work_of
+from kerv_cli.lab.policy import check
+from kerv_cli.lab.run import Runner, close_worlds
+from kerv_cli.worlds import stress as stressing
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
+from kerv_cli.worlds.recorded import register_recorded
+from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.stress.base import Draws, Spells, objects
+from kerv_cli.worlds.stress.colour import scenery_of
+from kerv_cli.worlds.world import MujocoWorld
 
 TESTS = Path(__file__).parent
 SEED, STEPS, SIZE = 50_006, 24, 48
@@ -150,7 +150,7 @@ def test_pictures_differ_more_at_higher_levels(insertion: MujocoWorld, kind: str
 
 
 def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion: MujocoWorld) -> None:
-    from kerv_cli.environments.stress.camera import LEVELS
+    from kerv_cli.worlds.stress.camera import LEVELS
 
     play(insertion, "none", 0, steps=1)
     plain = model_of(insertion)
@@ -236,7 +236,7 @@ def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_l
 
 
 def test_a_dropped_picture_is_the_one_observed_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    from kerv_cli.environments.stress import sensor
+    from kerv_cli.worlds.stress import sensor
 
     monkeypatch.setattr(sensor, "LEVELS", (sensor.Level(1.0, 0.0, 1.0),) * 4)
     stress = stressing.build(StressSettings("sensor", 4))
@@ -266,7 +266,7 @@ def test_an_object_has_another_size_mass_and_friction(metaworld: MujocoWorld) ->
     size = after["geom_size"][geom, 0] / before["geom_size"][geom, 0]
     mass = after["body_mass"][body] / before["body_mass"][body]
     friction = after["geom_friction"] / before["geom_friction"]
-    from kerv_cli.environments.stress.objects import LEVELS
+    from kerv_cli.worlds.stress.objects import LEVELS
 
     assert np.isclose(max(size, 1 / size), LEVELS[2].size)
     assert np.isclose(max(mass, 1 / mass), LEVELS[2].mass)
@@ -276,7 +276,7 @@ def test_an_object_has_another_size_mass_and_friction(metaworld: MujocoWorld) ->
 
 
 def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metaworld: MujocoWorld) -> None:
-    from kerv_cli.environments.stress.objects import LEVELS
+    from kerv_cli.worlds.stress.objects import LEVELS
 
     inside = play(metaworld, "none", 0, steps=1).start
     outside = play(metaworld, "object", 1, steps=1).start
@@ -379,7 +379,7 @@ def test_what_an_environment_cannot_do_is_refused() -> None:
 
 
 def kerv(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.app", *words]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words]
     paths = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "KERV_PLUGINS": "examples.insertion", "PYTHONPATH": os.pathsep.join(paths)}
     return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env=environment)
@@ -398,7 +398,7 @@ def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -
 
 
 def test_the_plan_and_the_figures_say_which_stress_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from kerv_cli.commands.rollout import rollout
+    from kerv_cli.cli.rollout import rollout
 
     words = [*WORDS, "world.stress.level=2", f"results={tmp_path}"]
     rollout(words, plan=True)

@@ -9,18 +9,18 @@ import pandas as pd
 import pytest
 from studies_synthetic import run_cell, settings_of
 
-from kerv_cli.config import compose
-from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.reporting.page import verdict as page_verdict
-from kerv_cli.reporting.plots import study_figures
-from kerv_cli.reporting.report import report
-from kerv_cli.reporting.stressed import by_kind, is_stressed, stem, summed_table, verdict
-from kerv_cli.reporting.tables import StudyData, load_study, rows_of, study_table
-from kerv_cli.settings import RolloutSettings, StressSettings, StudySettings, SweepSettings
-from kerv_cli.studies.identity import stress_of
-from kerv_cli.studies.plan import Cell, plan
-from kerv_cli.studies.resolve import resolve
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.config import compose
+from kerv_cli.base.settings import RolloutSettings, StressSettings, StudySettings, SweepSettings
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.lab.identity import stress_of
+from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.resolve import resolve
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.page import verdict as page_verdict
+from kerv_cli.report.plots import study_figures
+from kerv_cli.report.report import report
+from kerv_cli.report.stressed import by_kind, is_stressed, stem, summed_table, verdict
+from kerv_cli.report.tables import StudyData, load_study, rows_of, study_table
 
 TASKS = ["reach-v3", "push-v3"]
 EPISODES = 20

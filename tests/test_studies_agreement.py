@@ -8,12 +8,12 @@ import pandas as pd
 import pytest
 from studies_synthetic import prepare, threshold_settings, threshold_study
 
-from kerv_cli.errors import UsageError
-from kerv_cli.reporting.agreement import agreement_summary, agreement_table
-from kerv_cli.reporting.report import report
-from kerv_cli.reporting.tables import load_study, study_table
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.errors import UsageError
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.agreement import agreement_summary, agreement_table
+from kerv_cli.report.report import report
+from kerv_cli.report.tables import load_study, study_table
 
 
 def run(results: Path) -> StudyStore:

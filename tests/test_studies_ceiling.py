@@ -13,13 +13,13 @@ import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, part, settings_of, still_episode
 
-from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.reporting.measures import MACRO, MICRO
-from kerv_cli.reporting.summary import summary_frame
-from kerv_cli.reporting.tables import flatten, load_study, per_task_table, study_table
-from kerv_cli.settings import RolloutSettings, StudySettings
-from kerv_cli.studies.plan import Cell, make_cell, plan
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.settings import RolloutSettings, StudySettings
+from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.lab.plan import Cell, make_cell, plan
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.measures import MACRO, MICRO
+from kerv_cli.report.summary import summary_frame
+from kerv_cli.report.tables import flatten, load_study, per_task_table, study_table
 
 STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip"}
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())

@@ -27,18 +27,18 @@ from studies_synthetic import (
     threshold_study,
 )
 
-from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.errors import StorageError, UsageError
-from kerv_cli.settings import RuntimeSettings
-from kerv_cli.studies.block import RunEpisode
-from kerv_cli.studies.claims import is_claimed
-from kerv_cli.studies.estimate import estimate
-from kerv_cli.studies.events import BlockStarted, CellDone, CellFailed, CellReused, Event, SweepFinished, SweepStarted
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Cell, blocks_of
-from kerv_cli.studies.progress import ProgressDisplay
-from kerv_cli.studies.reuse import Stock, cover
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.errors import StorageError, UsageError
+from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.cli.progress import ProgressDisplay
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.lab.block import RunEpisode
+from kerv_cli.lab.claims import is_claimed
+from kerv_cli.lab.estimate import estimate
+from kerv_cli.lab.events import BlockStarted, CellDone, CellFailed, CellReused, Event, SweepFinished, SweepStarted
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.plan import Cell, blocks_of
+from kerv_cli.lab.reuse import Stock, cover
+from kerv_cli.lab.store import StudyStore
 
 
 @pytest.fixture
@@ -187,7 +187,7 @@ def test_a_cell_that_is_completed_meanwhile_is_not_run_again(store: StudyStore) 
 
 def test_two_sweeps_share_the_work(store: StudyStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """Started together, they run every cell once, and both end with all of them."""
-    monkeypatch.setattr("kerv_cli.studies.execute._POLL_SECONDS", 0.02)
+    monkeypatch.setattr("kerv_cli.lab.execute._POLL_SECONDS", 0.02)
     cells = threshold_study(["reach-v3", "push-v3", "door-open-v3"])
     ran: list[tuple[str, str]] = []
 
@@ -228,9 +228,9 @@ def test_over_processes_only_the_guilty_cells_fail(store: StudyStore) -> None:
 KILLED_PARENT = """
 import sys
 from studies_synthetic import slow_elsewhere, threshold_study
-from kerv_cli.settings import RuntimeSettings
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.store import StudyStore
 
 cells = threshold_study(["reach-v3", "push-v3"])
 execute(cells, slow_elsewhere, StudyStore(sys.argv[1], "threshold"), RuntimeSettings(workers=2))

@@ -15,17 +15,17 @@ from typing import Any
 import pytest
 from studies_synthetic import misbehave, prepare, slow_elsewhere, threshold_study
 
-from kerv_cli.config import compose
-from kerv_cli.decoding.record import EpisodeRecord
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.settings import RolloutSettings, RuntimeSettings
-from kerv_cli.studies.block import RunEpisode
-from kerv_cli.studies.claims import is_claimed
-from kerv_cli.studies.events import CellDone, Event
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.executors import check_executor
-from kerv_cli.studies.plan import Cell
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.lab.block import RunEpisode
+from kerv_cli.lab.claims import is_claimed
+from kerv_cli.lab.events import CellDone, Event
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.executors import check_executor
+from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.store import StudyStore
 
 HERE = Path(__file__).parent
 PACKAGES = {"slurm": "submitit", "ray": "ray"}
@@ -117,8 +117,8 @@ def test_the_command_line_takes_an_executor_from_outside() -> None:
     path = os.pathsep.join([str(HERE / "examples"), *(p for p in sys.path if p)])
     environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": "thread_executor"}
     script = (
-        "from kerv_cli.settings import RuntimeSettings as R\n"
-        "from kerv_cli.studies.executors import check_executor\n"
+        "from kerv_cli.base.settings import RuntimeSettings as R\n"
+        "from kerv_cli.lab.executors import check_executor\n"
         "print(check_executor(R(executor='threads')).name)"
     )
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)

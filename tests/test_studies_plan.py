@@ -13,12 +13,12 @@ import pytest
 from studies_synthetic import IDENTITY, settings_of, threshold_settings, threshold_study
 
 import kerv_cli
-from kerv_cli.errors import UsageError
-from kerv_cli.settings import RolloutSettings, as_plain
-from kerv_cli.studies.code import _meaning, code_hash
-from kerv_cli.studies.identity import ENGINE, hash_of, work_of
-from kerv_cli.studies.plan import blocks_of, parse_seeds, plan, seeds_text, unique_cells
-from kerv_cli.studies.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import RolloutSettings, as_plain
+from kerv_cli.lab.code import _meaning, code_hash
+from kerv_cli.lab.identity import ENGINE, hash_of, work_of
+from kerv_cli.lab.plan import blocks_of, parse_seeds, plan, seeds_text, unique_cells
+from kerv_cli.lab.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
 
 
 def only_id(settings: RolloutSettings, task: str = "reach-v3", identity: dict[str, str] | None = None) -> str:
@@ -85,7 +85,7 @@ def test_task_and_weights_change_the_id_and_code_does_not(monkeypatch: pytest.Mo
     assert only_id(settings, task="push-v3") != before
     assert only_id(settings, identity={**IDENTITY, "drafter": "c" * 64}) != before
     with monkeypatch.context() as other:
-        other.setattr("kerv_cli.studies.code.code_hash", lambda: "f" * 64)
+        other.setattr("kerv_cli.lab.code.code_hash", lambda: "f" * 64)
         assert only_id(settings) == before
     assert work_of(as_plain(settings), IDENTITY, engine=ENGINE + 1) != work_of(as_plain(settings), IDENTITY)
 
@@ -146,9 +146,9 @@ def test_the_code_below_the_commands_counts_and_nothing_else(tmp_path: Path, mon
         return code_hash.__wrapped__()
 
     before = code_hash.__wrapped__()
-    assert hash_after("reporting/tables.py", "x = 1") == hash_after("commands/sweep.py", "x = 1") == before
-    assert hash_after("settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
-    computing = [hash_after(file, "x = 1") for file in ("decoding/decoder.py", "settings.py", "rollouts/run.py")]
+    assert hash_after("report/tables.py", "x = 1") == hash_after("cli/sweep.py", "x = 1") == before
+    assert hash_after("base/settings.py", '# a comment\n"""and a string that stands alone"""\n') == before
+    computing = [hash_after(file, "x = 1") for file in ("engine/decoder.py", "base/settings.py", "lab/run.py")]
     assert len({before, *computing}) == 4
 
 

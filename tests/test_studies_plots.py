@@ -13,16 +13,16 @@ import pytest
 from matplotlib.figure import Figure
 from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
-from kerv_cli.registry import Part
-from kerv_cli.reporting.drawing import COLOURS, INK, STYLE, new_figure, setting_colours
-from kerv_cli.reporting.measures import MICRO
-from kerv_cli.reporting.plots import series_of, study_figures
-from kerv_cli.reporting.scatter import place_labels
-from kerv_cli.reporting.tables import load_study, study_table
-from kerv_cli.reporting.task_map import has_task_map, task_map
-from kerv_cli.settings import RolloutSettings, StudySettings
-from kerv_cli.studies.plan import plan
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.registry import Part
+from kerv_cli.base.settings import RolloutSettings, StudySettings
+from kerv_cli.lab.plan import plan
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.drawing import COLOURS, INK, STYLE, new_figure, setting_colours
+from kerv_cli.report.measures import MICRO
+from kerv_cli.report.plots import series_of, study_figures
+from kerv_cli.report.scatter import place_labels
+from kerv_cli.report.tables import load_study, study_table
+from kerv_cli.report.task_map import has_task_map, task_map
 
 
 def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:
@@ -135,7 +135,7 @@ def test_a_part_gives_its_setting_a_colour_once_and_the_baseline_is_ink(monkeypa
     drafter = Part("proposer", "drafter", "nowhere:build", colour=0x123456)
     none = Part("proposer", "none", "nowhere:build", colour=0x6E7B8B)
     monkeypatch.setattr(
-        "kerv_cli.reporting.drawing.parts",
+        "kerv_cli.report.drawing.parts",
         lambda kind: {"drafter": drafter, "none": none} if kind == "proposer" else {},
     )
     kinds = {"ar": "none", "spec_vla": "drafter", "hold": "hold", "kerv": "drafter", "one_pass": "none"}

@@ -8,13 +8,15 @@ import pandas as pd
 import pytest
 from studies_synthetic import IDENTITY, part, run_cell, settings_of
 
-from kerv_cli.artifacts import MadeFor
-from kerv_cli.decoding.calibration_file import Calibration, Demonstrations, save_calibration
-from kerv_cli.drafting.kinematics import FILTERS, Noise
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError
-from kerv_cli.files import read_json, sha256_of, write_json
-from kerv_cli.reporting.prediction import (
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.settings import StudySettings
+from kerv_cli.lab.plan import plan
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.methods.artifacts import MadeFor
+from kerv_cli.methods.calibration_file import Calibration, Demonstrations, save_calibration
+from kerv_cli.methods.kinematics import FILTERS, Noise
+from kerv_cli.report.prediction import (
     calibrated_targets,
     predicting_targets,
     prediction_figure,
@@ -22,10 +24,8 @@ from kerv_cli.reporting.prediction import (
     prediction_table,
     read_predictions,
 )
-from kerv_cli.reporting.report import report
-from kerv_cli.settings import StudySettings
-from kerv_cli.studies.plan import plan
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.report.report import report
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 DOFS = ("dx", "dy", "dz", "gripper")
 STATUS = {"run": "r1", "workers": 1, "device_name": "chip"}

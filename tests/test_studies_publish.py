@@ -8,18 +8,18 @@ import pandas as pd
 import pytest
 from studies_synthetic import prepare, threshold_settings, threshold_study
 
-from kerv_cli.reporting.publish import Unpublishable, refusals
-from kerv_cli.reporting.report import report
-from kerv_cli.reporting.tables import load_study, study_table
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.publish import Unpublishable, refusals
+from kerv_cli.report.report import report
+from kerv_cli.report.tables import load_study, study_table
 
 COMMIT = "c" * 40
 
 
 def begin(folder: Path, monkeypatch: pytest.MonkeyPatch, commit: str = COMMIT) -> StudyStore:
     """A planned study whose cells say that this commit computed them."""
-    for module in ("kerv_cli.studies.execute", "kerv_cli.provenance"):
+    for module in ("kerv_cli.lab.execute", "kerv_cli.base.provenance"):
         monkeypatch.setattr(f"{module}.git_commit", lambda: commit)
     store = StudyStore(folder, "threshold")
     store.write_plan(threshold_settings(), threshold_study(["reach-v3", "push-v3"]))

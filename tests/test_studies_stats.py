@@ -9,7 +9,7 @@ import pytest
 from statsmodels.stats.contingency_tables import mcnemar as statsmodels_mcnemar
 from statsmodels.stats.proportion import proportion_confint
 
-from kerv_cli.reporting.statistics import (
+from kerv_cli.report.statistics import (
     PairedCounts,
     macro_wilson,
     mcnemar,

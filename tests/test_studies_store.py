@@ -16,12 +16,12 @@ import pyarrow.parquet as pq
 import pytest
 from studies_synthetic import episode, run_cell, threshold_settings, threshold_study
 
-from kerv_cli.decoding.record import PHASES
-from kerv_cli.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.leftovers import is_left_over
-from kerv_cli.studies import claims, rows
-from kerv_cli.studies.plan import Cell
-from kerv_cli.studies.store import StudyStore, begun_studies
+from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.base.leftovers import is_left_over
+from kerv_cli.engine.record import PHASES
+from kerv_cli.lab import claims, rows
+from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.store import StudyStore, begun_studies
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 
@@ -108,8 +108,8 @@ KILLED_WRITER = """
 import os, signal, sys
 from studies_synthetic import run_cell, threshold_study
 from pathlib import Path
-from kerv_cli import files
-from kerv_cli.studies import store as module
+from kerv_cli.base import files
+from kerv_cli.lab import store as module
 
 cell = threshold_study(["reach-v3"])[-1]
 store = module.StudyStore(sys.argv[1], "threshold")
@@ -217,7 +217,7 @@ def test_claims_expire(store: StudyStore, cell: Cell, host: str, pid: str, hours
 CONCURRENT_WRITER = """
 import pathlib, sys, time
 from studies_synthetic import run_cell, threshold_settings, threshold_study
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.lab.store import StudyStore
 
 results, me, task = sys.argv[1:]
 store = StudyStore(results, "threshold")

@@ -24,18 +24,18 @@ from studies_synthetic import (
     threshold_study,
 )
 
-from kerv_cli.decoding.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.errors import UsageError
-from kerv_cli.reporting.measures import MACRO, MICRO
-from kerv_cli.reporting.report import report
-from kerv_cli.reporting.statistics import PairedCounts, paired_difference, wilson
-from kerv_cli.reporting.summary import not_in_turn, summary_frame, summary_table
-from kerv_cli.reporting.tables import StudyData, csv_text, load_study, per_task_table, study_table
-from kerv_cli.settings import StudySettings
-from kerv_cli.studies.execute import execute
-from kerv_cli.studies.plan import Cell, plan
-from kerv_cli.studies.rows import Circumstances
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import StudySettings
+from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.rows import Circumstances
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.measures import MACRO, MICRO
+from kerv_cli.report.report import report
+from kerv_cli.report.statistics import PairedCounts, paired_difference, wilson
+from kerv_cli.report.summary import not_in_turn, summary_frame, summary_table
+from kerv_cli.report.tables import StudyData, csv_text, load_study, per_task_table, study_table
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
 STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip", "torch_version": "2", "git_commit": "c"}
@@ -397,7 +397,7 @@ def test_the_page_stands_alone(results: Path) -> None:
 
 
 def test_figures_show_the_axis_and_the_references(results: Path) -> None:
-    from kerv_cli.reporting.plots import series_of, study_figures
+    from kerv_cli.report.plots import series_of, study_figures
 
     table = study_table(load_study(StudyStore(results, "threshold")))
     rows = table[table["averaging"] == MICRO]

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.config import compose
-from kerv_cli.decoding.build import Context
-from kerv_cli.decoding.thresholds import Threshold
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.registry import find
-from kerv_cli.settings import RolloutSettings
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import find
+from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.methods.build import Context
+from kerv_cli.methods.thresholds import Threshold
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 levels = st.floats(0, 50)
 CLOSED_LOOP = ("kinematic", "change")

@@ -17,19 +17,19 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from kerv_cli import files
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, Interrupted
-from kerv_cli.files import sha256_of
-from kerv_cli.settings import DrafterSettings, TargetSettings, TrainSettings
+from kerv_cli.base import files
+from kerv_cli.base.errors import CheckpointError, Interrupted
+from kerv_cli.base.files import sha256_of
+from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainSettings
 from kerv_cli.targets.checkpoint import load_target, save_target, save_tensors
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import determining
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
@@ -205,7 +205,7 @@ def test_weights_can_be_stored_in_fewer_bits(tmp_path: Path) -> None:
 WITHOUT_VIEWER = """
 import sys
 sys.modules["rerun"] = None  # an import of it raises
-from kerv_cli.app import app
+from kerv_cli.cli.app import app
 results = sys.argv[1]
 train = ["target=nano", "target.observation=state", "train.steps=2", "train.batch=2"]
 train += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4", "name=blind", "demos=few"]
@@ -242,7 +242,7 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
 
 
 def test_batched_greedy_decoding_is_the_decoders() -> None:
-    from kerv_cli.decoding.decoder import Decoder
+    from kerv_cli.engine.decoder import Decoder
 
     torch.manual_seed(0)
     settings = TargetSettings(observation="state", width=32, layers=2, heads=2, feed_forward=48, scene_tokens=2)
@@ -261,7 +261,7 @@ def train(results: Path, *arguments: str) -> list[str]:
         "-W",
         "ignore",
         "-m",
-        "kerv_cli.app",
+        "kerv_cli.cli.app",
         "train",
         *arguments,
         f"results={results}",

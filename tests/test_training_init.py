@@ -12,18 +12,18 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from kerv_cli.config import compose
-from kerv_cli.environments.demos.dataset import DemoDataset, DemoEntry
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training import runs
 from kerv_cli.training.loop import read_state
 from kerv_cli.training.runs import TargetRun
+from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 

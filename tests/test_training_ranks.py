@@ -12,19 +12,19 @@ import pandas as pd
 import pytest
 import torch
 
-from kerv_cli.environments import spec_of
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.recording import DemoConfig, record, run_expert
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.settings import TrainSettings, WorldSettings
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.settings import TrainSettings, WorldSettings
 from kerv_cli.training.dagger import TargetActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import balanced
 from kerv_cli.training.loop import Job
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.runs import determining
+from kerv_cli.worlds import spec_of
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 SHORT = CameraConfig()
 SIZES = ("target.width=16", "target.layers=1", "target.heads=2", "target.feed_forward=16")

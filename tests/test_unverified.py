@@ -13,14 +13,14 @@ from examples.own_target import SEVEN, MockTarget
 from test_decoding_lossless import plain_greedy, random_prompt, random_target
 from test_proposers import stored
 
-from kerv_cli.decoding.chunk import Chunk
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import ChainProposer, PredictionProposer, RetrievalProposer
-from kerv_cli.decoding.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
-from kerv_cli.drafting.kinematics import Hold
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.parts import SimilaritySkipSettings
-from kerv_cli.spaces import Observation
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.kinematics import Hold
+from kerv_cli.methods.parts import SimilaritySkipSettings
+from kerv_cli.methods.proposers import ChainProposer, PredictionProposer, RetrievalProposer
+from kerv_cli.methods.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 PAUSE = 0.03
 SHOWN = Observation(np.array([0.3]), np.zeros(0), "go there")

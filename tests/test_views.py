@@ -11,20 +11,20 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from kerv_cli.app import app
-from kerv_cli.config import compose
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.environments.metaworld.world import MetaWorld
-from kerv_cli.environments.stress.base import NO_STRESS, Stress
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.settings import TargetSettings, TrainTargetSettings
-from kerv_cli.spaces import Observation
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.settings import TargetSettings, TrainTargetSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.base.views import View, frame_shape, views_of
+from kerv_cli.cli.app import app
 from kerv_cli.targets.compact.packed import has_blocked_layouts, pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary
-from kerv_cli.views import View, frame_shape, views_of
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.metaworld.world import MetaWorld
+from kerv_cli.worlds.stress.base import NO_STRESS, Stress
 
 SIZE = 32
 HAND = "corner4+gripperPOV:75"

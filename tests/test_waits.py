@@ -12,9 +12,13 @@ from pretended_device import DEVICE, Device, There, move
 from test_decoding_lossless import random_prompt, random_target
 from test_proposers import HELD, D, situation, stored
 
-from kerv_cli.decoding.boundary import Always
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import (
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.boundary import Always
+from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.early import EarlyDrafter
+from kerv_cli.methods.kinematics import Hold, Kalman, Noise
+from kerv_cli.methods.proposers import (
     DrafterProposer,
     EarlyProposer,
     HybridProposer,
@@ -23,10 +27,6 @@ from kerv_cli.decoding.proposers import (
     PredictionProposer,
     RetrievalProposer,
 )
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.drafting.early import EarlyDrafter
-from kerv_cli.drafting.kinematics import Hold, Kalman, Noise
-from kerv_cli.settings import DrafterSettings
 from kerv_cli.targets.compact.trunk import LayerStack
 
 CHUNK = 2

@@ -7,9 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from kerv_cli.config import compose, groups
-from kerv_cli.decoding.cost import Profile
-from kerv_cli.settings import EXPERT, RolloutSettings
+from kerv_cli.base.config import compose, groups
+from kerv_cli.base.settings import EXPERT, RolloutSettings
+from kerv_cli.engine.cost import Profile
 
 
 @dataclass(frozen=True)

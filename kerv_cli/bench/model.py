@@ -11,26 +11,26 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.artifacts import Artifacts
-from kerv_cli.config import compose, groups
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.environments.metaworld.spec import SPEC
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.runtime import DTYPES, set_up
-from kerv_cli.settings import (
+from kerv_cli.base.config import compose, groups
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.runtime import DTYPES, set_up
+from kerv_cli.base.settings import (
     BenchSettings,
     DrafterSettings,
     PolicySettings,
     TargetSettings,
     TrainTargetSettings,
 )
-from kerv_cli.spaces import Observation
+from kerv_cli.base.spaces import Observation
+from kerv_cli.base.views import frame_shape
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.eagle import Drafter
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
 from kerv_cli.training.imitation import vocabulary
-from kerv_cli.views import frame_shape
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encoder, caches, one layer twice
 
@@ -136,7 +136,7 @@ def open_model(settings: BenchSettings) -> Model:
 
 
 def _policies(results: str) -> list[str]:
-    from kerv_cli.places import results_dir, shipped_dir
+    from kerv_cli.base.places import results_dir, shipped_dir
 
     folders = (results_dir(results) / "artifacts" / "target", shipped_dir())
     return sorted(path.name for folder in folders for path in folder.glob("*") if path.is_dir())

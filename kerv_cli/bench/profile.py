@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.phases import Phase
-from kerv_cli.decoding.cost import KINDS, Profile
+from kerv_cli.engine.cost import KINDS, Profile
 
 
 def profile_of(prompt: int, phases: Sequence[Phase]) -> Profile:

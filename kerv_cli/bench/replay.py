@@ -13,10 +13,10 @@ from kerv_cli.bench.machine import synchronise
 from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Stage
 from kerv_cli.bench.sequences import Recorded
-from kerv_cli.decoding.cost import DRAFTER, DecodeSequence, Forward
-from kerv_cli.drafting.eagle import draft_tree
-from kerv_cli.drafting.tree import TokenTree, visible_in_verification
-from kerv_cli.drafting.unread import Unread
+from kerv_cli.engine.cost import DRAFTER, DecodeSequence, Forward
+from kerv_cli.engine.tree import TokenTree, visible_in_verification
+from kerv_cli.engine.unread import Unread
+from kerv_cli.methods.eagle import draft_tree
 
 _SPARE = 8
 

@@ -11,6 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import atomic_path, write_json
+from kerv_cli.base.provenance import stamp
+from kerv_cli.base.settings import BenchReplaySettings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import Model
 from kerv_cli.bench.phases import Phase, measure
@@ -18,12 +22,8 @@ from kerv_cli.bench.profile import profile_of, projected
 from kerv_cli.bench.replay import Player, play_all
 from kerv_cli.bench.run import open_and_card, place_of
 from kerv_cli.bench.sequences import Recorded, read_study
-from kerv_cli.decoding.cost import Profile, predicted, read_profile
-from kerv_cli.errors import UsageError
-from kerv_cli.files import atomic_path, write_json
-from kerv_cli.provenance import stamp
-from kerv_cli.settings import BenchReplaySettings
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.engine.cost import Profile, predicted, read_profile
+from kerv_cli.lab.store import StudyStore
 
 _RESAMPLES = 2000
 _PER_LAYER = 15e-6  # seconds per layer and forward below which projections do not go: kernels of a captured graph

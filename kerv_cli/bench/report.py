@@ -66,8 +66,8 @@ def plot_roofline(path: Path, title: str, machine: Machine, phases: Sequence[Pha
     import matplotlib as mpl
     import numpy as np
 
-    from kerv_cli.files import atomic_path
-    from kerv_cli.reporting.drawing import INK, STYLE, colour, entitle, new_figure
+    from kerv_cli.base.files import atomic_path
+    from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
 
     shown = [phase for phase in phases if phase.floor > 0]
     with mpl.rc_context(STYLE):

@@ -9,14 +9,14 @@ from typing import Any
 
 import torch
 
+from kerv_cli.base.places import results_dir
+from kerv_cli.base.provenance import stamp
+from kerv_cli.base.settings import BenchSettings
 from kerv_cli.bench.ceilings import MethodCeiling, ceilings
 from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
 from kerv_cli.bench.phases import Phase, Stage, costs, flipped, measure
 from kerv_cli.bench.profile import profile_of
-from kerv_cli.places import results_dir
-from kerv_cli.provenance import stamp
-from kerv_cli.settings import BenchSettings
 
 FLIP_CHUNKS = 8
 

@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
-from kerv_cli.decoding.cost import DECODE_TIMES, DecodeSequence, sequence_of
-from kerv_cli.errors import UsageError
-from kerv_cli.studies.identity import batch_of
-from kerv_cli.studies.plan import Cell
-from kerv_cli.studies.store import StudyStore
+from kerv_cli.base.errors import UsageError
+from kerv_cli.engine.cost import DECODE_TIMES, DecodeSequence, sequence_of
+from kerv_cli.lab.identity import batch_of
+from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.store import StudyStore
 
 _COLUMNS = ["task", "seed", "index", "rounds", *DECODE_TIMES]
 

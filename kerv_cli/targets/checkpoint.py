@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.files import atomic_path, read_json, sha256_of, write_json
-from kerv_cli.manifests import read
-from kerv_cli.registry import find, load, parts
-from kerv_cli.spaces import ActionSpace, ObservationSpace
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import atomic_path, read_json, sha256_of, write_json
+from kerv_cli.base.manifests import read
+from kerv_cli.base.registry import find, load, parts
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 
 if TYPE_CHECKING:  # torch is imported where weights are read or written: a description is read without it
     import torch

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.findings import Failed, Finding, run
-from kerv_cli.spaces import ActionSpace, Observation
-from kerv_cli.targets.protocol import Target
+from kerv_cli.base.findings import Failed, Finding, run
+from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.protocol import Target
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
 """Largest difference of logits relative to their spread, by number format: products are summed in other orders."""
@@ -55,7 +55,7 @@ def check_target(target: Target, observation: Observation, seed: int = 0) -> lis
 def _members(target: Any) -> str:
     missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(target, name)]
     if missing:
-        raise Failed(f"{type(target).__name__} lacks {', '.join(missing)} (kerv_cli/targets/protocol.py)")
+        raise Failed(f"{type(target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
     if not isinstance(target.actions, ActionSpace):
         raise Failed(f"actions is {type(target.actions).__name__}, an ActionSpace is wanted")
     if target.chunk < 1 or target.width < 1 or target.max_prompt < 1:

@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kerv_cli.artifacts import Artifacts, MadeFor
-from kerv_cli.decoding.boundary import BoundaryRanges
-from kerv_cli.decoding.build import compose
-from kerv_cli.decoding.calibration_file import (
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.places import artifact
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
+from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.boundary import BoundaryRanges
+from kerv_cli.methods.build import compose
+from kerv_cli.methods.calibration_file import (
     BoundarySection,
     Calibration,
     Demonstrations,
@@ -23,13 +28,6 @@ from kerv_cli.decoding.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from kerv_cli.environments import resolve_tasks
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import CheckpointError, KervError, UsageError
-from kerv_cli.places import artifact
-from kerv_cli.provenance import provenance
-from kerv_cli.settings import CalibrateSettings, RolloutSettings, as_plain
-from kerv_cli.spaces import Observation, ObservationSpace
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.observations import check_frames, check_shown, instruction_of
 from kerv_cli.training.predictor_fit import (
@@ -39,10 +37,12 @@ from kerv_cli.training.predictor_fit import (
     prediction_errors,
     read_windows,
 )
+from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 if TYPE_CHECKING:
-    from kerv_cli.decoding.decoder import Decoder
-    from kerv_cli.environments.demos.episode_file import DemoEpisode
+    from kerv_cli.engine.decoder import Decoder
+    from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from kerv_cli.environments import resolve_tasks
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 ALL, HALF = "all", "half"
 

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kerv_cli.decoding.build import own_decoder
-from kerv_cli.environments.demos.recording import DemoConfig
-from kerv_cli.environments.spec import EnvironmentSpec, World
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.places import find_target
-from kerv_cli.settings import WorldSettings
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.places import find_target
+from kerv_cli.base.settings import WorldSettings
+from kerv_cli.methods.build import own_decoder
 from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.worlds.demos.recording import DemoConfig
+from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 
 class TargetActor:

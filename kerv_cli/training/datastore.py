@@ -12,8 +12,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from kerv_cli.artifacts import Artifacts
-from kerv_cli.drafting.datastore import (
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.files import read_json, sha256_of, write_folder, write_json
+from kerv_cli.base.places import artifact
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import BuildDatastoreSettings
+from kerv_cli.base.spaces import ObservationSpace
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.datastore import (
     PAYLOAD,
     PROJECTION,
     VECTORS,
@@ -24,15 +31,6 @@ from kerv_cli.drafting.datastore import (
     projected,
     prompt_key,
 )
-from kerv_cli.environments import resolve_tasks
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.files import read_json, sha256_of, write_folder, write_json
-from kerv_cli.places import artifact
-from kerv_cli.provenance import provenance
-from kerv_cli.runtime import set_up
-from kerv_cli.settings import BuildDatastoreSettings
-from kerv_cli.spaces import ObservationSpace
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import covered
 from kerv_cli.training.demonstrations import open_demos
@@ -40,6 +38,8 @@ from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_shown, read_chunks, read_observations
 from kerv_cli.training.recorded import prompts_of, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
+from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 128  # observations encoded at once
 KEYS = ("vision", "scene", "proprioception")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.places import artifact
+from kerv_cli.base.places import artifact
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 
 def open_demos(results: str, names: str) -> DemoDataset:

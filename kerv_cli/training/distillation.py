@@ -13,14 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.decoding.acceptance import Acceptance
-from kerv_cli.decoding.decoder import Decoder, Parts
-from kerv_cli.decoding.proposers import DrafterProposer
-from kerv_cli.decoding.thresholds import Fixed
-from kerv_cli.drafting.eagle import Drafter
-from kerv_cli.settings import DrafterSettings
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.engine.acceptance import Acceptance
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.protocol import Target
+from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.proposers import DrafterProposer
+from kerv_cli.methods.thresholds import Fixed
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.protocol import Target
 from kerv_cli.training.imitation import Samples
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows

@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.drafting.early import EarlyDrafter, choose, padded
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.settings import DrafterSettings, TrainSettings
+from kerv_cli.base.settings import DrafterSettings, TrainSettings
+from kerv_cli.methods.early import EarlyDrafter, choose, padded
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, Rows, observed_steps, read_observations
 from kerv_cli.training.recorded import prompts_of, spread_steps
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 64  # observations that the target decodes at once
 RADII = {"strict": 0, "r3": 3, "r9": 9}

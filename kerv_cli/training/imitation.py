@@ -18,16 +18,16 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from kerv_cli.environments import specs
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.settings import TargetSettings, TrainSettings
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Job, Metrics
 from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
+from kerv_cli.worlds import specs
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 WITHIN = 9
 """Bins; the share of tokens this close is reported (the relaxed radius of Spec-VLA)."""

@@ -18,10 +18,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from kerv_cli.errors import CheckpointError, Interrupted, KervError
-from kerv_cli.files import atomic_path
-from kerv_cli.manifests import read
-from kerv_cli.settings import TrainSettings
+from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
+from kerv_cli.base.files import atomic_path
+from kerv_cli.base.manifests import read
+from kerv_cli.base.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 from kerv_cli.training.interruption import Stop, until_interrupted
 from kerv_cli.training.ranks import ALONE, Ranks

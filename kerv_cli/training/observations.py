@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.environments import spec_of, specs
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.environments.demos.frames import EncodedFrames
-from kerv_cli.errors import CheckpointError
-from kerv_cli.settings import TargetSettings
-from kerv_cli.spaces import ActionSpace, ObservationSpace
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.settings import TargetSettings
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.worlds import spec_of, specs
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.frames import EncodedFrames
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.artifacts import Artifacts
-from kerv_cli.drafting.public import Convention, read_public, save_public
-from kerv_cli.errors import UsageError
-from kerv_cli.files import write_json
-from kerv_cli.provenance import provenance
-from kerv_cli.runtime import set_up
-from kerv_cli.settings import BuildDrafterSettings, DrafterSettings
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import write_json
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import BuildDrafterSettings, DrafterSettings
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.public import Convention, read_public, save_public
 from kerv_cli.targets.checkpoint import FORMAT
 
 

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from kerv_cli.errors import UsageError
+from kerv_cli.base.errors import UsageError
 
 PATIENCE = timedelta(hours=3)
 """How long a rank waits for the others: the first one may validate in closed loop meanwhile."""

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.environments.demos.episode_file import DemoEpisode
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.spaces import Observation, ObservationSpace
-from kerv_cli.targets.protocol import Target
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.protocol import Target
 from kerv_cli.training.distillation import StatesByLength, TeacherStates, greedy
 from kerv_cli.training.observations import instruction_of
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 
 def steps_of(target: Target, episode: DemoEpisode) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.files import atomic_path
+from kerv_cli.base.files import atomic_path
 
 Row = dict[str, Any]
 FOLDER = "records"

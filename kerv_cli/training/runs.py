@@ -13,16 +13,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from kerv_cli.artifacts import artifact_folder
-from kerv_cli.drafting.eagle import Drafter, save_drafter
-from kerv_cli.drafting.early import EarlyDrafter, save_early
-from kerv_cli.environments import resolve_tasks, settled, spec_of
-from kerv_cli.environments.demos.dataset import DemoDataset
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.places import artifact, find_target
-from kerv_cli.provenance import provenance
-from kerv_cli.runtime import set_up
-from kerv_cli.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.places import artifact, find_target
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.methods.artifacts import artifact_folder
+from kerv_cli.methods.eagle import Drafter, save_drafter
+from kerv_cli.methods.early import EarlyDrafter, save_early
 from kerv_cli.targets.checkpoint import load_target, read_target, save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import covered
@@ -43,6 +41,8 @@ from kerv_cli.training.loop import Job, Loop, Metrics
 from kerv_cli.training.observations import check_camera, check_shown, check_spaces, split
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.recorded import teach_recorded
+from kerv_cli.worlds import resolve_tasks, settled, spec_of
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 Progress = Callable[[int, int], None]
 
@@ -232,7 +232,7 @@ class TargetRun(Run):
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
-        from kerv_cli.rollouts.run import success_of
+        from kerv_cli.lab.run import success_of
 
         seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
         return success_of(target, self.tasks, seeds, self.world)

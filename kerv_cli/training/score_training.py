@@ -11,13 +11,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kerv_cli.artifacts import Artifacts
-from kerv_cli.decoding.risk_file import FEATURES, RiskRecording
-from kerv_cli.drafting.learned_score import FLOOR, LearnedScore, save_score
-from kerv_cli.errors import CheckpointError
-from kerv_cli.provenance import provenance
-from kerv_cli.reporting.risk import BAD, auc
-from kerv_cli.settings import TrainScoreSettings
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.settings import TrainScoreSettings
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.learned_score import FLOOR, LearnedScore, save_score
+from kerv_cli.methods.risk_file import FEATURES, RiskRecording
+from kerv_cli.report.risk import BAD, auc
 
 Metrics = dict[str, float]
 

@@ -9,8 +9,8 @@ import torch
 from examples.own_target import SEVEN
 from torch import Tensor
 
-from kerv_cli.registry import Part, register
-from kerv_cli.spaces import ActionSpace, Observation
+from kerv_cli.base.registry import Part, register
+from kerv_cli.base.spaces import ActionSpace, Observation
 
 
 class Remembered:

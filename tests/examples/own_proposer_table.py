@@ -13,12 +13,12 @@ import torch
 from examples.own_proposer import FollowSettings
 from torch import Tensor, nn
 
-from kerv_cli.artifacts import Artifact, Request, artifact_folder
-from kerv_cli.decoding.build import Context
-from kerv_cli.decoding.chunk import Chunk
-from kerv_cli.decoding.proposers import ChainProposer
-from kerv_cli.errors import CheckpointError
-from kerv_cli.spaces import ActionSpace
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.methods.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.methods.build import Context
+from kerv_cli.methods.proposers import ChainProposer
 from kerv_cli.targets.checkpoint import Description, TargetDescription, load_state, read_description, save_module
 
 

@@ -1,4 +1,4 @@
-"""Example: a target of your own in one file. It needs no transformer, only `kerv_cli/targets/protocol.py`.
+"""Example: a target of your own in one file. It needs no transformer, only `kerv_cli/engine/protocol.py`.
 
 Its hidden state is a sum over all that is visible, weighted by position, so a wrong mask, position or cache entry
 changes its tokens: the tests of the decode loop run on it. `KERV_PLUGINS=examples.own_target` registers it, and every
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.registry import Part, register
-from kerv_cli.spaces import ActionSpace, Group, Observation
+from kerv_cli.base.registry import Part, register
+from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.targets.checkpoint import TargetDescription
 
 SEVEN = ActionSpace(

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.spec import EnvironmentSpec, Seeds, Task
-from kerv_cli.environments.world import EpisodeWorld
-from kerv_cli.registry import Part, register
-from kerv_cli.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
+from kerv_cli.base.registry import Part, register
+from kerv_cli.base.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, Task
+from kerv_cli.worlds.world import EpisodeWorld
 
 NEAR = 0.01  # metres from the goal that count as there
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.registry import Part, register
+from kerv_cli.base.registry import Part, register
 
 
 @dataclass
@@ -19,7 +19,7 @@ class ThreadOptions:
 
 
 class Threads:
-    """See `kerv_cli.studies.executors.Executor`."""
+    """See `kerv_cli.lab.executors.Executor`."""
 
     def __init__(self, slots: int, name: str) -> None:
         self.slots = slots

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kerv_cli.errors import KervError
-from kerv_cli.files import write_json
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.files import write_json
 from kerv_cli.targets.checkpoint import save_tensors
 from kerv_cli.targets.openvla.config import CONFIG, SHAPES, STATISTICS, Language, Shape, Tower
 from kerv_cli.targets.openvla.image import DEFAULTS, PREPROCESSOR

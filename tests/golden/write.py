@@ -8,9 +8,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.rollouts.run import close_worlds, run_task
-from kerv_cli.studies.identity import ENGINE
-from kerv_cli.studies.resolve import resolve
+from kerv_cli.lab.identity import ENGINE
+from kerv_cli.lab.resolve import resolve
+from kerv_cli.lab.run import close_worlds, run_task
 
 FILE = Path(__file__).with_name("main.json")
 ENGINES = Path(__file__).with_name("engines.json")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kerv_cli.spaces import ObservationSpace, Place
+from kerv_cli.base.spaces import ObservationSpace, Place
 
 COARSE, FINE = 0.1, 0.02  # metres per unit of the linear and of the saturating features of a vector
 STEP = 0.01  # metres (or units of the state) per control step that count as a velocity of one

@@ -20,10 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.errors import CheckpointError
-from kerv_cli.manifests import read
-from kerv_cli.settings import TargetSettings
-from kerv_cli.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.manifests import read
+from kerv_cli.base.settings import TargetSettings
+from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.base.views import frame_shape, views_of
+from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import (
     hand_features,
@@ -37,8 +39,6 @@ from kerv_cli.targets.compact.packed import Packable, PackedPrompt, load_packed
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Cache, Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
-from kerv_cli.targets.transfer import upload
-from kerv_cli.views import frame_shape, views_of
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
-from kerv_cli.errors import UsageError
+from kerv_cli.base.errors import UsageError
 
 PAD, UNKNOWN = 0, 1
 

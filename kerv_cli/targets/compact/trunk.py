@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.attention import Buffered, attention_mask, rotate
+from kerv_cli.engine.attention import Buffered, attention_mask, rotate
 from kerv_cli.targets.compact.captured import CapturedLayers
 from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradient
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16

@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.files import read_json
-from kerv_cli.manifests import read
-from kerv_cli.spaces import ActionSpace, Group
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.files import read_json
+from kerv_cli.base.manifests import read
+from kerv_cli.base.spaces import ActionSpace, Group
 
 SHAPES = "vision_shapes"
 """Field of `config.json` that only folders of another size than the published ones have: one `Tower` per image."""

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.errors import CheckpointError, UsageError
-from kerv_cli.files import read_json
-from kerv_cli.manifests import read
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import read_json
+from kerv_cli.base.manifests import read
 from kerv_cli.targets.openvla.config import Shape
 
 PREPROCESSOR = "preprocessor_config.json"

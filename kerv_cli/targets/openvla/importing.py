@@ -6,14 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.environments import specs
-from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.errors import UnknownName, UsageError
-from kerv_cli.files import write_json
-from kerv_cli.places import artifact
-from kerv_cli.provenance import provenance
-from kerv_cli.settings import BuildTargetSettings
-from kerv_cli.spaces import ActionSpace, ObservationSpace
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.files import write_json
+from kerv_cli.base.places import artifact
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.settings import BuildTargetSettings
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import FORMAT
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.image import read_normalisations
@@ -21,6 +19,8 @@ from kerv_cli.targets.openvla.layout import layout
 from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, open_shards
 from kerv_cli.targets.openvla.prompt import PROMPTS, Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
+from kerv_cli.worlds import specs
+from kerv_cli.worlds.spec import EnvironmentSpec
 
 SEES_NOTHING_ELSE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
 

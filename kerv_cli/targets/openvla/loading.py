@@ -17,8 +17,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from kerv_cli.errors import CheckpointError
-from kerv_cli.files import read_json, sha256_of
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_json, sha256_of
 from kerv_cli.targets.openvla.config import Shape
 from kerv_cli.targets.openvla.layout import Sizes, layout, unread
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.targets.openvla.config import Shape
 
 TOKENIZER = "tokenizer.json"

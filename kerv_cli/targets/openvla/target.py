@@ -17,16 +17,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kerv_cli.errors import CheckpointError
-from kerv_cli.manifests import read
-from kerv_cli.spaces import ActionSpace, Observation
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.manifests import read
+from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.openvla.config import Shape, read_shape
 from kerv_cli.targets.openvla.image import Normalisation, check_image, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import OpenVLAModel, load_model, open_shards
 from kerv_cli.targets.openvla.prompt import Prompter
 from kerv_cli.targets.openvla.trunk import KeyValueCache
-from kerv_cli.targets.transfer import upload
 
 
 @dataclass(frozen=True)

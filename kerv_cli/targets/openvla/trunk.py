@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.attention import Buffered, attention_mask, rotate
+from kerv_cli.engine.attention import Buffered, attention_mask, rotate
 from kerv_cli.targets.openvla.config import Language
 
 

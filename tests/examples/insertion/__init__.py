@@ -8,9 +8,9 @@ importable.
 
 from __future__ import annotations
 
-from kerv_cli.environments.spec import EnvironmentSpec, Task
-from kerv_cli.registry import Part, register
-from kerv_cli.spaces import ActionSpace, Group, ObservationSpace, Place
+from kerv_cli.base.registry import Part, register
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
+from kerv_cli.worlds.spec import EnvironmentSpec, Task
 
 SPEC = EnvironmentSpec(
     name="insertion",

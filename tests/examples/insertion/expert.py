@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.spaces import Observation
+from kerv_cli.base.spaces import Observation
+from kerv_cli.worlds.spec import EnvironmentSpec
 
 from .pose import GRASP, PEG_HALF, Pose, limited, misfit, turn_between
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.spec import EnvironmentSpec
-from kerv_cli.environments.world import MujocoWorld
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.world import MujocoWorld
 
 from .pose import (
     GRASP,

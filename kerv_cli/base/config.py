@@ -1,0 +1,408 @@
+"""The only module that uses Hydra: it composes a command's YAML files, checks overrides, expands a grid.
+
+Typer owns the process and the messages. Overrides are checked before torch or MuJoCo load; a wrong one is answered by
+one line with the nearest known keys.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import functools
+import itertools
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
+
+from kerv_cli.base import registry
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.files import read_yaml
+from kerv_cli.base.limits import check_settings
+from kerv_cli.base.settings import DERIVED_FROM
+from kerv_cli.methods.parts import PART_GROUPS, PREFILL, part_of
+
+T = TypeVar("T")
+
+MOST_POINTS = 10_000
+"""Points of a grid; more are refused before they are expanded."""
+
+
+def conf_dir() -> Path:
+    """`$KERV_CONF_DIR`, else the checkout's `conf/`, else the one inside the installed package.
+
+    Raises:
+        UsageError: no configuration there.
+    """
+    chosen = os.environ.get("KERV_CONF_DIR")
+    package = Path(__file__).resolve().parents[1]
+    places = [Path(chosen).resolve()] if chosen else [package.parent / "conf", package / "conf"]
+    for place in places:
+        if (place / "rollout.yaml").is_file():
+            return place
+    raise UsageError(f"no configuration in {' or '.join(map(str, places))}: set KERV_CONF_DIR to a folder like conf/")
+
+
+def groups() -> dict[str, list[str]]:
+    """Config groups and the names in them: {"method": ["ar", "spec_vla", …], …}."""
+    root = conf_dir()
+    known = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
+    for group in PART_GROUPS:
+        known.setdefault(group, set()).update(_parts_of(group))
+    return {group: sorted(names) for group, names in sorted(known.items())}
+
+
+def _parts_of(group: str) -> dict[str, registry.Part]:
+    """The parts that a group may choose, by name; in-prefill drafts are proposers that need no states of the target."""
+    if group != "prefill_draft":
+        return dict(registry.parts(group))
+    return {name: part for name, part in registry.parts("proposer").items() if part.traits.get("when") == PREFILL}
+
+
+def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
+    """The command's settings: the dataclass `schema`, `conf/<command>.yaml`, its groups and the overrides.
+
+    Raises:
+        UsageError: an override that cannot be parsed, an unknown key or name, a value of another type or out of range.
+    """
+    return Composer(command, schema).compose(overrides)
+
+
+class Composer(Generic[T]):
+    """Composes many settings of one command: what the same choices of groups compose to is composed once."""
+
+    def __init__(self, command: str, schema: type[T]) -> None:
+        self.command, self.schema, self.known = command, schema, groups()
+        self._composed: dict[tuple[str, ...], tuple[Any, T]] = {}
+
+    def compose(self, overrides: Sequence[str]) -> T:
+        """As the function `compose`."""
+        from hydra.errors import HydraException
+        from omegaconf.errors import OmegaConfBaseException
+
+        overrides, method = method_of_file(overrides)
+        overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
+        _check(self.command, overrides, self.known)
+        words = [_task_list(word) for word in overrides]
+        try:
+            settings = self._settings([_parsed(word) for word in words])
+        except (HydraException, OmegaConfBaseException) as error:
+            raise _explained(self.command, error, words, self.schema) from error
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
+            raise UsageError(f"cannot read '{' '.join(overrides)[:200]}': {_one_line(error)}") from error
+        _check_ranges(settings)
+        if method is not None:
+            settings.method = method  # type: ignore[attr-defined]
+        return settings
+
+    def _settings(self, overrides: Sequence[Any]) -> T:
+        """Hydra composes all but plain values, which are set afterwards as it sets them."""
+        from omegaconf import OmegaConf
+
+        values = [override for override in overrides if self._is_value(override)]
+        rest = tuple(override.input_line for override in overrides if not self._is_value(override))
+        if rest not in self._composed:
+            nodes = _composed(self.command, rest, self.schema)
+            self._composed[rest] = nodes, cast(T, OmegaConf.to_object(nodes))
+        nodes, settings = self._composed[rest]
+        if all(_is_scalar(nodes, override) for override in values):
+            settings = copy.deepcopy(settings)
+            for override in values:
+                _set_scalar(nodes, settings, override)
+            return settings
+        nodes = copy.deepcopy(nodes)
+        for override in values:
+            OmegaConf.update(nodes, override.key_or_group, override.value(), merge=True)
+        return cast(T, OmegaConf.to_object(nodes))
+
+    def _is_value(self, override: Any) -> bool:
+        """Whether an override sets one key to one value."""
+        from hydra.core.override_parser.types import OverrideType
+
+        plain = override.type == OverrideType.CHANGE and override.package is None and not override.is_sweep_override()
+        return plain and override.key_or_group not in self.known
+
+
+def _is_scalar(nodes: Any, override: Any) -> bool:
+    """Whether an override replaces one plain value that no other setting depends on by another."""
+    from omegaconf import OmegaConf
+
+    key, value = override.key_or_group, override.value()
+    if key in DERIVED_FROM or not isinstance(value, int | float | str) or "${" in str(value):
+        return False
+    return isinstance(OmegaConf.select(nodes, key), int | float | str)
+
+
+def _set_scalar(nodes: Any, settings: Any, override: Any) -> None:
+    """Sets a value in the dataclass `settings`, converted as its typed node in `nodes` converts it; converting all of
+    them takes a hundred times as long, and a study composes hundreds of settings."""
+    from omegaconf import OmegaConf
+
+    key = override.key_or_group
+    before = OmegaConf.select(nodes, key)
+    OmegaConf.update(nodes, key, override.value())
+    converted = OmegaConf.select(nodes, key)
+    OmegaConf.update(nodes, key, before)
+    *path, name = key.split(".")
+    for part in path:
+        settings = settings[part] if isinstance(settings, dict) else getattr(settings, part)
+    if isinstance(settings, dict):
+        settings[name] = converted
+    else:
+        setattr(settings, name, converted)
+
+
+def _check_ranges(settings: Any) -> None:
+    """Checks every setting against its range, and what only a part knows about its settings."""
+    check_settings(settings)
+    for group in PART_GROUPS:
+        chosen = getattr(settings, group, None)
+        part = None if chosen is None else part_of(group, chosen.kind)
+        # another part's settings are refused by the method's check
+        if part is not None and part.check is not None and isinstance(chosen, part.settings):
+            part.check(chosen)
+
+
+@functools.lru_cache(maxsize=4096)
+def _parsed(word: str) -> Any:
+    """The override as Hydra parses it; raises as Hydra."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return OverridesParser.create().parse_overrides([word])[0]
+
+
+def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
+    """Hydra's composition, as typed nodes."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import MISSING, OmegaConf
+
+    store = ConfigStore.instance()
+    base = OmegaConf.structured(schema)
+    _open_mappings(base)
+    for group in set(PART_GROUPS) & set(base):
+        base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
+    store.store(name=f"base_{command}", node=base)
+    for group in PART_GROUPS:
+        for name, part in _parts_of(group).items():
+            _store_part(group, name, part.settings)
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra_compose(command, overrides=list(overrides))
+
+
+def _open_mappings(node: Any) -> None:
+    """Lets the command line add keys to the untyped mappings of a schema (`runtime.executor_options`, …)."""
+    from omegaconf import DictConfig, OmegaConf
+
+    for child in (node[name] for name in node if not OmegaConf.is_missing(node, name)):
+        if isinstance(child, DictConfig) and OmegaConf.get_type(child) is dict:
+            OmegaConf.set_struct(child, False)
+        elif isinstance(child, DictConfig):
+            _open_mappings(child)
+
+
+@functools.cache
+def _store_part(group: str, name: str, settings: type) -> None:
+    """Once per process: a study composes many settings, and storing all parts takes a sixth of a composition."""
+    from hydra.core.config_store import ConfigStore
+
+    ConfigStore.instance().store(group=group, name=name, node=settings(kind=name))
+
+
+def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
+    """Overrides with a `method=FILE.yaml` replaced by what the file chooses, and the method's name: the file's. The
+    command line's own choices outrank it. Such a file looks like those of conf/method.
+
+    Raises:
+        UsageError: the file cannot be read, or is no method.
+    """
+    files = [word for word in overrides if word.startswith("method=") and word.endswith((".yaml", ".yml"))]
+    if not files:
+        return list(overrides), None
+    path = Path(files[-1].split("=", 1)[1]).expanduser()
+    try:
+        value = read_yaml(path.read_text(encoding="utf-8"))
+        chosen = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
+        parts = {key.removeprefix("override /"): name for choice in chosen for key, name in choice.items()}
+        words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
+    except OSError as error:
+        raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
+    except (ValueError, AttributeError, TypeError) as error:
+        raise UsageError(f"method={path} is no method: see conf/method/kerv.yaml for one") from error
+    rest = [word for word in overrides if word not in files]
+    given = {word.split("=", 1)[0] for word in rest}
+    return [*(word for word in words if word.split("=", 1)[0] not in given), *rest], path.stem
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif value is not None:
+            yield f"{prefix}{key}={str(value).lower() if isinstance(value, bool) else value}"
+
+
+def expand(overrides: str | Sequence[str]) -> list[list[str]]:
+    """Hydra's grid grammar -> one override list per point: `threshold.r=0,3` or `threshold.r=range(0,4)`.
+
+    A string is split at white space outside quotes. The grid is counted before it is expanded.
+
+    Raises:
+        UsageError: an override that cannot be parsed, or more than MOST_POINTS points.
+    """
+    from hydra.errors import HydraException
+
+    words = split_words(overrides) if isinstance(overrides, str) else list(overrides)
+    try:
+        parsed = [_parsed(word) for word in words]
+        points = math.prod(map(_count, parsed))
+        if points > MOST_POINTS:
+            raise UsageError(f"'{' '.join(words)}' is a grid of {points:.6g} points: at most {MOST_POINTS}")
+        axes = [list(_points(o)) for o in parsed]
+    except HydraException as error:
+        raise UsageError(f"cannot read '{' '.join(words)}': {_one_line(error)}") from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
+        raise UsageError(f"cannot read '{' '.join(words)[:200]}': {_one_line(error)}") from error
+    return [list(point) for point in itertools.product(*axes)]
+
+
+def split_words(text: str) -> list[str]:
+    """The words of a line of overrides, split at white space outside quotes.
+
+    Raises:
+        UsageError: a quote or a backslash without its end.
+    """
+    import shlex
+
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise UsageError(f"cannot read '{text}': {error}") from error
+
+
+def _count(override: Any) -> float:
+    """How many points an override stands for.
+
+    Raises:
+        UsageError: a range without an end or with steps of 0, an interval, a glob.
+    """
+    from hydra.core.override_parser.types import ChoiceSweep, RangeSweep
+
+    value = override.value()
+    if not override.is_sweep_override():
+        return 1
+    if isinstance(value, ChoiceSweep):
+        return len(value.list)
+    if not isinstance(value, RangeSweep):
+        raise UsageError(f"'{override.input_line}' is no list of values: write key=a,b,c or key=range(first,end,step)")
+    numbers = value.start, value.stop, value.step
+    if any(number is None or not math.isfinite(number) for number in numbers) or not value.step:
+        raise UsageError(f"'{override.input_line}': a range needs a first number, an end and a step that is not 0")
+    return max(0, math.ceil((value.stop - value.start) / value.step))  # type: ignore[operator]
+
+
+def _points(override: Any) -> Iterator[str]:
+    if not override.is_sweep_override():
+        yield override.input_line
+        return
+    key = override.get_key_element()
+    for value in override.sweep_string_iterator():
+        yield f"{key}={value}"
+
+
+def swept_keys(overrides: str | Sequence[str]) -> list[str]:
+    """Keys of the overrides that hold several values."""
+    points = expand(overrides)
+    first = points[0] if points else []
+    return [word.split("=", 1)[0] for i, word in enumerate(first) if len({p[i] for p in points}) > 1]
+
+
+def to_yaml(settings: Any) -> str:
+    """A settings dataclass as YAML, for `--cfg`."""
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_yaml(OmegaConf.structured(settings))
+
+
+def _check(command: str, overrides: Sequence[str], known: Mapping[str, Sequence[str]]) -> None:
+    """Refuses what Hydra would answer at length or not at all: words that are no overrides, unknown group choices,
+    several choices where one is wanted."""
+    for word in overrides:
+        key, equals, value = word.partition("=")
+        if not equals or not key or key[0] == "~":  # nothing is taken away from settings
+            raise UsageError(
+                f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys"
+            )
+        if key not in known or value in known[key]:
+            continue
+        several = [name.strip() for name in value.split(",")]
+        if len(several) > 1 and set(several) <= set(known[key]):
+            hint = "run each in turn with 'kerv rollout -m', or" if command == "rollout" else "this command takes one:"
+            raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
+        raise UnknownName(key, value, known[key])
+
+
+def spoken(command: str) -> str:
+    """A command's name as it is typed: `train_drafter` -> `train drafter`."""
+    return command.replace("_", " ")
+
+
+def _task_list(word: str) -> str:
+    """Adds the brackets that `task=reach` and `task=reach,push` leave out."""
+    key, value = word.split("=", 1)
+    return f"task=[{value}]" if key == "task" and not value.startswith("[") else word
+
+
+def _explained(command: str, error: Exception, overrides: Sequence[str], schema: type) -> UsageError:
+    """Names the first unknown key and the nearest known ones; without one, Hydra's own message on one line."""
+    from hydra.errors import HydraException
+
+    choices = [word for word in overrides if word.split("=", 1)[0] in groups()]
+    try:
+        keys = _keys(command, choices, schema)
+    except HydraException:  # the choices alone do not compose
+        return UsageError(_one_line(error.__cause__ or error))
+    for word in overrides:
+        key = word.split("=", 1)[0]
+        if key not in keys and key not in groups():
+            near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
+            near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
+            hint = (
+                f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {spoken(command)} --cfg' for the keys"
+            )
+            return UsageError(f"unknown key '{key}': {hint}")
+    return UsageError(_one_line(error.__cause__ or error))
+
+
+def keys_of(command: str, choices: Sequence[str], schema: type) -> list[str]:
+    """Every key of the command's configuration with these group choices, dotted; those of the groups alone where the
+    choices do not compose."""
+    from hydra.errors import HydraException
+
+    try:
+        return _keys(command, choices, schema)
+    except HydraException:
+        return _keys(command, [], schema)
+
+
+def _keys(command: str, choices: Sequence[str], schema: type) -> list[str]:
+    """Every key of the command's configuration with these group choices, dotted."""
+    from omegaconf import DictConfig, OmegaConf
+
+    def walk(node: DictConfig, prefix: str) -> Iterator[str]:
+        for name in map(str, node):
+            yield f"{prefix}{name}"
+            if isinstance(OmegaConf.select(node, name), DictConfig):
+                yield from walk(node[name], f"{prefix}{name}.")
+
+    return list(walk(_composed(command, choices, schema), ""))
+
+
+def _one_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    useful = [line for line in lines if not line.startswith(("object_type", "reference_type", "See https"))]
+    keys = [line for line in useful if line.startswith("full_key:")]
+    text = " ".join(line for line in useful if not line.startswith("full_key:"))
+    return f"{keys[0].removeprefix('full_key:').strip()}: {text}" if keys else text

@@ -1,0 +1,104 @@
+"""The range of every setting: stated beside its default, checked wherever settings are composed or read from disk."""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import Field, field, fields, is_dataclass
+from typing import Any, get_args, get_origin, get_type_hints
+
+from kerv_cli.base.errors import UnknownName, UsageError
+
+PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
+"""Names of folders below `results`: no separators, not hidden, never `..`."""
+
+
+def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
+    """Metadata of a field whose numbers lie in least ≤ value ≤ most and value > above: itself, or every element of a
+    list. None is let through, NaN never."""
+    return {"limits": (least, most, above)}
+
+
+def number(default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> Any:
+    """A field with `limits`."""
+    return field(default=default, metadata=limits(least, most, above))
+
+
+def choice(default: str, *names: str) -> Any:
+    """A field that is one of `names`; the default among them."""
+    return field(default=default, metadata={"names": names})
+
+
+def check_name(name: str, what: str) -> str:
+    """`name`, which must be a plain folder name.
+
+    Raises:
+        UsageError: it is not.
+    """
+    if not PLAIN_NAME.fullmatch(name):
+        raise UsageError(
+            f"{what} '{name}' must be letters, digits, '_', '-', '+', '.' and begin with a letter or a digit"
+        )
+    return name
+
+
+def check_settings(settings: Any, what: str = "") -> None:
+    """Checks a dataclass and those within it: types of list elements, limits, choices, then what each says about its
+    fields together in a method `check_together`. what: the dotted key of `settings` in messages, empty for the root.
+
+    Raises:
+        UsageError: the first setting that is wrong.
+    """
+    prefix = f"{what}." if what else ""
+    for at, element in _declared(type(settings)):  # type: ignore[arg-type]
+        name, value = f"{prefix}{at.name}", getattr(settings, at.name)
+        if element is not None and not isinstance(value, list | dict):
+            raise UsageError(f"{name}={value}: a list or a mapping is wanted")
+        if element is not None and not all(isinstance(x, element) for x in _elements(value)):
+            raise UsageError(f"{name}={value}: every element must be of type {element.__name__}")
+        for x in value if isinstance(value, list) else [value]:
+            _check_value(name, x, at.metadata)
+        if is_dataclass(value):
+            check_settings(value, name)
+    together = getattr(settings, "check_together", None)
+    if together is not None:
+        together(prefix)
+
+
+@functools.cache
+def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
+    """A dataclass's fields, and the type of their elements where they are lists or dicts of plain ones."""
+    hints = get_type_hints(kind)
+
+    def element(name: str) -> type | None:
+        inner = get_args(hints[name])[-1] if get_origin(hints[name]) in (list, dict) else None
+        return inner if inner in (str, int, float, bool) else None
+
+    return tuple((at, element(at.name)) for at in fields(kind))
+
+
+def _elements(value: Any) -> Iterator[Any]:
+    return iter(value.values() if isinstance(value, dict) else value)
+
+
+def _check_value(name: str, value: Any, metadata: Any) -> None:
+    if value is None:
+        return
+    if "names" in metadata and value not in metadata["names"]:
+        raise UnknownName(name, str(value), metadata["names"])
+    if "limits" in metadata:
+        least, most, above = metadata["limits"]
+        if isinstance(value, str) or not (least <= value <= most and value > above):
+            raise UsageError(f"{name}={value}: {_wanted(least, most, above)}")
+
+
+def _wanted(least: float, most: float, above: float) -> str:
+    low = f"above {above:g}" if not math.isinf(above) else f"at least {least:g}" if not math.isinf(least) else ""
+    if math.isinf(most):
+        return low or "a number"
+    high = f"{most:g}" if most != int(most) or most < 10**6 else f"{int(most)}"
+    if low.startswith("at least"):
+        return f"from {least:g} to {high}"
+    return f"{low}, at most {high}" if low else f"at most {high}"

@@ -1,0 +1,99 @@
+"""Reads JSON that describes an artifact into a dataclass, checked field by field."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.limits import check_settings
+
+T = TypeVar("T")
+
+
+@functools.cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter
+
+    _forbid_unknown(kind)
+    return TypeAdapter(kind)
+
+
+def _forbid_unknown(kind: Any) -> None:
+    """Makes pydantic refuse unknown fields and NaN or infinity in a dataclass and in those that its fields hold."""
+    if dataclasses.is_dataclass(kind) and not hasattr(kind, "__pydantic_config__"):
+        setattr(kind, "__pydantic_config__", {"extra": "forbid", "allow_inf_nan": False})  # noqa: B010
+        for hint in get_type_hints(kind).values():
+            _forbid_unknown(hint)
+    for inner in get_args(kind):
+        _forbid_unknown(inner)
+
+
+def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
+    """`value` (what JSON gives) as an instance of the dataclass `kind`, nested ones included. tolerant: fields that
+    this kerv does not know, e.g. of a newer one, are left out instead of refused.
+
+    Raises:
+        CheckpointError: a field is missing, unknown or of another type; the line names the first one.
+    """
+    from pydantic import ValidationError
+
+    try:
+        adapter: Any = _adapter(kind)  # type: ignore[arg-type]
+        checked: T = adapter.validate_python(_known(kind, value) if tolerant else value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
+        check_settings(checked)
+    except KervError as error:  # what the dataclass itself refuses, and settings out of range
+        raise CheckpointError(f"{what} is damaged: {error}") from error
+    return checked
+
+
+def _known(hint: Any, value: Any) -> Any:
+    """`value` without the keys that the dataclasses of this type do not have, at any depth."""
+    inner = get_args(hint)
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        hints = _hints(hint)  # type: ignore[arg-type]
+        return {name: _known(hints[name], one) for name, one in value.items() if name in hints}
+    if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
+        return {key: _known(inner[-1], one) for key, one in value.items()}
+    if isinstance(value, list | tuple) and get_origin(hint) in (list, tuple):
+        return [_known(inner[0], one) for one in value]
+    either = next((one for one in inner if dataclasses.is_dataclass(one)), None)  # X | None
+    return value if either is None else _known(either, value)
+
+
+_hints = functools.cache(get_type_hints)
+
+
+def read_file(kind: type[T], path: Path, what: str) -> T:
+    """The JSON file at `path` as an instance of `kind`; errors as `read`, and a missing or unreadable file."""
+    value = read_json(path)
+    if not isinstance(value, Mapping):
+        raise CheckpointError(f"{path} is not {what}")
+    return read(kind, value, str(path), tolerant=True)
+
+
+def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
+    """Hash by which others name a datastore: over its keys, chunk and target (docs/formats.md)."""
+    text = json.dumps([key, chunk, target, sorted(files.items())])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
+    """Checks that the files in `folder` are those that its manifest names. files: name -> SHA-256; again: the remedy.
+
+    Raises:
+        CheckpointError: one is missing or changed.
+    """
+    for name, digest in files.items():
+        if sha256_of(folder / name) != digest:
+            raise CheckpointError(f"{folder / name} does not match its manifest: {again}")

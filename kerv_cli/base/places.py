@@ -1,0 +1,97 @@
+"""Paths below the results folder (docs/formats.md)."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from kerv_cli.base.errors import StorageError, UsageError
+from kerv_cli.base.files import storage_errors
+from kerv_cli.base.limits import check_name
+
+
+def results_dir(results: str) -> Path:
+    """The results folder.
+
+    Raises:
+        UsageError: it is a file, or no path.
+    """
+    path = as_path(results)
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"results={results} is a file: name a folder")
+    return path
+
+
+def check_writable(results: str) -> None:
+    """Refuses a results folder that nothing could be stored in, before anything is computed for it. Leaves no trace.
+
+    Raises:
+        UsageError: it is a file, or lies below one.
+        StorageError: the disk is full or read-only, or permission is missing.
+    """
+    folder = results_dir(results)
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not there.is_dir():
+        raise UsageError(f"results={results}: {there} is a file, name a folder")
+    try:
+        # nameless where the file system can: nothing stays when the process is killed here
+        with storage_errors(folder), tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise StorageError(f"cannot write {folder}: {error.strerror}") from error
+
+
+def artifact(results: str, kind: str, name: str) -> Path:
+    """Folder of a trained or built artifact: results/artifacts/<kind>/<name>, or `name` itself with a slash in it.
+
+    Raises:
+        UsageError: neither a plain folder name nor a path.
+    """
+    if "/" in name:
+        return as_path(name)
+    return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name")
+
+
+def as_path(text: str) -> Path:
+    """A path that a user wrote; raises UsageError for one that no file system takes."""
+    if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
+        raise UsageError(f"'{text[:80]}…' is no path")
+    return Path(text).expanduser()
+
+
+def shipped_dir() -> Path:
+    """`results/pretrained` of the checkout that the package runs from, else the `pretrained` inside the installed
+    package (`mt10-vision` alone)."""
+    package = Path(__file__).resolve().parents[1]
+    checkout = package.parent / "results" / "pretrained"
+    return checkout if checkout.is_dir() else package / "pretrained"
+
+
+def find_target(results: str, name: str) -> Path:
+    """Folder of the target `name`: `name` itself if it is a path, else an artifact, else a shipped policy.
+
+    Raises:
+        UsageError: nothing of that name; the line lists what there is.
+    """
+    if "/" in name:
+        places = [as_path(name)]
+    else:
+        shipped = (folder / name / "target" for folder in (results_dir(results) / "pretrained", shipped_dir()))
+        places = [artifact(results, "target", name), *shipped]
+    for place in places:
+        if (place / "target.json").is_file():
+            return place
+    known = sorted({p.parent.parent.name for p in shipped_dir().glob("*/target/target.json")})
+    known += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("*/target.json")})
+    raise UsageError(
+        f"no target '{name}' in {', '.join(map(str, places))}: train it with 'kerv train target name={name}'"
+        + (f", or take one of {', '.join(dict.fromkeys(known))}" if known else "")
+    )
+
+
+def beside(target: Path, kind: str) -> Path:
+    """Folder of the artifact `kind` of a target: its sibling in a shipped policy (pretrained/<name>/{target,<kind>}),
+    artifacts/<kind>/<name> for a trained one (artifacts/target/<name>), else a subfolder."""
+    if target.name == "target":
+        return target.parent / kind
+    return target.parent.parent / kind / target.name if target.parent.name == "target" else target / kind

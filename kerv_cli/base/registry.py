@@ -1,0 +1,146 @@
+"""What kerv is put together from: parts of a method, artifacts, targets, environments and executors, by kind and name.
+
+Names, settings and needs are known without importing torch or MuJoCo. `build` names a function, `module:function`,
+whose module is imported when the part is built. Everything that depends on which parts there are derives from here:
+what a method loads, the identity of its results, which compositions are refused, completion, `--cfg`, colours.
+
+A package adds parts by an entry point of the group `kerv.parts`, a file by `KERV_PLUGINS=module,…`: the module is
+imported and registers its parts.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from typing import Any
+
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.limits import check_settings
+
+PLUGINS = "KERV_PLUGINS"
+
+
+@dataclass
+class NoSettings:
+    """A part without settings but its name."""
+
+    kind: str = "none"
+
+
+def nothing(settings: Any) -> tuple[str, ...]:
+    """A part that needs no artifact."""
+    return ()
+
+
+@dataclass(frozen=True)
+class Part:
+    """One choice among the parts of a kind.
+
+    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
+    environment, stress or executor. build: `module:function`; its arguments are documented where the kind is used.
+    settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
+    settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
+    and timeline.
+    traits: further properties that the kind asks for, e.g. when a proposer can draft.
+    """
+
+    kind: str
+    name: str
+    build: str = ""
+    settings: type = NoSettings
+    needs: Callable[[Any], tuple[str, ...]] = nothing
+    check: Callable[[Any], None] | None = None
+    colour: int | None = None
+    traits: Mapping[str, Any] = field(default_factory=dict)
+
+    def built(self, *arguments: Any, **keywords: Any) -> Any:
+        """Imports and calls `build`."""
+        return load(self.build)(*arguments, **keywords)
+
+    def check_settings(self, settings: Any, what: str) -> None:
+        """Checks these settings as `limits.check_settings`, then by `check`. what: how messages call the settings.
+
+        Raises:
+            UsageError: a number out of range, or settings that do not fit together.
+        """
+        check_settings(settings, what)
+        if self.check is not None:
+            self.check(settings)
+
+
+_PARTS: dict[str, dict[str, Part]] = {}
+
+
+def register(part: Part) -> Part:
+    """Adds a part. The same code can register a name again, e.g. when a module is reloaded.
+
+    Raises:
+        UsageError: another part of that kind has the name.
+    """
+    there = _PARTS.setdefault(part.kind, {}).get(part.name)
+    if there is not None and there.build != part.build:
+        raise UsageError(f"{part.kind} '{part.name}' is registered twice: {there.build} and {part.build}")
+    _PARTS[part.kind][part.name] = part
+    return part
+
+
+def load(name: str) -> Any:
+    """Imports the object that `module:attribute` names.
+
+    Raises:
+        UsageError: no such module or attribute.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        found = importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(f"{module} cannot be imported: {error}") from error
+    if not hasattr(found, attribute):
+        raise UsageError(f"{module} has no {attribute}")
+    return getattr(found, attribute)
+
+
+def find(kind: str, name: str, what: str = "") -> Part:
+    """The part of that kind and name. what: how the message calls the kind.
+
+    Raises:
+        UnknownName: there is none; the message names the nearest ones.
+    """
+    known = parts(kind)
+    if name not in known:
+        raise UnknownName(what or kind, name, known)
+    return known[name]
+
+
+def parts(kind: str) -> Mapping[str, Part]:
+    """All parts of a kind by name, in the order of registration."""
+    load_plugins()
+    return _PARTS.get(kind, {})
+
+
+def kinds() -> tuple[str, ...]:
+    """Every kind that has parts."""
+    load_plugins()
+    return tuple(_PARTS)
+
+
+@functools.cache
+def load_plugins() -> None:
+    """Registers kerv's own parts, then those of installed packages and of `KERV_PLUGINS`.
+
+    Raises:
+        UsageError: a plugin that cannot be imported.
+    """
+    importlib.import_module("kerv_cli.methods.parts")
+    named = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
+    for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *named]:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UsageError(
+                f"plugin {name} cannot be imported ({error}): mend it, or leave it out of {PLUGINS}"
+            ) from None

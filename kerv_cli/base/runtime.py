@@ -1,0 +1,31 @@
+"""Device, dtype and threads of a process."""
+
+from __future__ import annotations
+
+import re
+
+import torch
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import check_settings
+from kerv_cli.base.settings import RuntimeSettings
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+
+def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
+    """Applies `settings` to this process -> (device, dtype).
+
+    Raises:
+        UsageError: no such device here, or a setting out of range.
+    """
+    check_settings(settings, "runtime")
+    device = settings.device
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise UsageError(f"runtime.device={device}: known are cpu, cuda, cuda:N, auto")
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UsageError(f"runtime.device={device}: torch sees no CUDA device here, use runtime.device=cpu")
+    torch.set_num_threads(settings.threads)
+    return device, DTYPES[settings.dtype]

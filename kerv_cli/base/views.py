@@ -1,0 +1,55 @@
+"""What a frame shows: one camera, or several views side by side, named by the cameras joined with `+`.
+
+`corner4+gripperPOV:75` is two cameras, the second with a field of view of its own; `corner4+corner4@4` is one, now and
+four control steps ago: a policy's history.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from kerv_cli.base.errors import UsageError
+
+VIEWS = "+"
+"""Between the cameras of a joined name."""
+_PART = re.compile(r"(?P<camera>[^:@]+)(:(?P<fovy>\d{1,3}(\.\d{1,3})?))?(@(?P<delay>[1-9]\d{0,2}))?", re.ASCII)
+
+
+@dataclass(frozen=True)
+class View:
+    """One part of a frame: what `camera` showed `delay` control steps ago. fovy: degrees; None: as all others."""
+
+    camera: str
+    fovy: float | None = None
+    delay: int = 0
+
+    @property
+    def shown(self) -> str:
+        """The camera, with its field of view where it has one of its own."""
+        return self.camera if self.fovy is None else f"{self.camera}:{self.fovy:g}"
+
+
+def views_of(name: str) -> tuple[View, ...]:
+    """The views of a frame of that name, from left to right; of the empty name one, of the environment's first camera.
+
+    Raises:
+        UsageError: a part without a camera, an impossible field of view, or a delay that is none.
+    """
+    return tuple(_view(part, name) for part in name.split(VIEWS)) if name else (View(""),)
+
+
+def frame_shape(name: str, size: int) -> tuple[int, int, int]:
+    """(size, size x views, 3): height, width and colours of a frame of that name; size: of one view, pixels."""
+    return size, size * len(views_of(name)), 3
+
+
+def _view(part: str, name: str) -> View:
+    found = _PART.fullmatch(part)
+    fovy = float(found["fovy"]) if found and found["fovy"] else None
+    if found is None or (fovy is not None and not 0 < fovy < 180):
+        raise UsageError(
+            f"camera name '{name}': '{part}' is no view; write NAME, NAME:DEGREES (above 0, below 180) or NAME@STEPS "
+            "(1 to 999), joined with +, e.g. front+wrist:75+front@4"
+        )
+    return View(found["camera"], fovy, int(found["delay"] or 0))

@@ -1,0 +1,106 @@
+"""Runs a run again from what it stored: its resolved settings, not the command that was typed."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.manifests import read
+from kerv_cli.base.settings import StudySettings, TrainDrafterSettings, TrainTargetSettings, settings_from
+from kerv_cli.lab.catalogue import ROLLOUT, RunEntry, description_of, find_run, store_of
+from kerv_cli.lab.cells import CellRunner, reference_decode
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.identity import OBSERVATION
+from kerv_cli.lab.plan import Cell, make_cell
+from kerv_cli.lab.policy import check, identity_of
+from kerv_cli.lab.rollout_runs import new_name
+from kerv_cli.lab.run_file import note_invocation
+from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore
+
+if TYPE_CHECKING:
+    from kerv_cli.training.runs import DrafterRun, TargetRun
+
+
+@dataclass(frozen=True)
+class Again:
+    """A sweep or rollout that is to be repeated. cells: with ids of this code. store: a new one."""
+
+    run: RunEntry
+    study: StudySettings
+    cells: list[Cell]
+    store: StudyStore
+
+
+def plan_again(run: RunEntry, results: str) -> Again:
+    """What would run.
+
+    Raises:
+        CheckpointError: the weights or the data that the run used are not there any more. UsageError: as
+            `policy.check`.
+    """
+    plan = store_of(run).read_plan()
+    cells = [_again(cell, results) for cell in plan.cells]
+    study = StudySettings(plan.name, plan.title, plan.baseline, axis=plan.axis)
+    if run.kind == ROLLOUT:
+        return Again(run, study, cells, StudyStore(results, new_name(results, cells), ROLLOUTS))
+    store = StudyStore(results, _free(Path(results).expanduser() / STUDIES, plan.name))
+    return Again(run, dataclasses.replace(study, name=store.name), cells, store)
+
+
+def _again(cell: Cell, results: str) -> Cell:
+    settings = settings_from({**cell.settings, "results": results, "episodes": 1, "seed": cell.seeds[0]})
+    check(settings)
+    identity = identity_of(settings)
+    for kind in cell.identity.keys() | identity.keys():
+        was, now = cell.identity.get(kind, "none"), identity.get(kind, "none")
+        if kind != OBSERVATION and was != now:
+            raise CheckpointError(
+                f"the {kind} of {cell.label} was {was[:12]} and is {now[:12]} now: it cannot run again"
+            )
+    stored = {**cell.settings, "results": results}
+    return make_cell(cell.label, cell.overrides, stored, identity, cell.task, cell.seeds, cell.repeat)
+
+
+def run_again(again: Again, results: str) -> RunEntry:
+    """Runs it in this process -> the new run.
+
+    Raises:
+        KervError: a cell failed.
+    """
+    again.store.write_plan(again.study, again.cells)
+    note_invocation(again.store.root, ["runs", "rerun", again.run.id])
+    outcome = execute(again.cells, CellRunner(again.store.rollouts, keep=True), again.store, gauge=reference_decode)
+    if outcome.failed:
+        raise KervError(outcome.failed[0].reason)
+    return find_run(results, again.store.name)
+
+
+def _free(folder: Path, name: str) -> str:
+    """`name-again`, or with a number behind it, where no folder has that name yet."""
+    names = (f"{name}-again{number if number > 1 else ''}" for number in range(1, 1000))
+    return next(candidate for candidate in names if not (folder / candidate).exists())
+
+
+def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
+    """The training run with the stored settings under a free name.
+
+    Raises:
+        CheckpointError: its description is missing, damaged or of another version.
+    """
+    from kerv_cli.training.runs import TargetRun, drafter_run
+
+    path = run.folder / f"{run.kind}.json"
+    made = description_of(run).get("settings")
+    if not isinstance(made, dict):
+        command = "target" if run.kind == "target" else "drafter"
+        raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
+    value: dict[str, Any] = made | {"results": results}
+    name = _free(run.folder.parent, run.folder.name)
+    if run.kind == "target":
+        return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
+    settings = read(TrainDrafterSettings, value, str(path))
+    place: dict[str, Any] = {("drafter" if run.kind == "drafter" else "early"): name}
+    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, **place)))

@@ -1,0 +1,100 @@
+"""`kerv bench`: a target's speed against the device's limits; `kerv bench replay`: recorded decodes on another one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kerv_cli.cli.common import Overrides, ShowConfig, composed, console, edge, print_table
+
+if TYPE_CHECKING:
+    from kerv_cli.base.settings import BenchSettings
+
+REPLAY = "replay"
+AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
+Compare = Annotated[
+    tuple[Path, Path] | None, typer.Option("--compare", help="Compare two results instead of measuring one.")
+]
+
+
+@edge
+def bench(
+    overrides: Overrides = None, cfg: ShowConfig = False, as_json: AsJson = False, compare: Compare = None
+) -> None:
+    """Measure a target's forwards against the device's limits; target= is a policy or a shape: vla-150m, smolvla,
+    openvla-7b. 'kerv bench replay study=NAME target=…' executes a study's recorded decodes on that target."""
+    words = list(overrides or [])
+    if words[:1] == [REPLAY]:
+        _replay(words[1:], cfg, as_json)
+        return
+    from kerv_cli.base.settings import BenchSettings
+
+    settings = composed("bench", renamed(words), BenchSettings, cfg)
+    if compare is not None:
+        _compare(*compare)
+        return
+    _measure(settings, as_json)
+
+
+def renamed(words: list[str]) -> list[str]:
+    """To Hydra target= and study= would be choices among the files of conf/; here they name a policy or shape, and a
+    study of the results folder."""
+    keys = {"target": "model", "study": "recorded"}
+    return [f"{keys.get(key, key)}{equals}{value}" for key, equals, value in (word.partition("=") for word in words)]
+
+
+def _measure(settings: BenchSettings, as_json: bool) -> None:
+    from kerv_cli.base.files import write_json
+    from kerv_cli.bench import report
+    from kerv_cli.bench.run import open_and_card, place_of, run
+
+    model, machine, card, opened = open_and_card(settings)
+    print_table(("card", ""), report.card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
+    done = run(settings, model, machine, opened)
+    typer.echo(
+        f"cold start: opened in {opened:.1f} s, first prefill and token {done.cold['first_decode_seconds']:.2f} s"
+    )
+    print_table(report.PHASE_COLUMNS, report.phase_rows(done.phases), done.title)
+    columns = [name for n in settings.tokens for name in (f"N = {n}", "ceiling", "with its drafter")]
+    print_table(("method", *columns), report.ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
+    flipped, compared = done.ties
+    typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
+    document, path = done.document(), place_of(settings.results, model.name, done.dtype, ".json")
+    write_json(path, document)
+    report.plot_roofline(path.with_suffix(".png"), done.title, done.machine, done.phases)
+    typer.echo(f"{path}\n{path.with_suffix('.png')}")
+    if as_json:
+        typer.echo(json.dumps(document, allow_nan=False))
+
+
+def _compare(a: Path, b: Path) -> None:
+    from kerv_cli.base.errors import CheckpointError
+    from kerv_cli.base.files import read_json
+    from kerv_cli.bench.report import comparison_rows
+
+    documents: list[dict[str, Any]] = []
+    for path in (a, b):
+        found = read_json(path)
+        if not isinstance(found, dict) or not {"phases", "target", "dtype"} <= set(found):
+            raise CheckpointError(f"{path} is no result of 'kerv bench'")
+        documents.append(found)
+    names = [f"{d['target']} {d['dtype']} ms" for d in documents]
+    print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
+
+
+def _replay(words: list[str], cfg: bool, as_json: bool) -> None:
+    from kerv_cli.base.settings import BenchReplaySettings
+
+    settings = composed("bench_replay", renamed(words), BenchReplaySettings, cfg)
+    from kerv_cli.bench.replay_run import replay
+
+    done = replay(settings)
+    for table in done.tables():
+        console().print(table)
+    for path in done.write(settings.results):
+        typer.echo(str(path))
+    if as_json:
+        typer.echo(json.dumps(done.document(), allow_nan=False))

@@ -1,0 +1,147 @@
+"""`kerv calibrate`: fits predictors, reference levels, boundary ranges and skip levels on the demonstrations."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from kerv_cli.cli import common
+from kerv_cli.cli.common import Overrides, ShowConfig, ShowPlan, edge, print_table, progress_bar
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
+    from kerv_cli.methods.calibration_file import Calibration
+
+
+RISK, PLOT = "risk", "coverage.png"
+
+
+@edge
+def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels. `kerv calibrate
+    risk …` records in closed loop what unverified drafts lose, for skip=risk."""
+    if overrides and overrides[0] == RISK:
+        _risk(overrides[1:], cfg, plan)
+        return
+    from kerv_cli.base.settings import CalibrateSettings
+
+    settings = common.composed("calibrate", overrides, CalibrateSettings, cfg)
+    from kerv_cli.training.calibration import CalibrationRun
+
+    run = CalibrationRun(settings)
+    if plan:
+        common.print_plan(run.plan())
+    with progress_bar("reading demonstrations") as advance:
+        run.load(advance)
+    variability, skip = {}, None
+    if settings.decodes:
+        with progress_bar("pre-sampling") as advance:
+            variability = run.presample(advance)
+    with progress_bar("boundary ranges") as advance:
+        boundary = run.boundary(advance)
+    if run.stored:
+        with progress_bar("skip levels") as advance:
+            skip = run.skip(advance)
+    with common.console(stderr=True).status("fitting the predictors"):
+        calibration = run.finish(variability, boundary, skip)
+    _tasks(calibration, run.path)
+    _noise(calibration)
+    _errors(calibration)
+    _boundary(calibration)
+    _skip(calibration)
+    for line in run.notes:
+        typer.echo(line)
+
+
+def _tasks(calibration: Calibration, path: Path) -> None:
+    columns = ("task", "fitted on", "tested on", "decodes", "K_S", "K p25", "K p75", "Kalman, h=1", "hold, h=1")
+    kalman, hold = (_moving_errors(calibration, kind)[:, 0] for kind in ("kalman", "hold"))
+    rows = []
+    for number, (name, counts) in enumerate(calibration.demos.tasks.items()):
+        row = calibration.variability.get(name)
+        levels = [row.decodes, *(f"{x:.3f}" for x in (row.k_s, row.p25, row.p75))] if row else ["-"] * 4
+        errors = (f"{kalman[number]:.4f}", f"{hold[number]:.4f}")
+        rows.append((name, counts["training"], counts["held_out"], *levels, *errors))
+    print_table(columns, rows, f"calibration in {path}")
+
+
+def _noise(calibration: Calibration) -> None:
+    space = calibration.target.actions
+    moving = [dof for dof in range(space.dofs) if not space.is_strict[dof]]
+    rows = [
+        (kind, *(f"{noise.q[dof] / noise.r[dof]:.3g} ({noise.damping[dof]:.2g})" for dof in moving))
+        for kind, noise in calibration.noise.items()
+    ]
+    print_table(("filter", *(space.names[dof] for dof in moving)), rows, "fitted q / r (damping)")
+
+
+def _moving_errors(calibration: Calibration, kind: str) -> np.ndarray:
+    from kerv_cli.training.predictor_fit import moving_errors
+
+    return moving_errors(calibration.errors, kind, calibration.target.actions)
+
+
+def _errors(calibration: Calibration) -> None:
+    hold, rows = _moving_errors(calibration, "hold"), []
+    horizon = hold.shape[1]
+    for kind in calibration.errors:
+        error = _moving_errors(calibration, kind)
+        below = [int((error[:, h] < hold[:, h]).sum()) for h in (0, horizon - 1)]
+        wins = ["-" if kind == "hold" else f"{count}/{len(hold)} tasks" for count in below]
+        rows.append((kind, *(f"{e:.4f}" for e in error.mean(0)), *wins))
+    columns = ("predictor", *(f"h={h}" for h in range(1, horizon + 1)), "below hold at h=1", f"at h={horizon}")
+    print_table(columns, rows, "held-out error of the moving DoFs, mean of tasks, normalised action units")
+
+
+def _boundary(calibration: Calibration) -> None:
+    if calibration.boundary is None:
+        return
+    rows = []
+    for window, r in calibration.boundary.windows.items():
+        bounds = (r.radius_low, r.radius_high, r.length_low, r.length_high)
+        rows.append((window, *(f"{1000 * metres:.1f}" for metres in bounds)))
+    columns = ("positions", "radius R, minimum", "95th percentile", "length D, minimum", "95th percentile")
+    print_table(columns, rows, "ranges of the boundary's metric, mm")
+
+
+def _skip(calibration: Calibration) -> None:
+    if calibration.skip is None:
+        return
+    epsilon, confidence = calibration.skip.epsilon, calibration.skip.confidence
+    rows = []
+    for name, row in calibration.skip.tasks.items():
+        levels = [f"{x:.4f}" for x in (row.s_min, row.low, row.high)] if row.share else ["never", "-", "-"]
+        figures = [f"{row.within:.1%}", f"{row.error:.4f}"] if row.share else ["-", "-"]
+        rows.append((name, *levels, f"{row.share:.1%}", *figures, row.entries))
+    columns = ("task", "s_min", "low", "high", "would be skipped", f"error ≤ {epsilon:g}", "mean error", "entries")
+    title = f"verify-skip, best neighbour in another episode, {confidence:.0%} with an error of at most {epsilon:g}"
+    print_table(columns, rows, title)
+
+
+def _risk(overrides: list[str], cfg: bool, plan: bool) -> None:
+    from kerv_cli.base.errors import Interrupted
+    from kerv_cli.base.settings import CalibrateRiskSettings
+
+    settings = common.composed("calibrate_risk", overrides, CalibrateRiskSettings, cfg)
+    from kerv_cli.report.risk import coverage_table, plot_coverage
+    from kerv_cli.training.risk_recording import RiskRun
+
+    run = RiskRun(settings)
+    if plan:
+        common.print_plan(run.plan())
+    try:
+        with progress_bar("episodes") as advance:
+            run.record(advance)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            f"interrupted: finished episodes are kept in {run.folder}, the same command goes on there"
+        ) from None
+    recording = run.finish(lambda recording, folder: plot_coverage(recording, folder / PLOT))
+    title = f"levels with a risk of at most {settings.epsilon:g}, certified at 1 - {settings.delta:g}"
+    columns = ("source", "score", "level", "trusted", "risk", "p", "holds in", "AUC", "episodes")
+    print_table(columns, coverage_table(recording, settings.epsilon, settings.delta), title)
+    typer.echo(f"{run.folder}\n{run.folder / PLOT}")

@@ -1,0 +1,239 @@
+"""What every command shares: turning errors into one line, override arguments and their completion, progress bars,
+tables."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import re
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from typing import Annotated, Any, ParamSpec, TypeVar
+
+import typer
+
+from kerv_cli.base.errors import KervError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def complete_overrides(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions of an override. Imports nothing heavy."""
+    from kerv_cli.cli.completing import complete_overrides as complete
+
+    return complete(ctx, incomplete)
+
+
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(help="Settings as key=value; see --cfg for all of them.", autocompletion=complete_overrides),
+]
+ShowConfig = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
+ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
+
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, nothing else.")]
+
+
+def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bool, writes: bool = True) -> T:
+    """The command's settings. With --cfg they are printed and the command ends. writes: the command stores results, so
+    that a folder that cannot be written is refused now.
+
+    Raises:
+        UsageError: as `config.compose`. StorageError: as `places.check_writable`.
+    """
+    from kerv_cli.base.config import compose, to_yaml
+    from kerv_cli.base.places import check_writable
+
+    settings: Any = compose(command, overrides or [], schema)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        raise typer.Exit(0)
+    if writes:
+        check_writable(settings.results)
+    checked: T = settings
+    return checked
+
+
+def print_json(value: Any) -> None:
+    """Prints a value as indented JSON; NaN and infinity, which JSON lacks, become null."""
+    import json
+
+    typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "item"):  # of numpy
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def print_notes(idle: Mapping[str, str]) -> None:
+    """Prints a line on stderr for each override that has no effect. idle: override -> why."""
+    for override, reason in idle.items():
+        typer.echo(f"note: {override} has no effect: {reason}", err=True)
+
+
+def print_plan(text: str, as_json: bool = False) -> None:
+    """Prints what would be done, for --plan; the command ends."""
+    if as_json:
+        print_json({"plan": text})
+    else:
+        typer.echo(text)
+    raise typer.Exit(0)
+
+
+def edge(command: Callable[P, None]) -> Callable[P, None]:
+    """Decorates a command: every exception is printed as one line and becomes an exit code (a KervError's own; 1 for
+    others; 130 for Ctrl-C). Commands named in the line run as they stand. KERV_TRACEBACK=1 raises it instead."""
+
+    @functools.wraps(command)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+        words: Any = kwargs.get("overrides") or kwargs.get("arguments") or []
+        try:
+            command(*args, **kwargs)
+        except typer.Exit:
+            raise
+        except KervError as error:
+            _refuse(runnable(str(error), words), error.exit_code, error)
+        except KeyboardInterrupt:
+            _refuse("interrupted", 130, None)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except OSError as error:
+            _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
+        except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
+            _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
+
+    return wrapped
+
+
+_QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
+_CARRIED = {
+    "results": None,  # None: every command takes it
+    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter"),
+    "demos": ("train target", "train drafter", "calibrate", "build datastore"),
+}
+"""Settings of the present command that a command in its messages needs too -> the commands that take them."""
+
+
+def runnable(message: str, words: Iterable[str]) -> str:
+    """The message with every quoted command made complete: how kerv is called here, and those of the present command's
+    settings without which it would work on another folder or another policy."""
+
+    def completed(found: re.Match[str]) -> str:
+        quote, name, rest = found.groups()
+        given = {word.split("=", 1)[0] for word in shlex.split(rest)}
+        carried = [shlex.quote(word) for word in words if _carries(word, name) and word.split("=", 1)[0] not in given]
+        return f"{quote}{' '.join([called(), name, *rest.split(), *carried])}{quote}"
+
+    return _QUOTED.sub(completed, message)
+
+
+def _carries(word: str, command: str) -> bool:
+    key = word.split("=", 1)[0].split(".", 1)[0]
+    takers = _CARRIED.get(key, ())
+    return takers is None or command in takers
+
+
+def in_same(place: Iterable[str]) -> str:
+    """` results=DIR` where these words name one, for commands to type next; else nothing."""
+    return "".join(f" {shlex.quote(word)}" for word in place if word.startswith("results="))
+
+
+def _refuse(message: str, code: int, error: BaseException | None) -> None:
+    if error is not None and os.environ.get("KERV_TRACEBACK"):
+        raise error
+    typer.echo(f"kerv: {' '.join(message.split())}", err=True)
+    raise typer.Exit(code)
+
+
+@contextmanager
+def at_work(what: str) -> Iterator[None]:
+    """A spinner on a terminal while something takes seconds and has no count: libraries and weights that load."""
+    with console(stderr=True).status(what) if sys.stderr.isatty() else nullcontext():
+        yield
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+    """Yields `advance(done, total, text="")`: a progress bar on a terminal, elsewhere at most 10 lines (50 for totals
+    from 2000 on). Of several processes that torchrun started, the first shows it."""
+    if os.environ.get("RANK", "0") != "0":
+        yield lambda done, total, text="": None
+        return
+    if not sys.stderr.isatty():
+        yield _plain_lines(title)
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    timed = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    texts = (TextColumn(f"{{task.{name}}}") for name in ("description", "fields[text]"))
+    with Progress(next(texts), *timed, next(texts), console=console(stderr=True)) as bar:
+        task = bar.add_task(title, total=None, text="")
+        yield lambda done, total, text="": bar.update(task, completed=done, total=total, text=text)
+
+
+def _plain_lines(title: str) -> Callable[..., None]:
+    shown = -1
+
+    def advance(done: int, total: int, text: str = "") -> None:
+        nonlocal shown
+        part = (50 if total >= 2000 else 10) * done // max(1, total)
+        if part > shown:
+            shown = part
+            typer.echo(f"{title} {done}/{total} {text}".rstrip(), err=True)
+
+    return advance
+
+
+def called() -> str:
+    """The command to show in hints: `kerv` where the shell finds it, else the path of this script."""
+    import shutil
+
+    return "kerv" if shutil.which("kerv") or not sys.argv[0].endswith("kerv") else os.path.relpath(sys.argv[0])
+
+
+def console(stderr: bool = False) -> Any:
+    """A rich console; 200 columns wide where the output is no terminal."""
+    from rich.console import Console
+
+    wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
+    return Console(stderr=stderr, width=wide, highlight=False)
+
+
+def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
+    """Prints a table below its title; columns: its header. A title is never wrapped: it may hold a path to copy."""
+    from rich.table import Table
+
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*map(str, row))
+    if title:
+        typer.echo(title)
+    console().print(table)
+
+
+def print_figures(what: str, figures: dict[str, float], folder: object) -> None:
+    """Prints named numbers, four digits of each, and the folder of what they belong to."""
+    rows = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in figures.items())
+    print_table((what, ""), rows)
+    typer.echo(str(folder))

@@ -1,0 +1,138 @@
+"""`kerv demos`: record the scripted experts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from kerv_cli.cli.common import (
+    Overrides,
+    ShowConfig,
+    ShowPlan,
+    composed,
+    edge,
+    print_figures,
+    print_plan,
+    print_table,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from kerv_cli.base.settings import DemosSettings
+    from kerv_cli.training.dagger import TargetActs
+
+
+@edge
+def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+    """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a target
+    visits, labelled by the expert. `kerv demos export …` writes a LeRobot dataset, `kerv demos import …` reads one."""
+    if overrides and overrides[0] in OTHERS:
+        OTHERS[overrides[0]](overrides[1:], cfg)
+        return
+    from kerv_cli.base.errors import Interrupted
+    from kerv_cli.base.settings import DemosSettings, as_plain
+
+    settings = composed("demos", overrides, DemosSettings, cfg)
+    from kerv_cli.base.places import artifact
+    from kerv_cli.worlds import resolve_tasks, spec_of
+
+    tasks = resolve_tasks(settings.task)
+    folder = artifact(settings.results, "demos", settings.name or "-".join(settings.task).lower())
+    if plan:
+        steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
+        minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
+        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
+    from kerv_cli.worlds.camera import CameraConfig
+    from kerv_cli.worlds.demos.recording import DemoConfig, record
+
+    actor = _actor(settings, tasks[0])
+    config = DemoConfig(
+        tasks=tasks,
+        episodes=settings.episodes,
+        first_seed=settings.seed,
+        perturbed=settings.perturbed,
+        camera=CameraConfig(**as_plain(settings.world.camera)),
+        frame_stride=settings.frame_stride,
+        workers=settings.runtime.workers,
+        horizon=settings.world.horizon,
+        policy=actor.sha256 if actor else "",
+        expert_share=settings.expert_share if actor else 0.0,
+    )
+    try:
+        with progress_bar("demonstrations") as advance:
+            manifest = record(config, folder, advance, actor)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            f"interrupted: finished episodes are kept in {folder}, the same command goes on there"
+        ) from None
+    rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
+    print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
+
+
+def _actor(settings: DemosSettings, task: str) -> TargetActs | None:
+    """What moves the robot in the expert's place; None: the expert itself. task: one of those recorded."""
+    from kerv_cli.base.settings import EXPERT, PolicySettings
+    from kerv_cli.worlds import spec_of
+
+    target = settings.policy.target
+    if settings.policy.kind != EXPERT:
+        from kerv_cli.training.dagger import TargetActs
+
+        return TargetActs.of(settings.results, target, spec_of(task), settings.world)
+    if target != PolicySettings().target:
+        from kerv_cli.base.errors import UsageError
+
+        raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
+    return None
+
+
+def _export(words: list[str], cfg: bool) -> None:
+    from kerv_cli.base.settings import DemosExportSettings
+
+    settings = composed("demos_export", words, DemosExportSettings, cfg)
+    from pathlib import Path
+
+    from kerv_cli.base.places import artifact, results_dir
+    from kerv_cli.worlds.demos.dataset import DemoDataset
+    from kerv_cli.worlds.demos.lerobot.export import export
+
+    _check_format(settings.format)
+    dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
+    folder = (
+        Path(settings.to).expanduser() if settings.to else results_dir(settings.results) / "lerobot" / settings.demos
+    )
+    with progress_bar("export") as advance:
+        made = export(dataset, folder, advance)
+    figures = {"episodes": len(made.episodes), "frames": made.rows, "tasks": len(made.tasks), "frames/s": made.rate}
+    print_figures("LeRobot dataset", figures, folder)
+
+
+def _import(words: list[str], cfg: bool) -> None:
+    from kerv_cli.base.settings import DemosImportSettings
+
+    settings = composed("demos_import", words, DemosImportSettings, cfg)
+    from pathlib import Path
+
+    from kerv_cli.base.places import artifact
+    from kerv_cli.worlds.demos.lerobot.reading import import_lerobot
+
+    _check_format(settings.format)
+    if not settings.source:
+        from kerv_cli.base.errors import UsageError
+
+        raise UsageError("source=DIR: name the folder of a LeRobot dataset")
+    folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
+    with progress_bar("import") as advance:
+        manifest = import_lerobot(settings, folder, advance)
+    rows = ((name, len(row["episodes"]), f"{row['mean_steps']:.0f}") for name, row in manifest["tasks"].items())
+    title = f"demonstrations in {folder}, suite {manifest['environment'].upper()}"
+    print_table(("task", "episodes", "mean steps"), rows, title)
+
+
+def _check_format(name: str) -> None:
+    from kerv_cli.base.errors import UnknownName
+
+    if name != "lerobot":
+        raise UnknownName("format", name, ("lerobot",))
+
+
+OTHERS = {"export": _export, "import": _import}

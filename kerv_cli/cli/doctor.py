@@ -1,0 +1,232 @@
+"""`kerv doctor`: checks this machine (rendering, torch, policies, disk) and names the remedy for each failure."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kerv_cli.base.errors import StorageError
+from kerv_cli.base.findings import Finding
+from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, edge, print_json, print_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from kerv_cli.base.settings import DoctorSettings
+    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.worlds.spec import EnvironmentSpec
+
+
+Repair = Annotated[
+    bool, typer.Option("--repair", help="Remove what killed commands left in the results; set damaged cells aside.")
+]
+
+
+@edge
+def doctor(
+    overrides: Overrides = None, cfg: ShowConfig = False, repair: Repair = False, as_json: AsJson = False
+) -> None:
+    """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
+    target=NAME or environment=NAME: whether that keeps its protocol."""
+    from kerv_cli.base.settings import DoctorSettings
+
+    # here target=NAME is a policy's folder; to Hydra it would be a choice among the files of conf/target
+    words = [f"policy.{o}" if o.startswith("target=") else o for o in overrides or []]
+    settings = composed("doctor", words, DoctorSettings, cfg, writes=False)
+    if repair:
+        _repair(settings)
+        return
+    if settings.policy.target or settings.environment:
+        findings = [*_target(settings), *_environment(settings)]
+    else:
+        findings = _machine(settings)
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        print_table(("check", "", "finding"), ((f.what, "ok" if f.ok else "FAILS", f.says) for f in findings))
+    if not all(finding.ok for finding in findings):
+        raise typer.Exit(1)
+
+
+def _machine(settings: DoctorSettings) -> list[Finding]:
+    findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings)]
+    return [*findings, _disk(settings), _left(settings), _display()]
+
+
+def _target(settings: DoctorSettings) -> list[Finding]:
+    """Whether the target keeps the protocol, on an observation of noise."""
+    if not settings.policy.target:
+        return []
+    import numpy as np
+
+    from kerv_cli.base.runtime import set_up
+    from kerv_cli.base.spaces import Observation
+    from kerv_cli.base.views import frame_shape
+    from kerv_cli.methods.artifacts import Artifacts
+    from kerv_cli.targets.conformance import check_target
+
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
+    described, random = artifacts.description, np.random.default_rng(settings.seed)
+    size, space = int(described.settings.get("image_size", settings.world.camera.size)), described.observation
+    images = {name: random.integers(0, 256, frame_shape(name, size), dtype=np.uint8) for name in described.cameras}
+    state = random.normal(size=space.state)
+    words = " ".join(described.words[:3]) or "move"
+    return check_target(artifacts.target, Observation(state[: len(space.proprioception)], state, words, images))
+
+
+def _environment(settings: DoctorSettings) -> list[Finding]:
+    """Whether the environment keeps the protocol, on its first task."""
+    if not settings.environment:
+        return []
+    from kerv_cli.base.errors import UnknownName
+    from kerv_cli.worlds import specs
+    from kerv_cli.worlds.conformance import check_environment
+
+    known = specs()
+    if settings.environment not in known:
+        raise UnknownName("environment", settings.environment, known)
+    return check_environment(known[settings.environment], settings.seed)
+
+
+def _versions() -> Finding:
+    from kerv_cli.base.provenance import versions
+
+    return Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items()))
+
+
+def _rendering(settings: DoctorSettings) -> list[Finding]:
+    """One finding per environment."""
+    from kerv_cli.worlds import specs
+
+    return [_drawn(f"rendering {spec.name}", spec, settings) for spec in specs().values()]
+
+
+def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
+    """Draws frames of a world and times them: a backend can load and still draw nothing."""
+    import time
+
+    from kerv_cli.base.errors import KervError
+    from kerv_cli.base.settings import as_plain
+    from kerv_cli.worlds.camera import CameraConfig, choose_backend
+
+    first = next(iter(spec.suites.values()), tuple(spec.tasks))[0]
+    try:
+        backend = choose_backend()
+        with spec.open_world(first, CameraConfig(**{**as_plain(settings.world.camera), "name": ""})) as world:
+            world.reset(settings.seed)
+            world.frame()
+            began = time.perf_counter()
+            spread = [int(world.frame().std()) for _ in range(20)][-1]
+            milliseconds = 1000 * (time.perf_counter() - began) / 20
+    except KervError as error:
+        return Finding(what, False, str(error))
+    size = settings.world.camera.size
+    if spread == 0:
+        return Finding(what, False, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
+    return Finding(what, milliseconds < 50, f"{backend}, {milliseconds:.1f} ms a frame at {size}x{size}")
+
+
+def _torch(settings: DoctorSettings) -> Finding:
+    import torch
+
+    from kerv_cli.base.errors import KervError
+    from kerv_cli.base.provenance import device_name
+    from kerv_cli.base.runtime import set_up
+
+    try:
+        device, _ = set_up(settings.runtime)
+    except KervError as error:
+        return Finding("torch", False, str(error))
+    cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"
+    return Finding("torch", True, f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}")
+
+
+def _policies(settings: DoctorSettings) -> list[Finding]:
+    from kerv_cli.base.errors import KervError
+    from kerv_cli.base.places import find_target, shipped_dir
+    from kerv_cli.targets.checkpoint import read_target
+
+    findings = []
+    for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
+        try:
+            described = read_target(find_target(settings.results, name))
+            found = described.provenance.get("parameters")
+            size = f"{found / 1e6:.1f} M parameters, " if isinstance(found, int | float) else ""
+            findings.append(Finding(f"policy {name}", True, f"{size}{described.sha256[:12]}"))
+        except KervError as error:
+            findings.append(Finding(f"policy {name}", False, str(error)))
+    return findings or [
+        Finding(
+            "policies", False, "none here: install kerv from its wheel or run it in a checkout, both bring mt10-vision"
+        )
+    ]
+
+
+def _disk(settings: DoctorSettings) -> Finding:
+    import shutil
+
+    from kerv_cli.base.files import atomic_path
+    from kerv_cli.base.places import results_dir
+
+    folder = results_dir(settings.results)
+    probe = folder / ".kerv-doctor"
+    try:
+        with atomic_path(probe) as temporary:
+            temporary.write_text("probe")
+        probe.unlink()
+    except StorageError as error:
+        return Finding("results", False, str(error))
+    free = shutil.disk_usage(folder).free / 1e9
+    return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
+
+
+def _left_over(settings: DoctorSettings) -> list[Path]:
+    """Temporary files and folders of dead processes, and claims and notes of dead sweeps, in the results."""
+    from kerv_cli.base.leftovers import left_over
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.lab.claims import void
+
+    root = results_dir(settings.results)
+    claims = [path for store in _stores(settings) for path in void(store.claims)]
+    return [*left_over(root), *claims]
+
+
+def _stores(settings: DoctorSettings) -> list[StudyStore]:
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.lab.store import ROLLOUTS, STUDIES, stores
+
+    return [store for family in (STUDIES, ROLLOUTS) for store in stores(results_dir(settings.results), family)]
+
+
+def _left(settings: DoctorSettings) -> Finding:
+    found = _left_over(settings)
+    says = f"{len(found)} files of killed commands, kerv doctor --repair removes them" if found else "nothing"
+    return Finding("left over", True, says)
+
+
+def _repair(settings: DoctorSettings) -> None:
+    """Lists and removes what `_left_over` finds; sets damaged cells aside."""
+    from kerv_cli.base.leftovers import remove
+
+    found = _left_over(settings)
+    for path in found:
+        remove(path)
+        typer.echo(f"removed {path}")
+    kept = [path for path in found if path.exists()]
+    if kept:
+        raise StorageError(f"{kept[0]} cannot be removed: permission denied?")
+    damages = [(store, name, error) for store in _stores(settings) for name, error in store.damages()]
+    for store, name, error in damages:
+        typer.echo(f"{str(error).split(': `')[0]}: it lies in {store.set_aside(name)} now, {store.how_to_run()}")
+    aside = f", {len(damages)} damaged cells set aside" if damages else ""
+    typer.echo(f"{len(found)} left over files removed{aside}; everything else is complete or absent")
+
+
+def _display() -> Finding:
+    from kerv_cli.report.viewing.viewer import has_display
+
+    says = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
+    return Finding("display", True, says)

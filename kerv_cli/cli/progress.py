@@ -1,0 +1,122 @@
+"""Shows a sweep's events: a progress bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from kerv_cli.lab import events
+from kerv_cli.lab.cells import CellLike
+from kerv_cli.lab.plan import Block, Cell
+
+
+class ProgressDisplay:
+    """The `on_event` callback of `execute`; a context manager that ends the bar. The bar counts cells; where episodes
+    run in this process, `on_step` moves it within a cell and within an episode too."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self._bar: Progress | None = None
+        self._task = TaskID(0)
+        self._total = self._finished = 0
+        self._running: dict[str, Block] = {}  # by name, without their ended cells
+        self._parts: dict[str, float] = {}  # of unfinished cells, by id: the share of their control steps
+
+    def __enter__(self) -> ProgressDisplay:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, event: events.Event) -> None:
+        if isinstance(event, events.SweepStarted):
+            self._start(event)
+        elif isinstance(event, events.BlockStarted):
+            self._running[event.block.name] = event.block
+        elif isinstance(event, events.BlockWaits):
+            self._running.pop(event.block.name, None)
+            self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
+        elif isinstance(event, events.CellDone):
+            self._finish(event.cell, _result(event))
+        elif isinstance(event, events.CellFailed):
+            self._finish(event.cell, f"[red]failed[/red]: {escape(event.reason)}")
+        elif isinstance(event, events.CellReused):
+            self._finish(event.cell, "completed by another sweep")
+        self._refresh()
+
+    def on_step(self, cell: CellLike, seed: int, step: int) -> None:
+        """Shows that `step` control steps of a seed's episode were executed; at most one episode runs at a time."""
+        if self._bar is None:
+            return
+        horizon, seeds = int(cell.settings["world"]["horizon"]), list(cell.seeds)
+        # half an episode's share for a step at half the horizon: successful episodes end early and then jump
+        self._parts[cell.id] = (seeds.index(seed) + min(1.0, step / max(1, horizon))) / len(seeds)
+        now = f"{escape(cell.label)} on {cell.task}, seed {seed}: step {step}"
+        self._bar.update(self._task, completed=self._finished + sum(self._parts.values()), description=now)
+
+    def _start(self, event: events.SweepStarted) -> None:
+        self._total, self._finished = event.total, 0
+        self._parts.clear()
+        if self._bar is not None:
+            self._bar.stop()
+        if event.reused:
+            self.console.print(f"{event.reused} cells are complete already")
+        if not self.console.is_terminal or not event.total:
+            return
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[count]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        self._bar = Progress(*columns, console=self.console, transient=True)
+        self._task = self._bar.add_task("preparing", total=event.total, count=f"0/{event.total}")
+        self._bar.start()
+
+    def _finish(self, cell: Cell, result: str) -> None:
+        for name, block in list(self._running.items()):
+            left = block.without({cell.id})
+            if left is None:
+                del self._running[name]
+            else:
+                self._running[name] = left
+        self._finished += 1
+        self._parts.pop(cell.id, None)
+        count = f"[dim]{self._finished:{len(str(self._total))}}/{self._total}[/dim]"
+        alone = f", seed {cell.seeds[0]}" if len(cell.seeds) == 1 else ""
+        line = f"{count} {escape(cell.label)} on {cell.task}{alone}: {result}"
+        self.console.print(line, soft_wrap=True, highlight=False)
+
+    def _refresh(self) -> None:
+        if self._bar is None:
+            return
+        names = [block.title for block in self._running.values()]
+        more = f" +{len(names) - 1}" if len(names) > 1 else ""
+        now = escape(names[0] + more if names else "cells")
+        done = self._finished + sum(self._parts.values())
+        count = f"{self._finished}/{self._total}"
+        self._bar.update(self._task, completed=done, description=now, count=count)
+
+
+def _result(event: events.CellDone) -> str:
+    if event.episodes == 1:
+        return f"{'success' if event.successes else 'failure'}, {event.seconds:.1f} s"
+    rate = event.seconds / max(1, event.episodes)
+    return f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode"

@@ -1,0 +1,88 @@
+"""`kerv report`: tables, plots and a page from the cells of a results folder."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, console, edge, print_json
+
+if TYPE_CHECKING:
+    from kerv_cli.base.settings import ReportSettings
+
+Publish = Annotated[
+    bool,
+    typer.Option(
+        "--publish", help="Write tables and plots where they are committed; refuse what may not be published."
+    ),
+]
+
+
+Choose = Annotated[
+    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the boldest safe one.")
+]
+
+
+@edge
+def report(
+    overrides: Overrides = None,
+    cfg: ShowConfig = False,
+    publish: Publish = False,
+    choose: Choose = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
+    from kerv_cli.base.settings import ReportSettings
+    from kerv_cli.lab.resolve import study_name
+
+    # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
+    words = [f"only={study_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
+    settings = composed("report", words, ReportSettings, cfg)
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.cli.sweep import tell_table
+    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.report.agreement import agreement_summary
+    from kerv_cli.report.report import report as write_report
+    from kerv_cli.report.tables import rows_of
+
+    if choose:
+        _choose(settings, as_json)
+        return
+    written = write_report(results_dir(settings.results), settings.only, publish, settings.against)
+    if as_json:
+        tables = {name: rows_of(table) for name, table in written.tables.items()}
+        print_json({"files": written.files, "studies": tables})
+        return
+    for name, table in written.tables.items():
+        tell_table(table, StudyStore(results_dir(settings.results), name), words)
+    if written.agreement is not None:
+        console().print(agreement_summary(written.agreement))
+    for path in written.files:
+        typer.echo(str(path))
+
+
+def _choose(settings: ReportSettings, as_json: bool) -> None:
+    """Prints the choice of one study, or of every study that has results."""
+    from kerv_cli.base.errors import UsageError
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.lab.store import StudyStore, begun_studies
+    from kerv_cli.report.choose import choices, choices_frame, sentence, short
+    from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
+
+    results = results_dir(settings.results)
+    names = [settings.only] if settings.only else begun_studies(results)
+    if not names:
+        raise UsageError(f"no study in {results / 'studies'} has a complete cell: run `kerv sweep study=demo`")
+    answers = {}
+    for name in names:
+        data = load_study(StudyStore(results, name))
+        found = choices(study_table(data), per_task_table(data), data.plan.axis, settings.loss)
+        answers[name] = rows_of(choices_frame(found))
+        if not as_json:
+            typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(found[0].front)}")
+            typer.echo(f"  {sentence(found[0], data.plan.axis, settings.loss, data.plan.baseline)}")
+            for choice in found[1:]:
+                typer.echo(f"  {short(choice)}")
+    if as_json:
+        print_json(answers)

@@ -1,0 +1,261 @@
+"""`kerv rollout`: episodes of one method or of a grid, their figures and their Rerun files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+from kerv_cli.base.errors import KervError
+from kerv_cli.cli.common import (
+    AsJson,
+    Overrides,
+    ShowConfig,
+    ShowPlan,
+    at_work,
+    called,
+    console,
+    edge,
+    in_same,
+    print_json,
+    print_notes,
+    print_table,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    import pandas as pd
+
+    from kerv_cli.engine.record import EpisodeRecord
+    from kerv_cli.lab.cells import CellRunner
+    from kerv_cli.lab.plan import Cell
+    from kerv_cli.lab.resolve import ResolvedStudy
+    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.report.tables import StudyData
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
+
+
+@edge
+def rollout(
+    overrides: Overrides = None,
+    cfg: ShowConfig = False,
+    plan: ShowPlan = False,
+    multirun: Many = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
+    from dataclasses import asdict
+
+    from kerv_cli.base.config import to_yaml
+    from kerv_cli.base.places import check_writable
+    from kerv_cli.lab.effects import without_effect
+    from kerv_cli.lab.rollout_runs import resolve_rollout
+    from kerv_cli.worlds import resolve_tasks
+
+    words = list(overrides or [])
+    resolved = resolve_rollout(words, multirun)
+    if cfg:
+        typer.echo("---\n".join(to_yaml(settings) for settings in resolved.settings.values()), nl=False)
+        return
+    for label, settings in resolved.settings.items():
+        print_notes(without_effect(settings, resolved.overrides[label].split()))
+    first = next(iter(resolved.settings.values()))
+    check_writable(first.results)
+    cells = planned_cells(resolved)
+    if plan:
+        total = sum(len(cell.seeds) for cell in cells)
+        names = ", ".join(f"{label}{_stressed(asdict(own))}" for label, own in resolved.settings.items())
+        tasks = resolve_tasks(first.task)
+        if as_json:
+            print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
+        else:
+            typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, about {3 * total} s (a guess)")
+        return
+    arguments = ["rollout", *(["-m"] if multirun else []), *words]
+    store = run_cells(resolved, cells, first.results, arguments)
+    _tell(store, cells, as_json, in_same(words))
+
+
+def _stressed(settings: Mapping[str, Any]) -> str:
+    """How a setting of plain RolloutSettings is called after its label: its stress; empty without one."""
+    from kerv_cli.lab.identity import stress_of
+
+    stress = stress_of(settings)
+    return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
+
+
+def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
+    """The cells of a study, after everything that can be refused without running was."""
+    from kerv_cli.worlds import resolve_tasks
+
+    study = resolved.study
+    tasks = resolve_tasks(next(iter(resolved.settings.values())).task)
+    with at_work("loading the policy"):
+        from kerv_cli.base.runtime import set_up
+        from kerv_cli.lab.plan import plan as plan_cells
+        from kerv_cli.lab.policy import check, identity_of
+
+        for settings in resolved.settings.values():
+            check(settings)
+            settings.runtime.device, _ = set_up(settings.runtime)
+    warn_unseen(resolved, tasks)
+    return plan_cells(
+        resolved.settings,
+        tasks,
+        identity_of,
+        baseline=study.baseline,
+        overrides=resolved.overrides,
+        block=study.block,
+        repeats=study.repeats,
+    )
+
+
+def warn_unseen(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> None:
+    """Says on standard error which of these tasks a policy was not trained on."""
+    from kerv_cli.lab.policy import unseen_tasks
+
+    told: set[str] = set()
+    for settings in resolved.settings.values():
+        missing = unseen_tasks(settings, tasks)
+        line = f"kerv: warning: policy {settings.policy.target} was never trained on {', '.join(missing)}"
+        if missing and line not in told:
+            told.add(line)
+            typer.echo(line, err=True)
+
+
+def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, arguments: list[str]) -> StudyStore:
+    """Runs the cells, going on where the same command was interrupted -> where they are stored.
+
+    Raises:
+        Interrupted: Ctrl-C. KervError: an episode failed.
+    """
+    from kerv_cli.base.errors import Interrupted
+    from kerv_cli.cli.progress import ProgressDisplay
+    from kerv_cli.lab import events
+    from kerv_cli.lab.cells import CellRunner, reference_decode
+    from kerv_cli.lab.execute import execute
+    from kerv_cli.lab.rollout_runs import begin
+    from kerv_cli.lab.run import close_worlds
+    from kerv_cli.lab.run_file import note_invocation
+
+    store, cells, done = begin(results, cells)
+    if done:
+        typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
+    store.write_plan(resolved.study, cells)
+    note_invocation(store.root, arguments)
+    runtime = next(iter(resolved.settings.values())).runtime
+    with ProgressDisplay(console(stderr=True)) as display:
+
+        def on_event(event: events.Event) -> None:
+            if isinstance(event, events.CellFailed):
+                raise failure.error or KervError(event.reason)
+            display(event)
+
+        here = runtime.workers == 1
+        failure = _Remembering(CellRunner(store.rollouts, keep=True, on_step=display.on_step if here else None))
+        try:
+            execute(cells, failure if here else failure.runner, store, runtime, on_event, reference_decode)
+        except KeyboardInterrupt:
+            kept = sum(store.has_cell(cell.id) for cell in cells)
+            raise Interrupted(
+                f"interrupted: {kept} of {len(cells)} episodes are kept in {store.root}, the same command goes on there"
+            ) from None
+        finally:
+            close_worlds()
+    return store
+
+
+class _Remembering:
+    """A CellRunner of this process that keeps the error of a setting that cannot be built or run, with its exit
+    code."""
+
+    def __init__(self, runner: CellRunner) -> None:
+        self.runner = runner
+        self.error: KervError | None = None
+
+    def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
+        run = self._kept(self.runner, cell)
+        return lambda seed: self._kept(run, seed)
+
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+        """As `CellRunner.together`."""
+        try:
+            for cell, seed, ended in self.runner.together(cells):
+                self.error = ended if isinstance(ended, KervError) else self.error
+                yield cell, seed, ended
+        except KervError as error:
+            self.error = error
+            raise
+
+    def _kept(self, call: Callable[[A], B], argument: A) -> B:
+        try:
+            return call(argument)
+        except KervError as error:
+            self.error = error
+            raise
+
+
+def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+    from kerv_cli.report.summary import summary_table
+    from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
+
+    data = load_study(store)
+    recordings = sorted(store.rollouts.glob("*.rrd"))
+    table = study_table(data)
+    if as_json:
+        per_task = rows_of(per_task_table(data))
+        settings = rows_of(table[table["averaging"] == table["averaging"].iloc[0]])
+        print_json({"run": store.name, "folder": store.root, "settings": settings, "tasks": per_task,
+                    "recordings": recordings})  # fmt: skip
+        return
+    if len(data.plan.labels) > 1:
+        console().print(summary_table(table))
+    else:
+        _single(data)
+    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
+    if recordings:
+        typer.echo(f"{len(recordings)} recordings; open one with: {called()} view {recordings[0]}")
+
+
+def _single(data: StudyData) -> None:
+    """Figures of a run with one setting: by task, and time by phase."""
+    from kerv_cli.engine.record import PHASES
+    from kerv_cli.lab.identity import batch_of
+    from kerv_cli.report.measures import is_timed
+
+    episodes = data.episodes
+    cell = data.plan.cells[0]
+    tasks = list(dict.fromkeys(episodes["task"]))
+    names = (*tasks, "all") if len(tasks) > 1 else tasks
+    rows = [(name, *_figures(episodes[(episodes["task"] == name) | (name == "all")])) for name in names]
+    headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
+    seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
+    seen = cell.identity.get("observation", "")
+    stress = _stressed(cell.settings)
+    print_table(headers, rows, f"{cell.label}, observation {seen}{stress}, seeds {seeds}")
+    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
+    seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+    if not is_timed(episodes):
+        typer.echo(f"not timed: {batch_of(cell.settings)} episodes at a time, for success alone")
+        return
+    rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
+    print_table(("phase", "ms per decode", "share"), rows, "time by phase")
+
+
+def _figures(episodes: pd.DataFrame) -> list[str]:
+    from kerv_cli.report.measures import is_timed
+
+    steps, rounds = episodes["steps"].sum(), episodes["verifications"].sum()
+    per_round = [f"{episodes[name].sum() / rounds:.2f}" if rounds else "–" for name in ("committed", "accepted")]
+    return [
+        f"{episodes['success'].sum()}/{len(episodes)}",
+        f"{steps / len(episodes):.0f}",
+        f"{episodes['forwards'].sum() / steps:.2f}",
+        *per_round,
+        f"{1000 * (episodes['seconds'] / episodes['steps']).mean():.2f}" if is_timed(episodes) else "–",
+    ]

@@ -1,0 +1,265 @@
+"""`kerv runs`: what a results folder holds: sweeps, rollouts and trainings, side by side, again, elsewhere or gone."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from kerv_cli.cli.common import AsJson, called, console, edge, in_same, print_json, print_table
+
+if TYPE_CHECKING:
+    from kerv_cli.lab.catalogue import RunEntry
+    from kerv_cli.report.compare import Comparison, Difference
+
+HELP = "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made."
+
+app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+def complete_run(incomplete: str) -> list[str]:
+    """Ids of the runs in ./results."""
+    from kerv_cli.lab.catalogue import find_runs
+
+    return [run.id for run in find_runs("results") if run.id.startswith(incomplete)]
+
+
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(help="Runs (id, a unique part of it, or last) and results=DIR.", autocompletion=complete_run),
+]
+Filters = Annotated[
+    list[str] | None, typer.Argument(help="kind=, method=, task=, state=, since= and results=DIR narrow the list.")
+]
+
+
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
+
+
+def _split(words: list[str] | None, least: int = 0, most: int = 1000, what: str = "a run") -> tuple[list[str], str]:
+    """(names, results folder) of the words. Raises UsageError: too few or too many names."""
+    from kerv_cli.base.errors import UsageError
+    from kerv_cli.lab.resolve import study_name
+
+    given = words or []
+    results = [word.split("=", 1)[1] for word in given if word.startswith("results=")]
+    names = [study_name(word.removeprefix("study=")) for word in given if not word.startswith("results=")]
+    if not least <= len(names) <= most:
+        raise UsageError(f"name {what}: 'kerv runs list' shows them")
+    return names, results[-1] if results else "results"
+
+
+@app.command("list")
+@edge
+def list_(overrides: Filters = None, as_json: AsJson = False) -> None:
+    """List the runs of a results folder, the newest first."""
+    from kerv_cli.base.errors import UsageError
+    from kerv_cli.lab.catalogue import find_runs, matching
+
+    words, results = _split(overrides)
+    for word in words:
+        if "=" not in word:
+            raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
+    found = matching(find_runs(results), dict(word.split("=", 1) for word in words))
+    if as_json:
+        print_json([_plain(run) for run in found])
+        return
+    if not found:
+        typer.echo(f"no runs in {results}" + (" that agree" if words else ""))
+        return
+    rows = [
+        (run.id, run.kind, run.started.replace("T", " ")[:16], run.state, _few(run.methods), _few(run.tasks),
+         run.episodes or "", _headline(run))
+        for run in found
+    ]  # fmt: skip
+    print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "figure"), rows)
+
+
+def _few(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:3]) + (f" +{len(names) - 3}" if len(names) > 3 else "")
+
+
+def _headline(run: RunEntry) -> str:
+    for name in ("success", "score"):
+        if name in run.figures:
+            value = run.figures[name]
+            return f"success {value:.0%}" if name == "success" else f"score {value:.4g}"
+    return ""
+
+
+def _plain(run: RunEntry) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
+
+
+@app.command("show")
+@edge
+def show(overrides: Words = None, as_json: AsJson = False) -> None:
+    """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
+    from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
+    from kerv_cli.report.compare import sides
+    from kerv_cli.report.summary import summary_table
+    from kerv_cli.report.tables import load_study, rows_of, study_table
+
+    names, results = _split(overrides, 1, 1)
+    chosen = sides(results, names[0])
+    run = chosen[0].run
+    table = study_table(load_study(store_of(run))) if run.has_episodes and run.episodes else None
+    if table is not None:
+        table = table[table["label"].isin([side.label for side in chosen])]
+    size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
+    if as_json:
+        rows = [] if table is None else rows_of(table)
+        print_json({**_plain(run), "made_from": origin, "bytes": size, "settings": rows})
+        return
+    typed = shlex.join(["kerv", *run.command]) if run.command else "unknown"
+    lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
+    made = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed} | made).items():
+        typer.echo(f"{name:<9} {value}")
+    if table is not None:
+        console().print(summary_table(table))
+    elif run.figures:
+        print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
+
+
+@app.command("compare")
+@edge
+def compare(overrides: Words = None, as_json: AsJson = False) -> None:
+    """Compare two runs, ID or ID:SETTING: what differs in settings beside what differs in results, with intervals."""
+    from kerv_cli.report import compare as comparing
+
+    names, results = _split(overrides, 2, 2, "two runs, ID or ID:SETTING")
+    found = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(results, *names)]
+    if as_json:
+        print_json([comparing.as_plain(comparison) for comparison in found])
+        return
+    for comparison in found:
+        typer.echo(f"\n{comparison.first}  →  {comparison.second}")
+        _print_differences(comparison.settings)
+        _print_results(comparison)
+
+
+@app.command("diff")
+@edge
+def diff(overrides: Words = None, as_json: AsJson = False) -> None:
+    """Show what differs between two runs in settings, weights, machine and versions."""
+    from dataclasses import asdict
+
+    from kerv_cli.report import compare as comparing
+
+    names, results = _split(overrides, 2, 2, "two runs, ID or ID:SETTING")
+    pairs = comparing.pairs_to_compare(results, *names)
+    found = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
+    if as_json:
+        print_json({name: [asdict(difference) for difference in rows] for name, rows in found.items()})
+        return
+    for name, rows in found.items():
+        typer.echo(f"\n{name}")
+        _print_differences(rows)
+
+
+def _print_differences(rows: list[Difference]) -> None:
+    if not rows:
+        typer.echo("no difference in settings, weights, machine or versions")
+        return
+    shown = (("–" if value is None else value for value in (row.key, row.first, row.second)) for row in rows)
+    print_table(("setting", "first", "second"), shown)
+
+
+def _print_results(comparison: Comparison) -> None:
+    rows = []
+    for row in comparison.results:
+        interval = f"{row['low']:.3g} to {row['high']:.3g}" if row.get("low") == row.get("low") and "low" in row else ""
+        numbers = (f"{row[name]:.4g}" for name in ("first", "second", "change"))
+        rows.append((row["measure"], *numbers, interval, row.get("what", "")))
+    print_table(("measure", "first", "second", "change", "95 % interval", ""), rows)
+
+
+@app.command("rerun")
+@edge
+def rerun(overrides: Words = None, plan: Annotated[bool, typer.Option("--plan", help="Say what would run.")] = False,
+          as_json: AsJson = False) -> None:  # fmt: skip
+    """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
+    from kerv_cli.base.errors import UsageError
+    from kerv_cli.base.places import check_writable
+    from kerv_cli.lab.catalogue import TRAINED, find_run
+
+    names, results = _split(overrides, 1, 1)
+    run = find_run(results, names[0])
+    check_writable(results)
+    where = in_same(overrides or [])
+    if run.kind in TRAINED:
+        _train_again(run, results, plan, as_json)
+        return
+    if not run.has_episodes:
+        raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
+    from kerv_cli.cli.again import plan_again, run_again
+    from kerv_cli.report.compare import same_tokens
+
+    again = plan_again(run, results)
+    if plan:
+        episodes = sum(len(cell.seeds) for cell in again.cells)
+        typer.echo(f"{run.id} again as {again.store.name}: {len(again.cells)} cells, {episodes} episodes")
+        return
+    entry = run_again(again, results)
+    same, shared = same_tokens(run, entry)
+    if as_json:
+        print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
+        return
+    typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
+    typer.echo(f"both side by side: {called()} runs compare {run.id} {entry.id}{where}")
+
+
+def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None:
+    from kerv_cli.cli.again import training_again
+    from kerv_cli.cli.train import run_training
+
+    run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
+
+
+@app.command("rm")
+@edge
+def rm(overrides: Words = None, yes: Yes = False) -> None:
+    """Remove runs and everything in their folders, after a question."""
+    from kerv_cli.lab.catalogue import disk_bytes, find_run
+    from kerv_cli.lab.removal import check_removable, remove
+
+    names, results = _split(overrides, 1)
+    found = [find_run(results, name, exact=yes) for name in names]
+    for run in found:
+        check_removable(run)
+    total = sum(disk_bytes(run.folder) for run in found)
+    what = f"{', '.join(run.id for run in found)} ({total / 1e6:.1f} MB)"
+    if not yes and not typer.confirm(f"remove {what}?"):
+        raise typer.Exit(1)
+    for run in found:
+        remove(run)
+    typer.echo(f"removed {what}")
+
+
+@app.command("export")
+@edge
+def export(
+    overrides: Words = None,
+    to: Annotated[str, typer.Option("--to", help="csv, trackio, wandb (offline) or mlflow.")] = "csv",
+    folder: Annotated[Path | None, typer.Option("--dir", help="Where it is written; default results/exports.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Hand a run to a tracker, or write its episodes or its curves as CSV."""
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.lab.catalogue import find_run
+    from kerv_cli.report.export import export as hand_over
+
+    names, results = _split(overrides, 1, 1)
+    place = folder or results_dir(results) / "exports" / to
+    written = hand_over(find_run(results, names[0]), to, place)
+    if as_json:
+        print_json({"folder": place, "written": written})
+        return
+    for name in written:
+        typer.echo(name)
+    typer.echo(f"{len(written)} runs in {place}")

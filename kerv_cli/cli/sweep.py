@@ -1,0 +1,218 @@
+"""`kerv sweep`: run a study's settings over tasks and seeds; an interrupted sweep resumes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import typer
+
+from kerv_cli.cli.common import (
+    AsJson,
+    Overrides,
+    ShowConfig,
+    ShowPlan,
+    called,
+    console,
+    edge,
+    in_same,
+    print_json,
+    print_notes,
+    print_table,
+    runnable,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from pandas import DataFrame
+
+    from kerv_cli.base.settings import RuntimeSettings
+    from kerv_cli.lab.events import Outcome
+    from kerv_cli.lab.plan import Cell
+    from kerv_cli.lab.resolve import ResolvedStudy
+    from kerv_cli.lab.reuse import Covered
+    from kerv_cli.lab.store import StudyStore
+
+SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core takes 0.5 to 1.5
+
+
+@edge
+def sweep(
+    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
+) -> None:
+    """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused."""
+    from kerv_cli.base.config import to_yaml
+    from kerv_cli.base.places import check_writable
+    from kerv_cli.cli.rollout import planned_cells
+    from kerv_cli.lab.executors import check_executor
+    from kerv_cli.lab.resolve import idle_overrides, resolve
+
+    words = list(overrides or [])
+    resolved = resolve(words)
+    first = next(iter(resolved.settings.values()))
+    if cfg:
+        typer.echo(to_yaml(resolved.study), nl=False)
+        for label, settings in resolved.settings.items():
+            typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
+        return
+    print_notes(idle_overrides(resolved))
+    check_executor(first.runtime)
+    check_writable(first.results)
+    wanted = planned_cells(resolved)
+    from kerv_cli.lab.reuse import Stock, cover, disagreements
+    from kerv_cli.lab.run_file import interrupted_since
+    from kerv_cli.lab.store import StudyStore
+
+    store = StudyStore(first.results, resolved.study.name)
+    stock = Stock(store)
+    covered = cover(wanted, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
+    if plan:
+        _print_plan(covered, store, first.runtime.workers, as_json)
+        return
+    outcome = _run(resolved, covered, store, words)
+    _tell(outcome, resolved, covered.cells, store, words, as_json)
+    for line in disagreements(outcome.done, Stock(store, others=False)) if resolved.rerun != "never" else ():
+        typer.echo(f"kerv: {line}", err=True)
+    if outcome.failed:
+        raise typer.Exit(1)
+
+
+def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
+    from kerv_cli.lab.estimate import estimate
+    from kerv_cli.lab.plan import seeds_text
+
+    by_label: dict[str, list[Cell]] = {}
+    for cell in covered.cells:
+        by_label.setdefault(cell.label, []).append(cell)
+    columns = ("setting", "to run", "reused", "tasks", "seeds", "repeats", "why")
+    rows = []
+    for label, own in by_label.items():
+        to_run = [cell for cell in own if cell.id in covered.reasons]
+        seeds = seeds_text(seed for cell in own for seed in cell.seeds)
+        tasks, repeats = len({cell.task for cell in own}), len({cell.repeat for cell in own})
+        why = "; ".join(dict.fromkeys(covered.reasons[cell.id] for cell in to_run))
+        rows.append((label, len(to_run), len(own) - len(to_run), tasks, seeds, repeats, why))
+    time = estimate(covered, store, workers, SECONDS_PER_EPISODE)
+    if as_json:
+        settings = [dict(zip(columns, row, strict=True)) for row in rows]
+        print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": time.to_run,
+                    "reused": time.reused, "seconds": time.seconds, "source": time.source})  # fmt: skip
+        return
+    print_table(columns, rows, f"study {store.name}")
+    typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
+
+
+def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
+    """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
+    from kerv_cli.base.errors import Interrupted
+    from kerv_cli.cli.progress import ProgressDisplay
+    from kerv_cli.lab.cells import CellRunner, reference_decode
+    from kerv_cli.lab.execute import execute
+    from kerv_cli.lab.reuse import take_over
+    from kerv_cli.lab.run_file import note_finished, note_invocation
+
+    runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
+    cells = covered.cells
+    take_over(store, covered)
+    if resolved.until == "done":
+        store.write_plan(resolved.study, cells)
+    note_invocation(store.root, ["sweep", *words])
+    here = runtime.executor == "local" and runtime.workers == 1
+    with ProgressDisplay(console(stderr=True)) as display:
+        runner = CellRunner(store.rollouts, on_step=display.on_step if here else None)
+        try:
+            if resolved.until == "decided":
+                outcome = _until_decided(resolved, cells, store, lambda own: execute(
+                    own, runner, store, runtime, display, reference_decode))  # fmt: skip
+            else:
+                outcome = execute(cells, runner, store, runtime, display, reference_decode)
+        except KeyboardInterrupt:
+            kept = sum(store.has_cell(cell.id) for cell in cells)
+            raise Interrupted(
+                f"interrupted: {kept} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
+            ) from None
+    if not outcome.failed:
+        note_finished(store.root)
+    return outcome
+
+
+def _until_decided(
+    resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, run: Callable[[list[Cell]], Outcome]
+) -> Outcome:
+    """Runs block after block of seeds, without the settings whose question is answered; the plan holds what was run."""
+    from kerv_cli.lab.events import Outcome
+    from kerv_cli.report import decided
+    from kerv_cli.report.tables import load_study
+
+    study, margin = resolved.study, resolved.loss / 100
+    blocks = decided.looks_of(cells, study.block)
+    typer.echo(decided.rule(resolved.loss, len(blocks)), err=True)
+    known: dict[str, decided.Verdict] = {}
+    asked: list[Cell] = []
+    total = Outcome()
+    left = [label for label in resolved.settings if label != study.baseline]
+    for look, block in enumerate(blocks, 1):
+        asked += [cell for cell in block if cell.label in (study.baseline, *left)]
+        store.write_plan(study, asked)
+        found = run([cell for cell in block if cell.label in (study.baseline, *left)])
+        lists = total.done + found.done, total.reused + found.reused, total.failed + found.failed
+        total = Outcome(*lists, total.seconds + found.seconds)
+        if found.failed:
+            return total
+        told = decided.verdicts(load_study(store, asked), left, margin, look, len(blocks))
+        typer.echo(f"look {look} of {len(blocks)}: {decided.summary(told)}", err=True)
+        known |= {verdict.label: verdict for verdict in told}
+        decided.write_verdicts(store.root, known, resolved.loss, len(blocks))
+        left = [verdict.label for verdict in told if verdict.verdict == decided.OPEN]
+        if not left:
+            break
+    return total
+
+
+def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> None:
+    """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
+    command, for the one that is named."""
+    from kerv_cli.lab.run_file import sweep_command
+    from kerv_cli.report.summary import not_in_turn, summary_table
+
+    console().print(summary_table(table))
+    apart = not_in_turn(table)
+    if apart:
+        command = runnable(f"'{sweep_command(store.root, store.name, 'rerun=timed')}'", words)
+        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; {command} does that")
+    note = store.read_plan().note
+    if note:
+        typer.echo(f"\n{note}\n")
+
+
+def _tell(
+    outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
+) -> None:
+    from kerv_cli.report.tables import load_study, rows_of, study_table
+
+    there = bool(outcome.done or outcome.reused)
+    ran = {cell.id for cell in [*outcome.done, *outcome.reused]}
+    table = study_table(load_study(store, [cell for cell in cells if cell.id in ran])) if there else None
+    recordings = sorted(store.rollouts.glob("*.rrd"))
+    counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
+    if as_json:
+        rows = [] if table is None else rows_of(table)
+        print_json({"study": store.name, "folder": store.root, "cells": counts, "settings": rows,
+                    "recordings": recordings})  # fmt: skip
+    else:
+        if table is not None:
+            tell_table(table, store, words)
+        episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
+        if episodes and minutes:
+            typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
+        typer.echo(
+            f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed; "
+            f"tables and plots: {called()} report study={store.name}{in_same(words)}"
+        )
+        if recordings:
+            typer.echo(
+                f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}"
+            )
+    for failure in outcome.failed:
+        reason = runnable(failure.reason, words)
+        typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

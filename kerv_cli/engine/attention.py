@@ -1,0 +1,61 @@
+"""Attention of a trunk that decodes with a cache: the mask and the rotation, shared by the families of targets.
+
+Shapes: B batch, T new tokens, S cached tokens, C channels of a head.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.engine.transfer import upload
+
+
+class Buffered:
+    """A cache in fixed buffers. buffer: (..., slots, C), of which the first `length` slots are valid. fixed: every
+    forward attends to all slots under a mask."""
+
+    buffer: Tensor
+    length: int
+    fixed: bool
+
+    def compact(self, start: int, slots: Tensor) -> None:
+        """Commits a path: moves the entries at `slots` (n,), increasing and from `start` on, to start, start + 1, … and
+        sets the length behind them."""
+        n = slots.shape[0]
+        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
+        self.length = start + n
+
+
+def attention_mask(
+    seen: np.ndarray | Tensor | None, tokens: int, cache: Buffered | None, like: Tensor
+) -> Tensor | None:
+    """Additive mask of T = `tokens` new tokens behind a cache: (T, S + T); (T, slots) for a cache of fixed shapes.
+
+    seen (T, M) bool says which of the newest M ≥ T tokens, the new ones last, each new token attends to; it attends to
+    all cached ones before those. None: the new tokens are causal. The mask is None where attention without one does the
+    same. A tensor `seen` lies on the device of `like`, where its mask is made.
+    """
+    cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
+    stop = cached + tokens
+    slots = cache.buffer.shape[-2] if cache is not None and fixed else stop
+    if isinstance(seen, Tensor):
+        there = like.new_zeros(tokens, slots)
+        there[:, stop - seen.shape[1] : stop].masked_fill_(~seen, -torch.inf)
+        there[:, stop:] = -torch.inf
+        return there
+    plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
+    if plain and not fixed:
+        return None
+    if seen is None:
+        seen = np.tri(tokens, dtype=bool)
+    mask = np.zeros((tokens, slots), dtype=np.float32)
+    mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
+    mask[:, stop:] = -np.inf
+    return upload(mask, like.device).to(like.dtype)
+
+
+def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """x rotated by its positions' cos and sin: x (B, T, heads, C) with (T, 1, C), or (B, heads, T, C) with (T, C)."""
+    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)

@@ -1,0 +1,204 @@
+"""Decodes the observations of several episodes at once, for runs that ask for success and not for times
+(docs/measuring.md).
+
+Only methods whose every decode is the same sequence of forwards can be batched: all episodes are through it at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.decoder import Decoder, deviation, record_of
+from kerv_cli.engine.protocol import Cache
+from kerv_cli.engine.record import PARALLEL, UNTIMED, DecodeRecord, Round
+from kerv_cli.methods.kinematics import ActionHistory
+from kerv_cli.methods.proposers import EarlyProposer
+from kerv_cli.methods.verify_skip import ParallelPass
+
+_BATCHED = {
+    ("none", "none", "none"): "ar",
+    ("early", "none", "always"): "early_unverified",
+    ("none", "none", "parallel"): "parallel",
+}
+"""Kinds of prefill_draft, proposer and skip -> the method that is made of them."""
+
+
+def check_batch(parts: Mapping[str, Any], method: str, batch: int) -> None:
+    """Refuses more than one episode at a time for methods that cannot be batched. parts: kind -> settings.
+
+    Raises:
+        UsageError: another method, or a threshold that follows one episode.
+    """
+    kinds = parts["prefill_draft"].kind, parts["proposer"].kind, parts["skip"].kind
+    if batch == 1:
+        return
+    if kinds not in _BATCHED:
+        *names, last = _BATCHED.values()
+        raise UsageError(
+            f"rollout.batch={batch} with method={method}: {', '.join(names)} and {last} alone decode several episodes "
+            "at once, leave it out"
+        )
+    if kinds[0] != "none" and parts["threshold"].kind != "fixed":
+        raise UsageError(
+            f"rollout.batch={batch} with threshold={parts['threshold'].kind}: its radius follows one episode's "
+            "decodes, use threshold=fixed"
+        )
+
+
+class Lane:
+    """What a batch keeps of one of its episodes: the actions and positions before the next decode."""
+
+    def __init__(self, actions: ActionSpace, cameras: tuple[str, ...]) -> None:
+        self.actions, self.cameras = actions, cameras
+        self.situation = Situation("", ActionHistory(actions.dofs))
+        self.decodes = 0
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """A new episode begins, with the end effector at (3,) metres."""
+        self.situation = Situation(task, ActionHistory(self.actions.dofs), [np.asarray(end_effector)])
+        self.decodes = 0
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """An action (D,) was executed; the end effector is now at (3,) metres."""
+        self.situation.history.append(self.actions.normalise(action))
+        self.situation.path.append(np.asarray(end_effector))
+
+    def finish(self, success: bool) -> None:
+        """The episode ended."""
+
+
+class BatchDecoder:
+    """Decodes one chunk for each of several episodes with the target and parts of a decoder.
+
+    In float32 its tokens are those of the decoder, but for ties that another order of summation rounds differently.
+    Its records have no times.
+    """
+
+    def __init__(self, decoder: Decoder, deviation_every: int = 0) -> None:
+        """decoder: of a method that `check_batch` accepts. deviation_every: as in RolloutSettings."""
+        self.decoder, self.target, self.every = decoder, decoder.target, deviation_every
+        self.limits = decoder.acceptance.limits(decoder.threshold.radius())
+        self.draft, self.skip = decoder.parts.prefill_draft, decoder.parts.skip
+        self._caches: dict[int, Cache] = {}
+
+    def lane(self) -> Lane:
+        """A new place in the batch."""
+        return Lane(self.target.actions, self.target.cameras)
+
+    @torch.inference_mode()
+    def decode(self, lanes: Sequence[Lane], observations: Sequence[Observation]) -> list[DecodeRecord]:
+        """One observation of each lane -> its actions and their record."""
+        chunks = [self._chunk(prompt, lane) for prompt, lane in zip(self._prompts(observations), lanes, strict=True)]
+        self._complete(chunks)
+        records = [self._record(chunk) for chunk in chunks]
+        due = []
+        for place, lane in enumerate(lanes):
+            lane.decodes += 1
+            if self.every and lane.decodes % self.every == 0:
+                due.append(place)
+        for place, wanted in zip(due, self._autoregressive([chunks[place] for place in due]), strict=True):
+            gap = deviation(self.target.actions, records[place].actions, wanted) if wanted is not None else 0.0
+            records[place] = replace(records[place], deviation=gap)
+        return records
+
+    def _prompts(self, observations: Sequence[Observation]) -> list[Tensor]:
+        """The prompts (1, P, E). One by one where packed weights encode a single image faster than a batch of them."""
+        together = getattr(self.target, "encode_many", None)
+        if together is None:
+            return [self.target.encode(observation) for observation in observations]
+        return list(together(observations).split(1))
+
+    def _chunk(self, prompt: Tensor, lane: Lane) -> Chunk:
+        steps, actions = self.decoder.steps, self.target.actions
+        return Chunk(prompt, steps, actions, self.decoder.cache, lane.situation, self.limits)
+
+    def _complete(self, chunks: Sequence[Chunk]) -> None:
+        """Commits all tokens of every chunk; prompts of one length run together, so that none is padded."""
+        for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
+            group = [chunk for chunk in chunks if chunk.prompt_length == length]
+            prompt = torch.cat([chunk.prompt for chunk in group])
+            if isinstance(self.skip, ParallelPass):
+                _parallel(group, self._parallel_tokens(prompt))
+            elif isinstance(self.draft, EarlyProposer):
+                self._drafted(group, prompt, self.draft)
+            else:
+                _one_by_one(group, self._tokens(prompt))
+
+    def _tokens(self, prompt: Tensor) -> list[list[int]]:
+        """prompt (B, P, E) -> the N tokens of each row, decoded one by one."""
+        target, length = self.target, prompt.shape[1]
+        cache = self._cache(len(prompt))
+        hidden = target.forward(prompt, torch.arange(length, device=prompt.device), cache)
+        found = [target.head(hidden[:, -1]).argmax(-1)]
+        for at in range(length, length + self._size - 1):
+            x = target.embed(found[-1][:, None])
+            hidden = target.forward(x, torch.tensor([at], device=prompt.device), cache)
+            found.append(target.head(hidden[:, 0]).argmax(-1))
+        tokens: list[list[int]] = torch.stack(found, 1).tolist()
+        return tokens
+
+    def _parallel_tokens(self, prompt: Tensor) -> list[list[int]]:
+        target: Any = self.target
+        hidden = target.parallel_pass(prompt, self._cache(len(prompt)))
+        tokens: list[list[int]] = target.head(hidden[:, : self._size]).argmax(-1).tolist()
+        return tokens
+
+    def _drafted(self, chunks: Sequence[Chunk], prompt: Tensor, draft: EarlyProposer) -> None:
+        """Takes the early drafter's chunks, unverified."""
+        histories = [chunk.situation.history.values() for chunk in chunks]
+        found = draft.early.tokens_of(draft.target.pooled(prompt), histories, max(self.limits, default=0))
+        for chunk, tokens in zip(chunks, found, strict=True):
+            chunk.skip(tokens, draft.name)
+
+    def _autoregressive(self, chunks: Sequence[Chunk]) -> list[np.ndarray | None]:
+        """The actions (H, D) that autoregressive decoding would have chosen for each chunk; None where it decoded
+        them."""
+        found: list[np.ndarray | None] = [None] * len(chunks)
+        if self.draft is None and self.skip is None:
+            return found
+        space = self.target.actions
+        for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
+            places = [place for place, chunk in enumerate(chunks) if chunk.prompt_length == length]
+            wanted = self._tokens(torch.cat([chunks[place].prompt for place in places]))
+            for place, tokens in zip(places, wanted, strict=True):
+                found[place] = space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
+        return found
+
+    def _record(self, chunk: Chunk) -> DecodeRecord:
+        actions, predicted = self.decoder.actions_of(chunk)
+        return record_of(chunk, actions, math.nan, dict(UNTIMED), predicted)
+
+    @property
+    def _size(self) -> int:
+        return self.decoder.steps * self.target.actions.dofs
+
+    def _cache(self, rows: int) -> Cache:
+        """An empty cache for so many rows. The last one is kept: episodes end one by one."""
+        if rows not in self._caches:
+            self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self._size)}
+        self._caches[rows].length = 0
+        return self._caches[rows]
+
+
+def _one_by_one(chunks: Sequence[Chunk], found: Sequence[Sequence[int]]) -> None:
+    """Commits tokens as autoregressive decoding does."""
+    for chunk, tokens in zip(chunks, found, strict=True):
+        for start, token in enumerate(tokens):
+            mode = "decode" if start else "prefill"
+            chunk.commit(Round(mode, "none", start, (), (token,), 0, 1, 0, ()), [token])
+
+
+def _parallel(chunks: Sequence[Chunk], found: Sequence[Sequence[int]]) -> None:
+    """Commits tokens as a parallel target's pass does."""
+    for chunk, tokens in zip(chunks, found, strict=True):
+        chunk.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, chunk.size, 0, ()), tokens)

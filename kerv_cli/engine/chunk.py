@@ -1,0 +1,232 @@
+"""What the parts of a decode share: the chunk, the situation before it, the clock; the protocols of proposers."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.protocol import Cache
+from kerv_cli.engine.record import PHASES, Round, Trust
+from kerv_cli.engine.tree import TokenTree
+from kerv_cli.engine.unread import Unread
+from kerv_cli.methods.boundary import Choice
+from kerv_cli.methods.kinematics import ActionHistory
+
+
+class Clock:
+    """Stopwatch of one decode: seconds per phase.
+
+    On CUDA it synchronises when it is made and when it stops, and nowhere between: laps are events in the stream, read
+    at the end, so that measuring phases does not keep the host from running ahead.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.phases = dict.fromkeys(PHASES, 0.0)
+        self.events: list[tuple[str, torch.cuda.Event]] | None = None
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+            self.events = [("", _event())]
+        self.began = self.last = time.perf_counter()
+
+    def lap(self, phase: str) -> None:
+        """Adds the time since the last lap to `phase`; on CUDA the device's time, added when the clock stops."""
+        if self.events is not None:
+            self.events.append((phase, _event()))
+            return
+        now = time.perf_counter()
+        self.phases[phase] += now - self.last
+        self.last = now
+
+    def stop(self) -> float:
+        """Seconds since the clock was made; the time since the last lap is added to `other`."""
+        self.lap("other")
+        if self.events is not None:
+            torch.cuda.synchronize()
+            self.last = time.perf_counter()
+            for (_, begin), (phase, end) in itertools.pairwise(self.events):
+                self.phases[phase] += begin.elapsed_time(end) / 1000.0
+            self.phases["other"] += max(0.0, self.last - self.began - sum(self.phases.values()))
+        return self.last - self.began
+
+
+def _event() -> torch.cuda.Event:
+    """An event with a time, recorded in the current stream."""
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def steps_of(asked: int, trained: int) -> int:
+    """Control steps of a chunk: as many as asked for, 0 for as many as the target was trained for.
+
+    Raises:
+        UsageError: more than it was trained for.
+    """
+    if not 0 <= asked <= trained:
+        raise UsageError(f"chunk={asked}: the target was trained for {trained} control steps")
+    return asked or trained
+
+
+@dataclass(frozen=True)
+class Situation:
+    """The episode before a decode. history: executed actions, normalised, oldest first. path: measured end-effector
+    positions (3,), metres. random: the boundary's generator, seeded per episode."""
+
+    task: str
+    history: ActionHistory
+    path: list[np.ndarray] = field(default_factory=list)
+    random: np.random.Generator = field(default_factory=np.random.default_rng)
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """What a verification found behind the accepted path. draft: the rejected draft's tokens behind its rejected token.
+    target: target tokens behind the rejected token and behind those; valid only if the tokens before them had been
+    right."""
+
+    draft: tuple[int, ...] = ()
+    target: tuple[int, ...] = ()
+
+
+class Chunk:
+    """The N tokens of one decode. Only its own methods change what is committed; the parts of a method read it.
+
+    prompt: (1, P, E). size: N. limits: r per DoF in bins; early drafters choose their tokens by it. choice: which side
+    drafts, where a boundary decides. The cache holds the prompt and every committed token but the
+    last; `hidden` (1, P + c − 1, E) are the target's states there after the prefill, which committed c tokens.
+    """
+
+    def __init__(
+        self,
+        prompt: Tensor,
+        steps: int,
+        space: ActionSpace,
+        cache: Cache,
+        situation: Situation,
+        limits: tuple[int, ...] = (),
+        choice: Choice | None = None,
+    ) -> None:
+        self.prompt, self.space, self.cache, self.situation = prompt, space, cache, situation
+        self.size, self.limits, self.choice = steps * space.dofs, limits, choice
+        self.tokens: list[int] = []
+        self.rounds: list[Round] = []
+        self.rejection = Rejection()
+        self.hidden = torch.empty(0)
+        self.asked: list[tuple[Tensor, Callable[[np.ndarray], None]]] = []  # (n,) to read beside the next target tokens
+        self.forwards = 0
+        self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
+        self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
+        self.trust: Trust | None = None  # why it was verified or not, where a gate with a score decides
+        self.closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
+
+    @property
+    def dofs(self) -> int:
+        """D."""
+        return self.space.dofs
+
+    @property
+    def steps(self) -> int:
+        """H, control steps."""
+        return self.size // self.dofs
+
+    @property
+    def prompt_length(self) -> int:
+        """P."""
+        return self.prompt.shape[1]
+
+    @property
+    def left(self) -> int:
+        """Tokens still to be decoded; 0 after a rectifier closed the chunk."""
+        return 0 if self.closed is not None else self.size - len(self.tokens)
+
+    @property
+    def variability(self) -> float | None:
+        """K: mean difference of draft and target over the judged tokens, normalised action units; None where none was
+        judged. Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2)."""
+        return float(np.mean(self._differences)) if self._differences else None
+
+    def commit(self, played: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
+        """Commits `tokens` after a forward; `played` is its record."""
+        self.forwards += 1
+        self.tokens += tokens
+        self.rounds.append(played)
+        self.rejection = rejection or Rejection()
+        if played.drafted:
+            both = np.array((played.drafted, played.target_tokens[: len(played.drafted)]))
+            drafted, wanted = self.space.values_of(both)
+            moving = ~self.space.strict_tokens(self.size)[played.start : played.start + len(drafted)]
+            self._differences += np.abs(drafted - wanted)[moving].tolist()
+
+    def skip(self, tokens: Sequence[int], proposer: str) -> None:
+        """Takes all N tokens from `proposer`, without a verification."""
+        self.tokens = list(tokens[: self.size])
+        self.rounds.append(Round("skip", proposer, 0, tuple(self.tokens), (), self.size, self.size, 0, ()))
+
+    def close(self, values: np.ndarray, with_target_token: bool) -> None:
+        """Ends the chunk with values (steps, D), normalised: its committed tokens, then predictions. with_target_token:
+        whether the target token at the rejected position stays committed."""
+        if not with_target_token:
+            del self.tokens[-1]
+            self.rounds[-1] = self.rounds[-1].without_bonus()
+        del self.tokens[values.size :]
+        self.closed = values
+
+
+class DraftsChunks(Protocol):
+    """A source of merged drafts: drafts whole chunks without the target's hidden states."""
+
+    @property
+    def name(self) -> str:
+        """As in the record, e.g. `early`."""
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
+        it has no draft."""
+
+    def is_sure(self, chunk: Chunk) -> bool:
+        """Whether it expects its first chain to be accepted whole."""
+
+
+class Proposer(Protocol):
+    """Drafts a tree behind the committed tokens."""
+
+    @property
+    def name(self) -> str:
+        """As in the record, e.g. `drafter`."""
+
+    @property
+    def needs_states(self) -> bool:
+        """Whether it reads the target's hidden states, so that it cannot draft before the prefill."""
+
+    @property
+    def nodes(self) -> int:
+        """Most nodes of its trees, for which the cache has room; 0: as many as the chunk has tokens."""
+
+    def begin(self, chunk: Chunk) -> None:
+        """Called once per chunk, when the prompt is encoded and the first tokens are committed."""
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+        """A tree of depth ≤ `depth`; an empty one where it has no draft. One that lies on the device is read together
+        with the target's tokens."""
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
+        target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those
+        behind rejected nodes included."""
+
+
+@runtime_checkable
+class Asks(Protocol):
+    """A proposer that needs numbers of the encoded prompt on the host."""
+
+    def ask(self, chunk: Chunk) -> None:
+        """Called before the prefill: adds to `chunk.asked` what is to be read with its tokens."""

@@ -1,0 +1,191 @@
+"""Records of a decode and of an episode, as frozen dataclasses. Rerun files, tables and plots are made from them alone.
+
+Notation (docs/methods.md §0): D degrees of freedom, H control steps in a chunk, N = H·D tokens of a chunk.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from kerv_cli.base.spaces import ActionSpace
+
+PARALLEL = "parallel"
+"""Mode of a round, and of its decode, in which the target decoded all tokens at once."""
+
+TRUSTED, GATE, AUDIT, OPENING, ALARM = "trusted", "gate", "audit", "opening", "alarm"
+DOUBT, NO_DRAFT, STREAK = "doubt", "no draft", "streak"
+"""Reasons of `Trust`: executed unverified; verified because the score is too low, at random, at an episode's start,
+after an alarm, after a draft that was far off, because nothing was drafted, or because the verifications before do not
+allow more."""
+
+PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
+"""Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
+
+UNTIMED = dict.fromkeys(PHASES, math.nan)
+"""Phases of a decode that was computed together with others and has no time of its own."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round of a decode: a draft and the target tokens it was compared with.
+
+    `drafted` is the judged path: the accepted tokens followed, where there was a rejection, by the rejected candidate
+    that was nearest to the target token. `target_tokens` are the target's argmax tokens at the same positions and, when
+    the whole path was accepted and places are left, one more: the bonus.
+    """
+
+    mode: str  # "prefill" (token 0), "decode" (one token), "verify" (a tree), "skip" (no forward), PARALLEL
+    proposer: str  # which proposer drafted: "none", "drafter", "retrieval", "early", "hold", "kalman", ...
+    start: int  # tokens committed before this round
+    drafted: tuple[int, ...]
+    target_tokens: tuple[int, ...]
+    accepted: int  # draft tokens accepted
+    committed: int  # tokens committed by this round: accepted + bonus
+    tree_size: int  # nodes verified
+    threshold: tuple[int, ...]  # r per DoF, in bins; empty where no acceptance rule with a threshold ran
+
+    @property
+    def is_verification(self) -> bool:
+        """Whether the target verified a tree."""
+        return self.tree_size > 0 and self.mode != "skip"
+
+    def without_bonus(self) -> Round:
+        """This round without its bonus, for compensations that do not use the target token at the rejected position."""
+        return replace(self, committed=self.accepted)
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Why a draft was executed unverified or was verified (docs/methods.md §4.5, §4.6)."""
+
+    score: float  # of the draft, larger = safer; NaN for rules without a score
+    level: float  # from which on it is trusted
+    reason: str  # TRUSTED, GATE, AUDIT, …
+    loss: float | None = None  # ℓ in [0, 1], where it was verified
+    alarm: bool = False  # an alarm was on, or this decode's loss raised one
+
+    @property
+    def audited(self) -> bool:
+        """Whether the gate trusted the draft and it was verified all the same."""
+        return self.loss is not None and self.score >= self.level
+
+    @property
+    def sampled(self) -> bool:
+        """Whether it was verified at random: an unbiased sample of the risk of what is executed unverified."""
+        return self.loss is not None and self.reason == AUDIT
+
+
+@dataclass(frozen=True)
+class Delay:
+    """What the world did while the policy decoded (docs/methods.md §8), in control steps but for `seconds`.
+
+    observed: the step at which the observation was taken. steps: latency, rounded up. carried, held: how many of them
+    executed the chunk in hand on, and held the last action; fewer than `steps` where the episode ended. dropped: first
+    actions of the new chunk that were left out. predicted: actions that were put behind its last.
+    """
+
+    seconds: float
+    steps: int
+    observed: int
+    carried: int = 0
+    held: int = 0
+    dropped: int = 0
+    predicted: int = 0
+
+
+@dataclass(frozen=True)
+class DecodeRecord:
+    """One call of the decoder: from an observation to the actions to execute."""
+
+    tokens: tuple[int, ...]  # committed tokens, in order; N of them unless the rest of the chunk was dropped
+    actions: np.ndarray  # (steps, D) float32, environment units, what is executed; steps <= H
+    forwards: int  # target forwards, prefill included
+    rounds: tuple[Round, ...]
+    mode: str  # proposer of the first round that drafted; "skip": not verified; PARALLEL; "ar": no draft; "expert"
+    seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends; NaN: not timed
+    phases: dict[str, float]  # seconds by phase, keys from PHASES
+    compensated: int = 0  # tokens filled by a prediction instead of the target
+    size: int = 0  # N; 0: as many as `tokens`
+    skipped: bool = False  # executed without a verification
+    variability: float | None = None  # K of this decode (§3.2), normalised action units
+    similarity: float | None = None  # best retrieval similarity, where one was looked up
+    metric: float | None = None  # fused hybrid-boundary metric F (§4.4)
+    trust: Trust | None = None  # of a gate with a score
+    deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
+    delay: Delay | None = None  # None: the world waited
+
+    @property
+    def delay_steps(self) -> int | None:
+        """Control steps that the world went on during the decode; None: it waited."""
+        return None if self.delay is None else self.delay.steps
+
+    @property
+    def unverified(self) -> int:
+        """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's and
+        of a parallel one's, else what a prediction or a rejected draft filled."""
+        return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
+
+    @property
+    def score(self) -> float | None:
+        """Of the draft, where a gate told one."""
+        known = self.trust is not None and math.isfinite(self.trust.score)
+        return self.trust.score if self.trust is not None and known else None
+
+    @property
+    def loss(self) -> float | None:
+        """Of the draft, where a gate's draft was verified."""
+        return self.trust.loss if self.trust is not None else None
+
+    @property
+    def verifications(self) -> int:
+        """Rounds in which the target verified a tree."""
+        return sum(r.is_verification for r in self.rounds)
+
+    @property
+    def first_rejected(self) -> int | None:
+        """Index in the chunk of the first rejected token of the first verification; N if none; None if no tree."""
+        for r in self.rounds:
+            if r.is_verification:
+                return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
+        return None
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """One episode: a task, a seed, and everything the decoder did."""
+
+    environment: str  # name of the task's environment
+    space: ActionSpace  # the environment's
+    task: str
+    instruction: str
+    seed: int
+    success: bool  # the task's flag at any step within the horizon
+    steps: int  # T, control steps executed
+    decodes: tuple[DecodeRecord, ...]
+    decode_steps: tuple[int, ...]  # control step at which each decode's actions begin, same length as `decodes`
+    actions: np.ndarray  # (T, D) float32, executed, environment units, within the space's limits
+    path: np.ndarray  # (T + 1, 3) float32, end-effector positions, metres
+    gripper: np.ndarray  # (T + 1,) float32, gripper opening, 0..1
+    initial_state: np.ndarray  # (n,) float64, equal for episodes of a task that begin alike
+    frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, only where logged
+    wall_seconds: float = 0.0  # whole episode, simulation and rendering included; its share where several ran at once
+    # object, goal, … -> (T + 1, 3) metres, only where logged
+    places: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> float:
+        """Inference time of the episode; NaN where it was not timed."""
+        return sum(d.seconds for d in self.decodes)
+
+    @property
+    def timed(self) -> bool:
+        """Whether its decodes have times; those of a batch have none."""
+        return not math.isnan(self.seconds)
+
+    @property
+    def forwards(self) -> int:
+        """Target forwards of the episode."""
+        return sum(d.forwards for d in self.decodes)

@@ -1,0 +1,287 @@
+"""The runs of a results folder: sweeps, rollouts, trainings and whatever else was recorded, built or calibrated, each
+by its folder and what lies in it."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import fnmatch
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.files import read_json, sha256_of, visible
+from kerv_cli.base.leftovers import clean
+from kerv_cli.base.manifests import content_of
+from kerv_cli.base.places import shipped_dir
+from kerv_cli.lab.identity import OBSERVATION
+from kerv_cli.lab.plan import Cell, unique_cells
+from kerv_cli.lab.run_file import invocations
+from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, stores
+
+SWEEP, ROLLOUT = "sweep", "rollout"
+DESCRIPTIONS = {
+    "demos": "manifest.json",
+    "target": "target.json",
+    "drafter": "drafter.json",
+    "early": "early.json",
+    "datastore": "manifest.json",
+    "calibration": "calibration.json",
+    "risk": "risk.json",
+    "score": "score.json",
+}
+"""Kind of artifact -> the file that describes it."""
+TRAINED = ("target", "drafter", "early")
+KINDS = (SWEEP, ROLLOUT, *DESCRIPTIONS)
+LAST = "last"
+"""Stands for the newest run where one is named."""
+
+
+@dataclass(frozen=True)
+class RunEntry:
+    """One run. id: how commands name it. state: `complete`, `2 of 6 cells`, `step 300 of 600`, `begun`, `damaged`.
+    figures: its headline, by name. command: behind `kerv`, as far as it is known. sha256: by which others name it.
+    made_from: kind -> such a hash of what it was made from."""
+
+    id: str
+    kind: str
+    folder: Path
+    started: str  # ISO 8601, UTC; of an artifact: when its newest file changed
+    state: str
+    methods: tuple[str, ...] = ()
+    tasks: tuple[str, ...] = ()
+    episodes: int = 0
+    figures: dict[str, float] = field(default_factory=dict)
+    command: tuple[str, ...] = ()
+    sha256: str = ""
+    made_from: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing of it is left to do."""
+        return self.state == "complete"
+
+    @property
+    def has_episodes(self) -> bool:
+        """Whether it is a sweep or a rollout."""
+        return self.kind in (SWEEP, ROLLOUT)
+
+
+def find_runs(results: str | Path) -> list[RunEntry]:
+    """Every run of the results folder, the newest first."""
+    root = Path(results).expanduser()
+    found = [_stored(store) for family in (STUDIES, ROLLOUTS) for store in stores(root, family)]
+    found += [run for kind in DESCRIPTIONS for run in _artifacts(root / "artifacts" / kind, kind)]
+    return sorted(found, key=lambda run: (run.started, run.id), reverse=True)
+
+
+def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
+    """The run of that id, of a unique part of one, or the newest for `last`. exact: of that id alone.
+
+    Raises:
+        UsageError: several runs have that part, or there is no run at all. UnknownName: none has it.
+    """
+    runs = find_runs(results)
+    if not runs:
+        raise UsageError(f"no runs in {results}: make one with 'kerv rollout method=spec_vla task=reach'")
+    if name == LAST and not exact:
+        return runs[0]
+    same = [run for run in runs if run.id == name]
+    near = same or [run for run in runs if name in run.id and not exact]
+    if not near:
+        raise UnknownName("run", name, [run.id for run in runs])
+    if len(near) > 1:
+        raise UsageError(f"'{name}' is a part of {len(near)} runs: {', '.join(run.id for run in near[:5])}")
+    return near[0]
+
+
+def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
+    """Those runs that agree with every filter: kind, method, task (patterns such as `drawer*` too), state (a beginning
+    of it) and since (ISO 8601).
+
+    Raises:
+        UnknownName: no such filter or kind.
+    """
+    known = ("kind", "method", "task", "state", "since")
+    for key in filters:
+        if key not in known:
+            raise UnknownName("filter", key, known)
+    if filters.get("kind", SWEEP) not in KINDS:
+        raise UnknownName("kind of run", filters["kind"], KINDS)
+    return [run for run in runs if _agrees(run, filters)]
+
+
+def _agrees(run: RunEntry, filters: dict[str, str]) -> bool:
+    task = filters.get("task", "*")
+    return (
+        filters.get("kind", run.kind) == run.kind
+        and ("method" not in filters or any(fnmatch.fnmatch(name, filters["method"]) for name in run.methods))
+        and ("task" not in filters or any(fnmatch.fnmatch(t, task) or t == f"{task}-v3" for t in run.tasks))
+        and run.state.startswith(filters.get("state", ""))
+        and run.started >= filters.get("since", "")
+    )
+
+
+def store_of(run: RunEntry) -> StudyStore:
+    """The store of a sweep or rollout.
+
+    Raises:
+        UsageError: it is another kind of run.
+    """
+    if not run.has_episodes:
+        raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
+    return StudyStore(run.folder.parent.parent, run.folder.name, run.folder.parent.name)
+
+
+def _stored(store: StudyStore) -> RunEntry:
+    kind = SWEEP if store.family == STUDIES else ROLLOUT
+    typed = invocations(store.root)
+    name = store.name
+    try:
+        cells = unique_cells(store.read_plan().cells)
+    except KervError:
+        return RunEntry(name, kind, store.root, _changed(store.root / "plan.yaml"), "damaged")
+    status = [found for cell in cells if (found := _status(store, cell)) is not None]
+    started = [s["started"] for s in status if s.get("started")] or [command.started for command in typed]
+    episodes, successes = (sum(int(s[key]) for s in status) for key in ("episodes", "successes"))
+    return RunEntry(
+        id=name,
+        kind=kind,
+        folder=store.root,
+        started=min(started)[:19] if started else _changed(store.root / "plan.yaml"),
+        state="complete" if len(status) == len(cells) else f"{len(status)} of {len(cells)} cells",
+        methods=tuple(dict.fromkeys(str(cell.settings["method"]) for cell in cells)),
+        tasks=tuple(dict.fromkeys(cell.task for cell in cells)),
+        episodes=episodes,
+        figures={"success": successes / episodes} if episodes else {},
+        command=typed[-1].arguments if typed else (),
+        made_from=_weights(cells),
+    )
+
+
+def _weights(cells: Sequence[Cell]) -> dict[str, str]:
+    """Kind -> hash of the artifacts that a study reads; of several targets the first one's."""
+    identities = [cell.identity for cell in cells]
+    pairs = [(kind, value) for one in identities for kind, value in one.items() if kind != OBSERVATION and value]
+    return dict(reversed(pairs))
+
+
+def _status(store: StudyStore, cell: Cell) -> dict[str, Any] | None:
+    """The sums in a complete cell's status.json, unchecked: a list must be quick."""
+    with contextlib.suppress(CheckpointError):
+        found: dict[str, Any] = read_json(store.cells / cell.id / "status.json")
+        return found
+    return None
+
+
+def description_of(run: RunEntry) -> dict[str, Any]:
+    """The provenance of an artifact; empty where it names none, and before a training's first validation.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
+    return dict(_described(run.folder, run.kind).get("provenance") or {})
+
+
+def _described(folder: Path, kind: str) -> dict[str, Any]:
+    path = folder / DESCRIPTIONS[kind]
+    return dict(read_json(path)) if path.is_file() else {}
+
+
+def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
+    with contextlib.suppress(OSError):
+        clean(folder)
+    for place in visible(folder):
+        traces = (DESCRIPTIONS[kind], *_BEGUN.get(kind, ()))
+        if any((place / name).is_file() for name in traces):
+            yield _artifact(place, kind)
+
+
+_BEGUN = {"demos": ("recording.json",), **dict.fromkeys(TRAINED, ("log.csv",))}
+"""Kind -> files that an unfinished one has."""
+
+
+def _artifact(folder: Path, kind: str) -> RunEntry:
+    changed = max((_changed(path) for path in visible(folder) if path.is_file()), default="")
+    run = RunEntry(f"{kind}/{folder.name}", kind, folder, changed, "damaged")
+    try:
+        value = _described(folder, kind)
+        made = dict(value.get("provenance") or {})
+        settings = dict(made.get("settings") or {})
+        return replace(
+            run,
+            state=_trained_state(folder, settings) if kind in TRAINED else "complete" if value else "begun",
+            methods=(kind,),
+            tasks=tuple(settings.get("task") or value.get("tasks") or ()),
+            episodes=int(value.get("episodes", 0)) if kind == "demos" else 0,
+            figures=_figures(value, made),
+            command=tuple(str(made.get("command", "")).split()[1:]),
+            sha256=_hash_of(folder / DESCRIPTIONS[kind], value),
+            made_from=_made_from(value, made),
+        )
+    except (KervError, OSError, ValueError, TypeError, AttributeError, KeyError):
+        return run
+
+
+def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
+    """By which others name the artifact: that of its weights or data, else of its description."""
+    if value.get("kind") == "datastore":
+        return content_of(value["key"], value["chunk"], value["target"], value["files"])
+    return str(value.get("sha256") or (sha256_of(path) if value else ""))
+
+
+def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
+    if not (folder / "log.csv").is_file():
+        return "complete"  # copied or imported: it has no log
+    rows = _log(folder)
+    steps, done = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
+    return "complete" if done >= steps else f"step {done:.0f} of {steps}"
+
+
+def _figures(value: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, float]:
+    counts = {name: float(value[name]) for name in ("episodes", "rows") if isinstance(value.get(name), int)}
+    return counts | {name: float(number) for name, number in dict(made.get("validation") or {}).items()}
+
+
+def _made_from(value: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, str]:
+    """Kind -> hash, from wherever an artifact's description names it."""
+    named = dict(value.get("made_from") or {})
+    for kind, entry in (("target", value.get("target")), ("demos", value.get("demos") or made.get("demos"))):
+        sha256 = entry.get("sha256") if isinstance(entry, Mapping) else entry
+        named |= {kind: str(sha256)} if sha256 else {}
+    return named | ({"init": str(made["init"])} if made.get("init") else {})
+
+
+def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
+    """Kind -> what the run was made from: the id of a run here or a shipped policy, else the first letters of its
+    hash."""
+    names = {other.sha256: other.id for other in runs if other.sha256}
+    for folder in visible(shipped_dir()):
+        for kind in TRAINED:
+            with contextlib.suppress(KervError):
+                names.setdefault(str(_described(folder / kind, kind).get("sha256", "")), f"shipped {folder.name}")
+    return {kind: names.get(value, value[:12]) for kind, value in run.made_from.items()}
+
+
+def _log(folder: Path) -> list[dict[str, str]]:
+    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _changed(path: Path) -> str:
+    try:
+        return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")[:19]
+    except OSError:
+        return ""
+
+
+def disk_bytes(folder: Path) -> int:
+    """Size of everything below a folder."""
+    return sum(path.stat().st_size for path in _files(folder))
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.rglob("*") if path.is_file())

@@ -1,0 +1,52 @@
+"""Which code computes a cell: a hash of what its source means, so that what other code computed is not reused."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+
+import kerv_cli
+from kerv_cli.base.registry import kinds, parts
+
+_COMPUTING = ("base", "engine", "methods", "targets", "worlds", "lab")
+"""Rooms whose code an episode runs; not how it is shown or reported."""
+
+
+@functools.cache
+def code_hash() -> str:
+    """Hex SHA-256 over the names and syntax trees of the files that compute an episode: kerv's own, and those of parts
+    that are registered from outside. Comments, docstrings and layout do not count. Computed once per process."""
+    digest = hashlib.sha256()
+    for name, path in [*_own(), *_outside()]:
+        content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
+        digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
+    return digest.hexdigest()
+
+
+def _meaning(source: bytes) -> bytes:
+    """The syntax tree as text, without strings that stand alone: docstrings."""
+    return ast.dump(_WithoutDocstrings().visit(ast.parse(source))).encode()
+
+
+class _WithoutDocstrings(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else node
+
+
+def _own() -> Iterator[tuple[str, Path]]:
+    root = Path(kerv_cli.__file__).parent
+    files = [path for room in _COMPUTING for path in (root / room).rglob("*.py")]
+    return ((path.relative_to(root).as_posix(), path) for path in sorted(files))
+
+
+def _outside() -> Iterator[tuple[str, Path]]:
+    named = {part.build.partition(":")[0] for kind in kinds() for part in parts(kind).values() if kind != "executor"}
+    for name in sorted(module for module in named if module and not module.startswith("kerv_cli.")):
+        found = importlib.util.find_spec(name)
+        if found is not None and found.origin is not None:
+            yield name, Path(found.origin)

@@ -1,0 +1,172 @@
+"""Run one episode: world + decoder -> EpisodeRecord."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections import deque
+from collections.abc import Generator
+from typing import Any, Protocol
+
+import numpy as np
+
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
+from kerv_cli.lab.clock import RealClock
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.spec import World
+
+
+class Follower(Protocol):
+    """What an episode tells, whoever decodes its observations."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras whose images decode() reads; no others are drawn for it."""
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode: clears histories."""
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Told after each executed action (D,), in environment units; end_effector (3,) is its position now, metres."""
+
+    def finish(self, success: bool) -> None:
+        """Told at the end of the episode."""
+
+
+class ActionDecoder(Follower, Protocol):
+    """The interface of a decoder to an episode."""
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The present observation, with the images of `cameras` -> the actions to execute and their record."""
+
+
+class _Trace:
+    """Collects executed actions, end-effector positions, gripper openings, frames and places, step by step."""
+
+    def __init__(self, world: World, camera: CameraConfig | None) -> None:
+        self.world, self.camera = world, camera
+        self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
+        self.path: list[np.ndarray] = []
+        self.gripper: list[float] = []
+        self.frames: dict[int, np.ndarray] = {}
+        self.places: dict[str, list[np.ndarray]] = {}
+        self._look()
+
+    def add(self, action: np.ndarray) -> None:
+        """Executes `action` and stores the result."""
+        self.world.step(action)
+        space = self.world.spec.actions
+        self.actions.append(np.clip(action, space.low, space.high).astype(np.float32))
+        self._look()
+
+    def _look(self) -> None:
+        self.path.append(self.world.end_effector)
+        self.gripper.append(self.world.gripper)
+        if self.camera:
+            self.frames[len(self.actions)] = self.world.frame(self.camera)
+            state = np.asarray(self.world.observe(()).state)
+            for place in self.world.spec.observation.places:
+                self.places.setdefault(place.name, []).append(state[place.first : place.first + 3])
+
+
+class _Execution:
+    """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
+    the first one the robot stands still."""
+
+    def __init__(self, world: World, follower: Follower, trace: _Trace) -> None:
+        self.world, self.follower, self.trace = world, follower, trace
+        self.in_hand: deque[np.ndarray] = deque()
+        self.last = world.spec.standstill(world.gripper)
+
+    def step(self) -> None:
+        """One control step."""
+        if self.in_hand:
+            self.last = self.in_hand.popleft()
+        self.trace.add(self.last)
+        self.follower.observe(self.trace.actions[-1], self.trace.path[-1])
+
+    def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
+        """A new chunk replaces the one in hand."""
+        if clock is None or decode.delay is None:
+            self.in_hand = deque(decode.actions)
+        else:
+            self.in_hand = deque(clock.chunk(decode, self.trace.actions[: decode.delay.observed]))
+
+    def until(self, left: int) -> None:
+        """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
+        while len(self.in_hand) > left and not self.world.done:
+            self.step()
+
+    def during(self, delay: Delay) -> Delay:
+        """The world goes on for a decode's delay -> the delay, with what was executed."""
+        before, in_hand = len(self.trace.actions), len(self.in_hand)
+        while len(self.trace.actions) < before + delay.steps and not self.world.done:
+            self.step()
+        carried = in_hand - len(self.in_hand)
+        return dataclasses.replace(delay, carried=carried, held=len(self.trace.actions) - before - carried)
+
+
+def run_episode(
+    world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
+) -> EpisodeRecord:
+    """One closed-loop episode until success or the horizon: decodes a chunk and executes it whole, or, with a clock,
+    as docs/methods.md §8 says.
+
+    Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
+    record keeps, one per control step; None: none. clock: of a world that goes on during decodes; None: it waits.
+    """
+    steps = episode(world, decoder, seed, camera, clock)
+    decode: Any = None
+    while True:
+        try:
+            observation = steps.send(decode)
+        except StopIteration as end:
+            record: EpisodeRecord = end.value
+            return record
+        decode = decoder.decode(observation)
+
+
+def episode(
+    world: World, follower: Follower, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
+) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
+    """As `run_episode`, decoded by whoever runs it: yields each observation, is sent its decode and returns the
+    record."""
+    began = time.perf_counter()
+    world.reset(seed)
+    follower.reset(world.task, seed, world.end_effector)
+    trace = _Trace(world, camera)
+    execution = _Execution(world, follower, trace)
+    decodes: list[DecodeRecord] = []
+    decode_steps: list[int] = []
+    if clock is not None:
+        clock.reset()
+    while not world.done:
+        observation = world.observe(follower.cameras)
+        decode = yield observation if clock is None else clock.observed(observation, trace.path)
+        if clock is not None:
+            delay = clock.delay(decode, len(trace.actions))
+            decode = dataclasses.replace(decode, delay=execution.during(delay))
+        decodes.append(decode)
+        decode_steps.append(len(trace.actions))
+        execution.take(decodes[-1], clock)
+        execution.until(0 if clock is None else clock.expected)
+    follower.finish(world.succeeded)
+    return EpisodeRecord(
+        environment=world.spec.name,
+        space=world.spec.actions,
+        task=world.task,
+        instruction=world.instruction,
+        seed=seed,
+        success=world.succeeded,
+        steps=len(trace.actions),
+        decodes=tuple(decodes),
+        decode_steps=tuple(decode_steps),
+        actions=np.stack(trace.actions),
+        path=np.stack(trace.path).astype(np.float32),
+        gripper=np.asarray(trace.gripper, dtype=np.float32),
+        initial_state=world.initial_state,
+        frames=trace.frames,
+        places={name: np.asarray(path, dtype=np.float32) for name, path in trace.places.items()},
+        wall_seconds=time.perf_counter() - began,
+    )

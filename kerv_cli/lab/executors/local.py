@@ -1,0 +1,108 @@
+"""Processes of this machine (loky); a single worker is this process itself."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
+
+T = TypeVar("T")
+
+_WATCH_SECONDS = 1.0
+
+
+def build(options: Any, slots: int, threads: int, folder: Path) -> Executor:
+    """This process for one slot, else that many worker processes."""
+    return InProcess() if slots == 1 else Processes(slots, threads)
+
+
+class InProcess:
+    """Runs each function at once in this process; KeyboardInterrupt is raised to the caller."""
+
+    slots = 1
+
+    def submit(self, work: Callable[[], T], /) -> Future[T]:
+        """Runs `work` -> a future that is done."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(work())
+        except Exception as error:  # noqa: BLE001 - the future holds any exception
+            future.set_exception(error)
+        return future
+
+    def close(self, abandon: bool) -> None:
+        """Nothing to end."""
+
+
+class Processes:
+    """One loky pool per worker: when a worker dies, only its own work is lost, and which one is known."""
+
+    def __init__(self, slots: int, threads: int) -> None:
+        self.slots, self.threads = slots, threads
+        self._free: list[Any] = []
+        self._all: list[Any] = []
+
+    def submit(self, work: Callable[[], T], /) -> Future[T]:
+        """Gives `work` to a free worker or starts one; the caller keeps at most `slots` at work."""
+        pool = self._free.pop() if self._free else self._new_pool()
+        outer: Future[T] = Future()
+        pool.submit(work).add_done_callback(lambda inner: self._settle(outer, inner, pool))
+        return outer
+
+    def _settle(self, outer: Future[Any], inner: Future[Any], pool: Any) -> None:
+        from joblib.externals.loky.process_executor import BrokenProcessPool
+
+        error = inner.exception()
+        if isinstance(error, BrokenProcessPool):
+            signals = re.findall(r"SIG[A-Z]+", str(error))
+            self._all.remove(pool)
+            outer.set_exception(
+                WorkerLost(f"its worker process was {f'killed by {signals[0]}' if signals else 'lost'}")
+            )
+            return
+        self._free.append(pool)
+        if error is not None:
+            outer.set_exception(error)
+        else:
+            outer.set_result(inner.result())
+
+    def _new_pool(self) -> Any:
+        """A pool whose worker starts with its first work."""
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        # loky replaces a worker whose memory grew (open worlds, drawing contexts) and warns of it; no work is lost
+        warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
+        pool = ProcessPoolExecutor(
+            max_workers=1,
+            initializer=_begin_worker,
+            initargs=(os.getpid(),),
+            env=dict.fromkeys(THREAD_VARIABLES, str(self.threads)),
+        )
+        self._all.append(pool)
+        return pool
+
+    def close(self, abandon: bool) -> None:
+        """Ends the workers; abandoned ones are killed."""
+        for pool in list(self._all):
+            pool.shutdown(wait=True, kill_workers=abandon)
+
+
+def _begin_worker(parent: int) -> None:
+    """Worker start-up: ignores SIGINT (the parent handles Ctrl-C) and exits when the parent process is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

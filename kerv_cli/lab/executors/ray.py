@@ -1,0 +1,101 @@
+"""Tasks of a Ray cluster, or of a Ray that is started on this machine; a block is a task.
+
+The nodes must share the results folder.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
+from kerv_cli.methods.parts import RayOptions
+
+T = TypeVar("T")
+
+_CONNECT_SECONDS = 5.0
+
+
+def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Executor:
+    """Connects to the cluster, or starts a Ray with as many processors as the slots need.
+
+    Raises:
+        UsageError: the cluster cannot be reached.
+    """
+    import ray
+
+    _check_reachable(options.address)
+    started: dict[str, Any] = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
+    try:
+        ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        why = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise UsageError(f"the Ray cluster {options.address or 'of this machine'} cannot be reached: {why}") from None
+    return Tasks(slots, threads, options.gpus)
+
+
+def _check_reachable(address: str) -> None:
+    """Fails within seconds where Ray itself would try for minutes.
+
+    Raises:
+        UsageError: nothing listens at `host:port` or `ray://host:port`.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not port.isdigit():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=_CONNECT_SECONDS).close()
+    except OSError as error:
+        raise UsageError(f"the Ray cluster {address} cannot be reached: {error.strerror or error}") from None
+
+
+class Tasks:
+    """Ray tasks without Ray's retries: `execute` decides about lost blocks."""
+
+    def __init__(self, slots: int, threads: int, gpus: float) -> None:
+        import ray
+
+        self.slots = slots
+        variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
+        options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
+        self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
+        self._open: list[Any] = []
+
+    def submit(self, work: Callable[[], T], /) -> Future[T]:
+        """Starts a task."""
+        reference = self._call.remote(work)
+        self._open.append(reference)
+        outer: Future[T] = Future()
+        reference.future().add_done_callback(lambda inner: _settle(outer, inner))
+        return outer
+
+    def close(self, abandon: bool) -> None:
+        """Leaves the cluster; abandoned tasks are killed."""
+        import ray
+
+        if abandon:
+            for reference in self._open:
+                ray.cancel(reference, force=True)
+        ray.shutdown()
+
+
+def _call(work: Callable[[], T]) -> T:
+    return work()
+
+
+def _settle(outer: Future[Any], inner: Future[Any]) -> None:
+    from ray.exceptions import NodeDiedError, RayTaskError, WorkerCrashedError
+
+    error = inner.exception()
+    if error is None:
+        outer.set_result(inner.result())
+    elif isinstance(error, RayTaskError):
+        outer.set_exception(error.cause)
+    elif isinstance(error, WorkerCrashedError | NodeDiedError):
+        outer.set_exception(WorkerLost("its worker process was lost"))
+    else:
+        outer.set_exception(error)

@@ -1,0 +1,132 @@
+"""What a cell means: the settings that have an effect, the weights and data, the task, the seeds and `ENGINE`.
+
+Not the code, versions, machine, workers or layout of files: those are provenance, written beside. So what was measured
+stays, whatever is renamed or added, and what would give the same tokens is the same work in any study.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.settings import EXPERT, MODEL, as_plain, settings_from
+from kerv_cli.lab.effects import idle_keys
+
+ENGINE = 1
+"""Which tokens the code gives. Raised by hand in a change that alters tokens or actions, and in no other:
+tests/test_golden.py holds both."""
+
+Identity = Mapping[str, str]
+"""Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
+
+OBSERVATION = "observation"
+"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
+
+# Fields of RolloutSettings that do not change an episode's result (where it is written, how much of it is recorded,
+# names), or that count otherwise (task and seeds as the cell's own, the policy by its hashes). All other fields count,
+# so that a new setting makes new cells instead of being overlooked.
+NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
+NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
+
+
+def hash_of(value: Any) -> str:
+    """First 16 hex digits of the SHA-256 of canonical JSON.
+
+    Raises:
+        ValueError: NaN or infinity, which JSON lacks.
+        TypeError: a value that is not JSON's.
+    """
+    return hashlib.sha256(_canonical(value).encode("ascii")).hexdigest()[:16]
+
+
+def _canonical(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+
+
+def work_of(settings: Mapping[str, Any], identity: Identity, engine: int = ENGINE) -> str:
+    """Hash of what determines the results of a setting, apart from task, seeds and repeat. settings: plain
+    RolloutSettings, of this kerv or an older one. engine: with which they were computed."""
+    kept = without(settings, NOT_DETERMINING - {"policy", "method"})
+    policy = settings.get("policy", {}).get("kind", MODEL)
+    return _work(_canonical(kept), _canonical(dict(identity)), policy, engine)
+
+
+@functools.lru_cache(maxsize=4096)
+def _work(settings: str, identity: str, policy: str, engine: int) -> str:
+    hashes = {f"{name}_sha256": value for name, value in json.loads(identity).items() if name != OBSERVATION}
+    plain = json.loads(settings)
+    return hash_of({"settings": effective(plain), "policy": {"kind": policy, **hashes}, "engine": engine})
+
+
+def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that determine a result: complete, without those that have no effect."""
+    kept = without(settings, NOT_DETERMINING)
+    try:
+        read = settings_from(settings, tolerant=True)
+    except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
+        return kept
+    kept = _filled(kept, without(as_plain(read), NOT_DETERMINING))
+    for key in idle_keys(read) if read.policy.kind != EXPERT else ():
+        _drop(kept, key.split("."))
+    kept["runtime"] = without(kept["runtime"], NOT_DETERMINING_RUNTIME)
+    if not stress_of(kept)["level"]:
+        kept["world"] = without(kept["world"], {"stress"})  # level 0 of every kind is the same world
+    return kept
+
+
+def _filled(stored: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored values and, where an older file has none, the defaults of today; keys that are unknown today stay."""
+    both = {**complete, **stored}
+    for key, value in both.items():
+        if isinstance(value, Mapping) and isinstance(complete.get(key), Mapping):
+            both[key] = _filled(value, complete[key])
+    return both
+
+
+def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
+    for key in path[:-1]:
+        settings = settings.get(key, {})
+    settings.pop(path[-1], None)
+
+
+def complete_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored plain RolloutSettings with today's defaults where an older kerv had no such setting."""
+    try:
+        return _filled(settings, as_plain(settings_from(settings, tolerant=True)))
+    except KervError:
+        return dict(settings)
+
+
+def depends_on_order(settings: Mapping[str, Any]) -> bool:
+    """Whether an episode's result depends on the episodes before it in its cell: a skip level that feedback moves."""
+    skip = settings.get("skip", {})
+    return bool(skip.get("up") or skip.get("down"))
+
+
+def stress_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Kind and level of the stress in plain RolloutSettings; `none` where nothing is shifted."""
+    stress = settings["world"].get("stress", {})
+    level = int(stress.get("level", 0))
+    return {"kind": stress["kind"] if level else "none", "level": level}
+
+
+def batch_of(settings: Mapping[str, Any]) -> int:
+    """Episodes that run at the same time in plain RolloutSettings; with more than one they have no times."""
+    return int(settings.get("rollout", {}).get("batch", 1))
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}."""
+    pairs: dict[str, Any] = {}
+    for key, value in settings.items():
+        pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return pairs
+
+
+def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """The settings without those keys."""
+    return {key: value for key, value in settings.items() if key not in names}

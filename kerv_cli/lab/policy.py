@@ -1,0 +1,250 @@
+"""The policy of a rollout: checks that its parts and files fit together, its identity, and its decoder."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.base.views import frame_shape
+from kerv_cli.engine.batched import BatchDecoder, check_batch
+from kerv_cli.engine.decoder import Decoder, deviation
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.lab import timing
+from kerv_cli.lab.clock import RealClock
+from kerv_cli.lab.episode import ActionDecoder
+from kerv_cli.lab.expert import ExpertDecoder
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.build import check as check_method
+from kerv_cli.methods.build import compose, needs
+from kerv_cli.worlds import resolve_tasks, spec_of
+from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.stress import check as check_stress
+
+WARM_UP_DECODES = 6
+CALIBRATION_DECODES = 15
+"""Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
+OBSERVATION = "observation"
+"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
+
+
+def artifacts_of(settings: RolloutSettings) -> Artifacts:
+    """The policy's files on its device; all settings of this process share the loaded objects."""
+    device, _ = set_up(settings.runtime)
+    return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
+
+
+def is_expert(settings: RolloutSettings) -> bool:
+    """Whether the policy is the environment's scripted expert."""
+    return settings.policy.kind == EXPERT
+
+
+def identity_of(settings: RolloutSettings) -> dict[str, str]:
+    """Hashes of everything that determines a result besides the settings, without loading weights.
+
+    Raises:
+        CheckpointError: as `check`.
+    """
+    if is_expert(settings):
+        return {"target": "", OBSERVATION: "state (privileged)"}
+    profile = timing.identity_of(settings)
+    artifacts = artifacts_of(settings)
+    shown = shown_to(artifacts.description.settings)
+    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: shown}
+
+
+def shown_to(target: Mapping[str, object]) -> str:
+    """What a target of these settings observes, `vision` or `state (privileged)`; stands in every row, so that a
+    privileged policy is recognised."""
+    kind = str(target.get(OBSERVATION, "vision"))
+    return "state (privileged)" if kind == "state" else kind
+
+
+def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
+    """Those of the tasks that the policy's target was not trained on; none where it does not say what it was."""
+    if is_expert(settings):
+        return []
+    made = artifacts_of(settings).description.provenance.get("settings")
+    trained = made.get("task") if isinstance(made, Mapping) else None
+    if not trained or not isinstance(trained, list) or not all(isinstance(name, str) for name in trained):
+        return []
+    known = set(resolve_tasks(trained))
+    return [task for task in tasks if task not in known]
+
+
+def check(settings: RolloutSettings) -> None:
+    """Refuses settings that cannot run, before anything heavy starts.
+
+    Raises:
+        UsageError: a number out of range, training seeds, a camera that the policy was not trained on, parts that do
+            not belong together.
+        CheckpointError: no such policy, a damaged one, an artifact of another target or another action space.
+    """
+    tasks = resolve_tasks(settings.task)
+    spec = spec_of(tasks[0])
+    _check_seeds(settings, spec)
+    check_stress(settings.world.stress, spec)
+    timing.check_numbers(settings, spec)
+    if is_expert(settings):
+        _check_expert(settings, spec)
+        return
+    artifacts = artifacts_of(settings)
+    target = artifacts.description
+    target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
+    method = settings.parts()
+    if settings.deviation_every > 0:
+        target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
+    check_method(method, settings.chunk, target.chunk, target.parallel)
+    check_batch(method, settings.method, settings.rollout.batch)
+    timing.check_method(settings, spec, target)
+    wanted = needs(method)
+    artifacts.check(wanted)
+    if "calibration" in wanted and method["threshold"].kind in ("kinematic", "change"):
+        calibration = artifacts.load("calibration")
+        for task in tasks if method["threshold"].k_s is None else ():
+            calibration.k_s(task)
+
+
+def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
+    seeds = range(settings.seed, settings.seed + settings.episodes)
+    if settings.seed in spec.seeds.training:
+        first = spec.seeds.evaluation.start
+        raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {first}")
+    purpose = "selection" if settings.seed in spec.seeds.selection else "evaluation"
+    spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
+
+
+def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
+    timing.check_expert(settings, spec)
+    if settings.rollout.batch > 1:
+        raise UsageError(f"policy=expert with rollout.batch={settings.rollout.batch}: it decodes nothing, leave it out")
+    if settings.deviation_every > 0:
+        raise UsageError(f"deviation_every={settings.deviation_every}: the expert has no AR to differ from")
+    if settings.chunk:
+        raise UsageError(f"policy=expert with chunk={settings.chunk}: the expert decodes nothing, leave it out")
+    for kind, part in settings.parts().items():
+        if part != getattr(RolloutSettings(), kind):
+            raise UsageError(f"policy=expert with {kind}={part.kind}: the expert decodes nothing, leave it out")
+
+
+class Sampled:
+    """A decoder that also decodes every `every`-th observation autoregressively, outside the timing, and records the
+    deviation."""
+
+    def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
+        self.decoder, self.reference, self.every, self.count = decoder, reference, every, 0
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those of the decoder."""
+        return self.decoder.cameras
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode of both decoders."""
+        self.count = 0
+        self.decoder.reset(task, seed, end_effector)
+        self.reference.reset(task, seed, end_effector)
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The decoder's record; every `every`-th with the mean deviation from AR, in normalised action units."""
+        record = self.decoder.decode(observation)
+        self.count += 1
+        if self.count % self.every:
+            return record
+        wanted = self.reference.decode(observation).actions
+        return dataclasses.replace(record, deviation=deviation(self.decoder.target.actions, record.actions, wanted))
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Tells the decoder; AR needs no history."""
+        self.decoder.observe(action, end_effector)
+
+    def finish(self, success: bool) -> None:
+        """Tells the decoder."""
+        self.decoder.finish(success)
+
+
+def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
+    """The decoder of one setting on one task, warmed up.
+
+    Raises:
+        UsageError, CheckpointError: as `check`.
+    """
+    spec = spec_of(task)
+    if is_expert(settings):
+        decoder: ActionDecoder = ExpertDecoder()
+    else:
+        artifacts = artifacts_of(settings)
+        decoder = compose(settings.parts(), artifacts.target, artifacts.load, task, settings.chunk)
+        if settings.deviation_every > 0:
+            reference = Decoder(artifacts.target, chunk=settings.chunk)
+            decoder = Sampled(decoder, reference, settings.deviation_every)
+    warm_up(decoder, task, spec, settings.world.camera.size)
+    return decoder
+
+
+def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
+    """The decoder of one setting for several episodes, of any tasks.
+
+    Raises:
+        UsageError, CheckpointError: as `check`.
+    """
+    artifacts = artifacts_of(settings)
+    decoder = compose(settings.parts(), artifacts.target, artifacts.load, chunk=settings.chunk)
+    return BatchDecoder(decoder, settings.deviation_every)
+
+
+def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
+    """The clock of one setting on one task; None where the world waits.
+
+    Raises:
+        UsageError: as `check`.
+    """
+    if settings.rollout.clock == WAITS:
+        return None
+    target = None if is_expert(settings) else artifacts_of(settings).description
+    measured = 0.0
+    if timing.calibrates(settings):
+        runtime = settings.runtime
+        measured = _ar_seconds(
+            *(settings.results, settings.policy.target, settings.chunk, task, settings.world.camera.size),
+            *(runtime.device, runtime.dtype, runtime.threads),
+        )
+    latency = timing.latency_of(settings, target, measured)
+    return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
+
+
+@functools.cache
+def _ar_seconds(
+    results: str, target: str, chunk: int, task: str, pixels: int, device: str, dtype: str, threads: int
+) -> float:
+    """Median seconds of an autoregressive decode here, after warm-up; measured once per process."""
+    runtime = RuntimeSettings(device=device, dtype=dtype, threads=threads)
+    policy = PolicySettings(target=target)
+    artifacts = artifacts_of(RolloutSettings(results=results, runtime=runtime, policy=policy))
+    decoder = Decoder(artifacts.target, chunk=chunk)
+    warm_up(decoder, task, spec_of(task), pixels)
+    still = still_observation(decoder, spec_of(task), pixels)
+    return float(np.median([decoder.decode(still).seconds for _ in range(CALIBRATION_DECODES)]))
+
+
+def still_observation(decoder: ActionDecoder, spec: EnvironmentSpec, pixels: int) -> Observation:
+    """Zeros for everything that the decoder reads. pixels: size of the images."""
+    images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
+    space = spec.observation
+    return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+
+
+def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: int) -> None:
+    """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
+    so that parts that need a history or a path run too. pixels: size of the images."""
+    still = still_observation(decoder, spec, pixels)
+    decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
+    for i in range(WARM_UP_DECODES):
+        for action in decoder.decode(still).actions:
+            decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

@@ -1,0 +1,134 @@
+"""Composes a study's settings from its YAML and the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kerv_cli.base.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import read_yaml
+from kerv_cli.base.manifests import read
+from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.lab.effects import without_effect
+from kerv_cli.worlds import resolve_tasks, settled, spec_of
+
+_OF_THE_SWEEP = ("study", "results", "until", "loss", "rerun")
+
+
+@dataclass(frozen=True)
+class ResolvedStudy:
+    """A study whose settings are composed and checked. until, loss, rerun: as SweepSettings."""
+
+    study: StudySettings
+    settings: Mapping[str, RolloutSettings]  # by label, the study's order
+    overrides: Mapping[str, str]  # by label, as written
+    until: str = "done"
+    loss: float = 3.0
+    rerun: str = "never"
+    common: tuple[str, ...] = ()  # of the command line, for every setting
+
+
+def resolve(overrides: Sequence[str]) -> ResolvedStudy:
+    """The chosen study; overrides of `study…` and `results` go to the sweep, all others to each of its settings.
+
+    Raises:
+        UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
+    """
+    overrides, by_path = _study_of_path(overrides)
+    mine = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in _OF_THE_SWEEP]
+    theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
+    sweep = compose("sweep", mine, SweepSettings)
+    if by_path is not None:
+        changed = {o.split("=", 1)[0].removeprefix("study.") for o in mine if o.startswith("study.")}
+        kept = {name: getattr(sweep.study, name) for name in changed & set(StudySettings.__dataclass_fields__)}
+        sweep.study = dataclasses.replace(by_path, **kept)
+    given = {_key(o) for o in theirs}
+    common = [o for o in split_words(sweep.study.common) if _key(o) not in given] + theirs
+    written = _points(sweep.study)
+    for words in written.values():
+        varied = given & {_key(word) for word in words}
+        if varied:
+            raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
+    if sweep.study.baseline not in written:
+        raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(written)}")
+    composer = Composer("rollout", RolloutSettings)
+    settings = {label: composer.compose([*common, *words]) for label, words in written.items()}
+    for setting in settings.values():
+        setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
+    texts = {label: " ".join(words) for label, words in written.items()}
+    return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, sweep.rerun, tuple(theirs))
+
+
+def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
+    """Overrides without effect -> why: a setting's own in that setting, those of the command line in every setting."""
+    found: dict[str, str] = {}
+    for label, settings in resolved.settings.items():
+        own = without_effect(settings, resolved.overrides[label].split(), sweep=True)
+        found |= {f"{label}: {word}": why for word, why in own.items()}
+    of_all = [without_effect(settings, resolved.common, sweep=True) for settings in resolved.settings.values()]
+    return found | {word: why for word, why in of_all[0].items() if all(word in idle for idle in of_all)}
+
+
+def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings | None]:
+    """The overrides without a `study=PATH.yaml`, and the study in that file.
+
+    Raises:
+        UsageError: no such file, or it is no study.
+    """
+    paths = [o.split("=", 1)[1] for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))]
+    if not paths:
+        return list(overrides), None
+    if len(paths) > 1:
+        raise UsageError(f"study= is given twice, {paths[0]} and {paths[-1]}: leave one out")
+    path = Path(paths[-1]).expanduser()
+    value = _read_study(path)
+    try:
+        study = read(StudySettings, {"name": path.stem, **value}, str(path))
+    except CheckpointError as error:
+        raise UsageError(str(error).replace(" is damaged", " is no study")) from error
+    return [o for o in overrides if not o.startswith("study=")], study
+
+
+def _read_study(path: Path) -> dict[str, Any]:
+    """The study file's values; raises as `_study_of_path`."""
+    try:
+        value = read_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or "it is not YAML"
+        raise UsageError(f"study={path} cannot be read: {why}") from error
+    if not isinstance(value, dict):
+        raise UsageError(f"study={path} is no study: it needs the keys settings and baseline, see conf/study/demo.yaml")
+    return value
+
+
+def study_name(study: str) -> str:
+    """The name under which `kerv sweep study=…` stores a study: of a file its `name:`, else its stem.
+
+    Raises:
+        UsageError: a file that is there and is no study.
+    """
+    path = Path(study).expanduser()
+    if path.suffix not in (".yaml", ".yml"):
+        return study
+    return str(_read_study(path).get("name", path.stem)) if path.is_file() else path.stem
+
+
+def _key(override: str) -> str:
+    return override.split("=", 1)[0]
+
+
+def _points(study: StudySettings) -> dict[str, list[str]]:
+    """Label -> override words; a grid's labels carry its values: `spec_vla r=3`."""
+    written: dict[str, list[str]] = {}
+    for label, text in study.settings.items():
+        varied = swept_keys(text)
+        for words in expand(text):
+            values = [f"{_key(w).rsplit('.', 1)[-1]}={w.split('=', 1)[1]}" for w in words if _key(w) in varied]
+            written[" ".join([label, *values])] = words
+        if len(written) > MOST_POINTS:
+            raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
+    return written

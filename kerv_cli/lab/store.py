@@ -1,0 +1,491 @@
+"""The results folder of a study. A cell is either complete or absent.
+
+results/studies/<name>/, results/rollouts/<run>/
+    run.json                      the commands that ran it; see run_file.py
+    plan.yaml                     what was asked for
+    cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
+    failures/<id>.txt             traceback of the last attempt, until one succeeds
+    claims/                       the cells that sweeps compute now; see claims.py
+    rollouts/*.rrd
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import os
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import (
+    atomic_path,
+    read_json,
+    read_yaml,
+    sha256_of,
+    storage_errors,
+    sync,
+    to_yaml,
+    visible,
+    write_folder,
+)
+from kerv_cli.base.leftovers import clean
+from kerv_cli.base.limits import check_name
+from kerv_cli.base.settings import StudySettings
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.lab import rows
+from kerv_cli.lab.claims import write_lock
+from kerv_cli.lab.identity import work_of
+from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+from kerv_cli.lab.rows import Circumstances
+from kerv_cli.lab.run_file import sweep_command
+
+_CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
+_STATUS = "status.json"
+_READ_TOGETHER = 100  # cells whose columns are converted at once: many tables of a few rows take much memory
+_DECODE_TIMES = pa.schema([rows.DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
+
+
+class DamagedCell(CheckpointError):
+    """A cell whose files are not what was written."""
+
+
+class NewerCell(CheckpointError):
+    """A cell of a format that this kerv does not read."""
+
+
+@dataclass(frozen=True)
+class StoredCell:
+    """A complete cell, read from its folder."""
+
+    id: str
+    folder: Path
+    config: dict[str, Any]  # the study's name and the fields of Cell
+    status: dict[str, Any]  # provenance, run, seconds, sums
+    # columns of rows.EPISODE_SCHEMA, those of a newer kerv, and decode_seconds: per episode (decodes,) seconds
+    episodes: pd.DataFrame
+
+    def of(self, cell: Cell) -> pd.DataFrame:
+        """The episodes of `cell`, which may ask for some of the seeds only."""
+        if len(cell.seeds) == len(self.episodes):
+            return self.episodes
+        return self.episodes[self.episodes["seed"].isin(cell.seeds)]
+
+
+FORMAT = 1
+"""Of a cell's files. A cell of a higher one is of a newer kerv and is left alone."""
+
+STUDIES, ROLLOUTS = "studies", "rollouts"
+"""Families of stores: what `kerv sweep` and what `kerv rollout` leaves, in the same files."""
+
+
+class StudyStore:
+    """`results/<family>/<name>`. Only a path: picklable, and nothing is created before the first write.
+
+    Raises:
+        UsageError: a name that is no plain folder name.
+    """
+
+    def __init__(self, results: Path | str, name: str, family: str = STUDIES) -> None:
+        self.name, self.family = check_name(name, "study name"), family
+        self.root = Path(results) / family / name
+        self.cells = self.root / "cells"
+        self.rollouts = self.root / "rollouts"
+        self.plan_path = self.root / "plan.yaml"
+        self.failures = self.root / "failures"
+        self.damaged = self.root / "damaged"  # cells that were set aside
+        self.claims = self.root / "claims"
+        self.jobs = self.root / "jobs"  # an executor's own files
+
+    def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
+        """Writes plan.yaml -> the written plan. Cells of the stored plan are kept if they have the new plan's settings
+        and seeds and a task that it does not name.
+
+        So sweeps of one study over different tasks end in one report, and changed settings or seeds replace old cells.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
+        with write_lock(self.plan_path):
+            with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
+                new = merge_plans(self.read_plan(), new)
+            with atomic_path(self.plan_path) as temporary:
+                temporary.write_text(plan_text(new), encoding="utf-8")
+        return new
+
+    def read_plan(self) -> StudyPlan:
+        """The stored plan.
+
+        Raises:
+            UsageError: there is no such study; the message names what to run.
+            CheckpointError: the plan is damaged.
+        """
+        try:
+            # a folder that was renamed by hand is the study of its new name
+            return replace(plan_from_text(self.plan_path.read_text(encoding="utf-8")), name=self.name)
+        except (FileNotFoundError, NotADirectoryError):
+            raise UsageError(f"no study '{self.name}' in {self.root.parent}: {self.how_to_run()}") from None
+        except (OSError, ValueError, CheckpointError) as error:
+            why = " ".join(str(error).split())[:120]
+            raise CheckpointError(f"{self.plan_path} is damaged ({why}): {self.how_to_run()} again") from error
+
+    def how_to_run(self) -> str:
+        """The command that runs this study, for messages."""
+        if self.family == STUDIES:
+            return f"run `{sweep_command(self.root, self.name)}`"
+        return f"run `kerv runs rerun {self.name}`"
+
+    def has_cell(self, name: str) -> bool:
+        """Whether the cell is complete; its files are compared with their hashes.
+
+        Raises:
+            CheckpointError: its folder is damaged; the message names it and the remedy.
+        """
+        if not (self.cells / name).exists():
+            return False
+        self.status_of(name)
+        return True
+
+    def status_of(self, name: str) -> dict[str, Any]:
+        """status.json of a complete cell, after every other file was compared with the hash in it.
+
+        Raises:
+            CheckpointError: as `has_cell`.
+        """
+        folder = self.cells / name
+        try:
+            status = read_json(folder / _STATUS)
+            if status.get("format", FORMAT) > FORMAT:
+                raise NewerCell(f"cell {folder} is of a newer kerv (format {status['format']}): update kerv")
+            # cells from before the seal have none
+            if status.get("sha256") not in (None, _seal(status)):
+                raise CheckpointError(f"{_STATUS} is not what was written")
+            for file in _CELL_FILES:
+                if sha256_of(folder / file) != status["files"][file]:
+                    raise CheckpointError(f"{file} is not what was written")
+        except NewerCell:
+            raise
+        except (CheckpointError, KeyError, TypeError, AttributeError) as error:
+            raise self._damaged(folder, error) from error
+        return status
+
+    def _damaged(self, folder: Path, error: Exception) -> CheckpointError:
+        why = str(error).replace(f"{folder}/", "")
+        return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
+
+    def folders(self) -> list[Path]:
+        """Folders of its cells, damaged ones among them; none that is being written or removed."""
+        return [path for path in visible(self.cells) if path.is_dir()]
+
+    def described(self, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        """config.yaml and status.json of a cell, unchecked: ten thousand are read to plan a sweep.
+
+        Raises:
+            CheckpointError: they cannot be read.
+        """
+        folder = self.cells / name
+        try:
+            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+            return config, dict(read_json(folder / _STATUS))
+        except (OSError, ValueError) as error:
+            raise self._damaged(folder, error) from error
+
+    def set_aside(self, name: str) -> Path:
+        """Moves a damaged cell out of the way -> where it lies now. The next sweep computes it again.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+        places = (self.damaged / (name if not i else f"{name}-{i}") for i in range(10_000))
+        place = next(path for path in places if not path.exists())
+        with storage_errors(place):
+            self.damaged.mkdir(exist_ok=True)
+            os.rename(self.cells / name, place)
+            sync(self.damaged)
+        return place
+
+    def damages(self) -> list[tuple[str, DamagedCell]]:
+        """Name of every cell that is not what was written -> why; one of a newer kerv is not among them."""
+        found = []
+        for folder in self.folders():
+            try:
+                self.status_of(folder.name)
+            except DamagedCell as error:
+                found.append((folder.name, error))
+            except CheckpointError:
+                continue
+        return found
+
+    def write_cell(
+        self,
+        cell: Cell,
+        records: Sequence[EpisodeRecord],
+        status: Mapping[str, Any],
+        circumstances: Sequence[Circumstances] = (),
+    ) -> bool:
+        """Writes a complete cell under a temporary name, syncs it and renames it.
+
+        Args:
+            cell: what ran.
+            records: its episodes, in the order of `cell.seeds`.
+            status: provenance, run and seconds, JSON values.
+            circumstances: of each record; unknown if empty.
+
+        Returns:
+            False if another process completed the cell first; its result stays and this one is discarded.
+
+        Raises:
+            StorageError: the disk refused; the cell is absent.
+            ValueError: the records are not of this cell's task and seeds.
+        """
+        if [(r.task, r.seed) for r in records] != [(cell.task, seed) for seed in cell.seeds]:
+            raise ValueError(f"records of other episodes than cell {cell.id} asks for ({cell.task}, {cell.seeds})")
+        files = self._cell_files(cell, records, status, circumstances or [Circumstances()] * len(records))
+
+        def fill(temporary: Path) -> None:
+            for file, content in files.items():
+                (temporary / file).write_bytes(content)
+
+        return write_folder(self.cells / cell.id, fill)
+
+    def _cell_files(
+        self,
+        cell: Cell,
+        records: Sequence[EpisodeRecord],
+        status: Mapping[str, Any],
+        circumstances: Sequence[Circumstances],
+    ) -> dict[str, bytes]:
+        config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
+        episodes = [
+            rows.episode_row(record, at, cell.repeat) for record, at in zip(records, circumstances, strict=True)
+        ]
+        decodes = [row for record in records for row in rows.decode_rows(record)]
+        files = {
+            "config.yaml": to_yaml(config).encode(),
+            "episodes.parquet": rows.parquet_bytes(episodes, rows.EPISODE_SCHEMA),
+            "decodes.parquet": rows.parquet_bytes(decodes, rows.DECODE_SCHEMA),
+        }
+        full = {
+            "format": FORMAT,
+            "state": "complete",
+            "episodes": len(records),
+            "successes": sum(r.success for r in records),
+            "wall_seconds": sum(r.wall_seconds for r in records),
+            "timed": all(r.timed for r in records),
+            "started": circumstances[0].started,
+            **status,
+            "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+        }
+        full["sha256"] = _seal(full)
+        files[_STATUS] = (json.dumps(full, indent=2, allow_nan=False) + "\n").encode()
+        return files
+
+    def read_cell(self, name: str) -> StoredCell:
+        """A complete cell.
+
+        Raises:
+            CheckpointError: it is absent or damaged, or of a newer kerv.
+        """
+        return _stored([self._read(name)])[0]
+
+    def _read(self, name: str) -> _ReadCell:
+        """A complete cell as it lies in its files; raises as `read_cell`."""
+        folder = self.cells / name
+        if not folder.exists():
+            raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
+        status = self.status_of(name)
+        try:
+            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+            episodes = with_columns(_parquet(folder / "episodes.parquet"), rows.EPISODE_SCHEMA)
+            decodes = with_columns(_parquet(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
+            return _ReadCell(name, folder, config, _interned(status), episodes, _split_by_seed(decodes))
+        except (OSError, ValueError, pa.ArrowException) as error:
+            raise self._damaged(folder, error) from error
+
+    def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
+        """The complete ones of these cells by id, and those that are absent.
+
+        Raises:
+            CheckpointError: a cell is damaged, or is not of these settings.
+            UsageError: not one is complete; the message names what to run.
+        """
+        unique = list({cell.id: cell for cell in cells}.values())
+        there = [cell for cell in unique if (self.cells / cell.id).exists()]
+        if not there:
+            raise UsageError(f"study '{self.name}' has no complete cell: {self.how_to_run()}")
+        found: dict[str, StoredCell] = {}
+        for first in range(0, len(there), _READ_TOGETHER):
+            read = [self._read_as(cell) for cell in there[first : first + _READ_TOGETHER]]
+            found |= {stored.id: stored for stored in _stored(read)}
+            del read
+            pa.default_memory_pool().release_unused()
+        return found, [cell for cell in unique if cell.id not in found]
+
+    def _read_as(self, cell: Cell) -> _ReadCell:
+        """A complete cell that is the result of `cell`.
+
+        Raises:
+            CheckpointError: as `read_cells`.
+        """
+        read = self._read(cell.id)
+        if not is_result_of(read.config, cell):
+            raise CheckpointError(
+                f"{self.plan_path} is damaged (it says something else of cell {cell.id} than the cell): "
+                f"{self.how_to_run()} again"
+            )
+        return read
+
+    def executed_actions(self, cell_id: str) -> dict[int, np.ndarray]:
+        """Seed -> the actions (T, D) that its episode executed, environment units, of a complete cell's repeat.
+
+        Raises:
+            CheckpointError: the cell is damaged.
+        """
+        folder = self.cells / cell_id
+        try:
+            decodes = pq.read_table(folder / "decodes.parquet", columns=["seed", "index", "actions"]).to_pandas()
+            steps = pq.read_table(folder / "episodes.parquet", columns=["seed", "steps"]).to_pandas()
+        except (OSError, pa.ArrowException) as error:
+            raise self._damaged(folder, error) from error
+        lengths = dict(zip(steps["seed"], steps["steps"], strict=True))
+        ordered = decodes.sort_values(["seed", "index"]).groupby("seed")["actions"]
+        # the last chunk of an episode may go beyond its end
+        return {int(s): np.concatenate([np.stack(c) for c in chunks])[: lengths[s]] for s, chunks in ordered}
+
+    def write_failure(self, name: str, text: str) -> None:
+        """Stores the traceback of a cell that failed."""
+        with atomic_path(self.failures / f"{name}.txt") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    def clear_failure(self, name: str) -> None:
+        """Removes the traceback of an earlier attempt that failed."""
+        with contextlib.suppress(OSError):
+            (self.failures / f"{name}.txt").unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class _ReadCell:
+    """A cell whose episodes are not converted yet. seconds: seed -> (decodes,) seconds."""
+
+    id: str
+    folder: Path
+    config: dict[str, Any]
+    status: dict[str, Any]
+    episodes: pa.Table
+    seconds: dict[int, np.ndarray]
+
+
+def _read_config(text: str) -> dict[str, Any]:
+    """config.yaml, entry by entry: the settings, by far the longest, are those of many cells and are read once."""
+    entries = (_read_entry(entry) for entry in re.split(r"^(?=\w)", text, flags=re.MULTILINE) if entry)
+    return {key: value for entry in entries for key, value in entry.items()}
+
+
+@functools.lru_cache(maxsize=1024)
+def _read_entry(text: str) -> dict[str, Any]:
+    entry = read_yaml(text)
+    if not isinstance(entry, dict):
+        raise ValueError(f"'{text[:40]}' is no entry")
+    return entry
+
+
+def _interned(status: Mapping[str, Any]) -> dict[str, Any]:
+    """The same entries; texts that thousands of cells share stand in memory once."""
+    return {sys.intern(key): sys.intern(value) if isinstance(value, str) else value for key, value in status.items()}
+
+
+def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
+    """Whether a stored cell's config.yaml holds the work of `cell` on all of its seeds, whatever the engine was."""
+    try:
+        work = work_of(config["settings"], config["identity"]), config["task"], config["repeat"]
+        return work == cell.work and set(cell.seeds) <= set(config["seeds"])
+    except (KeyError, TypeError, AttributeError, ValueError):
+        return False
+
+
+def _parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Those columns of a parquet file, or all of them."""
+    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
+    return pq.ParquetFile(path).read(columns=columns, use_threads=False)
+
+
+def with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The columns of `schema` first, then those that only the table has. A column that an older table lacks is empty.
+
+    Raises:
+        ValueError: a column of another type.
+    """
+    if table.schema.equals(schema):
+        return table
+    there, names = set(table.column_names), list(schema.names)
+    for field in (field for field in schema if field.name not in there):
+        table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    further = [name for name in table.column_names if name not in set(names)]
+    table = table.select([*names, *further])
+    return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
+
+
+def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
+    """Seed -> seconds of its decodes, in order; the decodes of an episode stand together."""
+    seeds, seconds = (decodes[name].to_numpy() for name in ("seed", "seconds"))
+    starts = np.flatnonzero(np.diff(seeds, prepend=-1))
+    return dict(zip(seeds[starts].tolist(), np.split(seconds, starts[1:]), strict=True))
+
+
+def _stored(cells: Sequence[_ReadCell]) -> list[StoredCell]:
+    """The cells with their episodes as data frames, converted all at once."""
+    whole = pa.concat_tables([cell.episodes for cell in cells], promote_options="default").to_pandas()
+    try:
+        whole["decode_seconds"] = [cell.seconds[s] for cell in cells for s in cell.episodes["seed"].to_pylist()]
+    except KeyError as error:
+        raise CheckpointError(f"a cell in {cells[0].folder.parent} has no decodes of seed {error}") from error
+    stops = np.cumsum([cell.episodes.num_rows for cell in cells]).tolist()
+    return [
+        StoredCell(cell.id, cell.folder, cell.config, cell.status, whole.iloc[stop - cell.episodes.num_rows : stop])
+        for cell, stop in zip(cells, stops, strict=True)
+    ]
+
+
+def _seal(status: Mapping[str, Any]) -> str:
+    """Hash of all entries of a status but its own."""
+    text = json.dumps({key: value for key, value in status.items() if key != "sha256"}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def stores(results: Path | str, family: str = STUDIES) -> list[StudyStore]:
+    """The runs of a family in a results folder, by name; neither hidden folders nor those without a plan. What a killed
+    command left among them is removed."""
+    with contextlib.suppress(OSError):
+        clean(Path(results) / family)
+    folders = visible(Path(results) / family)
+    return [StudyStore(results, folder.name, family) for folder in folders if (folder / "plan.yaml").is_file()]
+
+
+def studies_of(store: StudyStore) -> list[StudyStore]:
+    """The other studies of the same results folder; none where the store is no study's."""
+    if store.family != STUDIES:
+        return []
+    return [other for other in stores(store.root.parent.parent) if other.name != store.name]
+
+
+def begun_studies(results: Path | str) -> list[str]:
+    """Names of the studies with a readable plan and the folder of at least one planned cell."""
+    names = []
+    for store in stores(results):
+        with contextlib.suppress(CheckpointError):
+            if any((store.cells / cell.id).exists() for cell in store.read_plan().cells):
+                names.append(store.name)
+    return names

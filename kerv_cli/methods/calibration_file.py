@@ -1,0 +1,223 @@
+"""The calibration file: figures fitted on training demonstrations, read and checked (docs/methods.md §3, §4).
+
+`kerv calibrate` writes it (training/calibration.py); thresholds, predictors, boundaries and verify-skip read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import sha256_of, write_json
+from kerv_cli.base.manifests import read_file
+from kerv_cli.base.places import artifact, beside
+from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request
+from kerv_cli.methods.boundary import LEAST, BoundaryRanges
+from kerv_cli.methods.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
+from kerv_cli.targets.checkpoint import TargetDescription
+
+FORMAT = 2
+FILE = "calibration.json"
+NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
+AGAIN = "run 'kerv calibrate' again"
+Errors = dict[str, dict[str, dict[str, list[float]]]]
+"""predictor -> task -> DoF -> mean absolute error 1 … H steps ahead, normalised action units."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """The demonstrations of a calibration, by hash. tasks: task -> {"training": episodes, "held_out": episodes}."""
+
+    sha256: str
+    tasks: dict[str, dict[str, int]]
+
+
+@dataclass(frozen=True)
+class Variability:
+    """Distribution of K over the pre-sampled decodes of a task, normalised action units; p25, p90: percentiles."""
+
+    k_s: float  # the reference level K_S
+    decodes: int
+    p25: float
+    p75: float
+    p90: float
+
+    def __post_init__(self) -> None:
+        if not self.k_s > 0:
+            raise ValueError(f"the reference level {self.k_s} is not above 0")
+
+
+@dataclass(frozen=True)
+class BoundarySection:
+    """Ranges of the hybrid boundary by how many positions it looks at (§4.4)."""
+
+    episodes: int
+    windows: dict[str, BoundaryRanges]
+
+    def __post_init__(self) -> None:
+        wrong = [window for window in self.windows if not window.isdigit() or int(window) < LEAST]
+        if wrong:
+            raise ValueError(f"boundary window {wrong[0]}")
+
+
+@dataclass(frozen=True)
+class SkipLevel:
+    """Verify-skip levels of a task (§4.3), cosines. share: part of the datastore's `entries` that s_min would skip,
+    with another episode's best neighbour. within: part of those with an error of at most epsilon. error: their mean
+    error, normalised action units."""
+
+    s_min: float
+    low: float
+    high: float
+    share: float
+    entries: int
+    within: float | None = None
+    error: float | None = None
+
+    def __post_init__(self) -> None:
+        if not -NEVER <= self.low <= self.s_min <= self.high <= NEVER:
+            raise ValueError("the skip levels are not in order")
+
+
+@dataclass(frozen=True)
+class SkipSection:
+    """Skip levels by task, for the datastore of this content."""
+
+    datastore: str
+    epsilon: float
+    confidence: float
+    tasks: dict[str, SkipLevel]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Contents of `calibration.json`; `boundary` and `skip` are None and `variability` is empty where not measured."""
+
+    target: MadeFor
+    demos: Demonstrations
+    window: int  # control steps of history
+    noise: dict[str, Noise]  # per kind of filter
+    errors: Errors
+    variability: dict[str, Variability]
+    boundary: BoundarySection | None = None
+    skip: SkipSection | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+    format: Literal[2] = 2
+    kind: Literal["calibration"] = "calibration"
+
+    def __post_init__(self) -> None:
+        if set(self.noise) != set(FILTERS):
+            raise ValueError("the noise of a filter is missing")
+        if any(len(noise.q) != self.target.actions.dofs for noise in self.noise.values()):
+            raise ValueError("the noise is not that of the action space")
+        if self.window < MINIMUM:
+            raise ValueError(f"window {self.window}")
+
+    def k_s(self, task: str) -> float:
+        """The task's reference level K_S, normalised action units.
+
+        Raises:
+            CheckpointError: the task was not pre-sampled.
+        """
+        if task not in self.variability:
+            raise CheckpointError(
+                f"the calibration has no reference level K_S for {task}, only for "
+                f"{', '.join(self.variability) or 'no task'}: run 'kerv calibrate task={task}'"
+            )
+        return self.variability[task].k_s
+
+    def ranges(self, window: int) -> BoundaryRanges:
+        """Ranges that normalise R and D for a boundary with a window of `window` positions.
+
+        Raises:
+            CheckpointError: none were taken, or none over so many positions.
+        """
+        if self.boundary is None:
+            raise CheckpointError(f"the calibration has no ranges for the boundary: {AGAIN}")
+        windows = self.boundary.windows
+        if str(window) not in windows:
+            raise CheckpointError(
+                f"the calibration's ranges were taken over {', '.join(windows)} positions, the boundary looks at "
+                f"{window}: run 'kerv calibrate boundary_windows=[{','.join([*windows, str(window)])}]'"
+            )
+        return windows[str(window)]
+
+    def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
+        """(low, s_min, high) of the task: cosine similarities, low <= s_min <= high; NEVER where nothing is skipped.
+
+        datastore: `content` of the datastore that retrieves.
+
+        Raises:
+            CheckpointError: no levels, none for this task, or those of another datastore.
+        """
+        if self.skip is None:
+            raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
+        section = MadeFrom("the calibration's skip section", "fitted", AGAIN, {"datastore": self.skip.datastore})
+        section.check_same({"datastore": datastore})
+        if task not in self.skip.tasks:
+            raise CheckpointError(
+                f"the calibration has no skip level for {task}, only for {', '.join(self.skip.tasks)}: {AGAIN}"
+            )
+        row = self.skip.tasks[task]
+        return row.low, row.s_min, row.high
+
+    def predictor(self, kind: str, minimum: int = MINIMUM, horizon: int = HORIZON) -> Predictor:
+        """The predictor `kind` with the fitted noise.
+
+        Raises:
+            UnknownName: no such predictor.
+        """
+        return build_predictor(kind, self.target.actions.is_strict, self.noise, minimum, self.window, horizon)
+
+
+def calibration_place(results: str, name: str | None, target: Path) -> Path:
+    """Path of the named calibration, else of the target's: pretrained/<name>/calibration.json where it is shipped,
+    artifacts/calibration/<name>/calibration.json where it was made here."""
+    if name is not None:
+        return artifact(results, "calibration", name) / FILE
+    if target.name == "target":
+        return target.parent / FILE
+    return (beside(target, "calibration") if target.parent.name == "target" else target) / FILE
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Writes `calibration` atomically."""
+    write_json(path, asdict(calibration))
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration at `path`, of any target.
+
+    Raises:
+        CheckpointError: missing, damaged or of another format.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"no calibration at {path}: run 'kerv calibrate'")
+    try:
+        return read_file(Calibration, path, f"a calibration of format {FORMAT}")
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}; {AGAIN}") from error
+
+
+def load_calibration(path: Path, description: TargetDescription) -> Calibration:
+    """The calibration at `path`, which must have been made for this target.
+
+    Raises:
+        CheckpointError: missing, damaged, of another format, target, action space or chunk length.
+    """
+    loaded = read_calibration(path)
+    own = MadeFor(description.sha256, description.actions, description.chunk)
+    loaded.target.check_same(own, str(path), "made", "run 'kerv calibrate'")
+    return loaded
+
+
+def _check(path: Path, request: Request) -> str:
+    load_calibration(path, request.description)
+    return sha256_of(path)
+
+
+ARTIFACT = Artifact(
+    "calibration", calibration_place, _check, lambda path, request: load_calibration(path, request.description)
+)

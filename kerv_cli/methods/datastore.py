@@ -1,0 +1,379 @@
+"""Retrieval: action chunks of the demonstrations, searched by the target's own encoding of the observation
+(docs/methods.md §4.1, §4.2; HeiSD).
+
+The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
+normalised again; optionally projected onto the directions that hold nearly all of the keys. The default is the scene
+segment alone, which holds the vision encoder's object and goal positions together with hand and gripper. On MT10 the
+nearest neighbour by this key in another episode has the most similar chunk; adding pooled patch tokens makes the
+agreement worse. The payload is the expert's next H actions as tokens.
+
+On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `projection.npy` where keys are projected, and
+`manifest.json`; rows by task, seed, step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import count
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from kerv_cli.base import registry
+from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.manifests import check_files, content_of, read_file
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.methods.search import ExactIndex, Index, best
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.worlds import spec_of
+
+FORMAT = 2
+VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
+CROSS = 0.1  # probability that a path changes to other neighbours
+COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
+AGAIN = "build one with 'kerv build datastore'"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One task's part: its rows [first, last) and the seeds of its episodes."""
+
+    rows: tuple[int, int]
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """`manifest.json`: the entries' keys and sizes, the target they were made for, and their seeds.
+
+    key: parts of the prompt that are pooled. width: numbers of a key. chunk: H. actions: the target's action space.
+    target, demos, files: SHA-256 of the target's weights, the demonstrations and the files beside this one.
+    """
+
+    format: Literal[2]
+    kind: Literal["datastore"]
+    key: tuple[str, ...]
+    width: int
+    rows: int
+    chunk: int
+    actions: ActionSpace
+    target: str
+    demos: str
+    files: dict[str, str]
+    tasks: dict[str, Shard]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not {VECTORS, PAYLOAD} <= set(self.files):
+            raise ValueError("a file has no hash")
+        for task, shard in self.tasks.items():
+            if not 0 <= shard.rows[0] < shard.rows[1] <= self.rows:
+                raise ValueError(f"the rows of {task} are not among {self.rows}")
+
+    @property
+    def content(self) -> str:
+        """SHA-256 over keys, chunks and target: the same after a rebuild from the same target and demonstrations."""
+        return content_of(self.key, self.chunk, self.target, self.files)
+
+
+def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
+    """As `pooled_key`, on the host."""
+    return pooled_key(prompt, target, segments).cpu().numpy()
+
+
+def pooled_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
+    """prompt (B, P, E) -> keys (B, d) float32 of length 1, d = segments · E.
+
+    Raises:
+        UnknownName: a segment that this target's prompt does not have.
+    """
+    known = target.segments
+    for name in segments:
+        if name not in known:
+            raise UnknownName("part of the prompt", name, known)
+    pooled = [_unit(prompt[:, known[name]].float().mean(1)) for name in segments]
+    return _unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1))
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp_min(1e-12)
+
+
+def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
+    """keys (n, d) along the directions projection (d, c) -> (n, c) float32 of length 1."""
+    inside = keys @ projection
+    found: np.ndarray = inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
+    return found.astype(np.float32)
+
+
+def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
+    """Checks that all seeds (per task) are training seeds, so that no stored episode has the initial state of an
+    evaluation episode.
+
+    Raises:
+        CheckpointError: one is not.
+    """
+    for task, used in seeds.items():
+        training = spec_of(task).seeds.training
+        shared = [seed for seed in used if seed not in training]
+        if shared:
+            raise CheckpointError(
+                f"{where} holds seed {shared[0]} of {task}: seeds from {training.stop} on are for selection and "
+                "evaluation, retrieval would have seen the episodes it is evaluated on; build it from training ones"
+            )
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The k nearest entries, best first; equal scores in the datastore's order."""
+
+    similarity: np.ndarray  # (k,) float32, cosine
+    chunks: np.ndarray  # (k, N) int64 tokens
+    seeds: np.ndarray  # (k,) int64, the stored episodes
+    steps: np.ndarray  # (k,) int64, control step of the stored episode
+    left: np.ndarray  # (k,) int64, control steps from there to the stored episode's end
+
+    def __len__(self) -> int:
+        return len(self.similarity)
+
+
+@dataclass(frozen=True)
+class Datastore:
+    """An opened datastore. shards: task -> its rows."""
+
+    manifest: Manifest
+    vectors: np.ndarray  # (rows, d) float32
+    tokens: np.ndarray  # (rows, N) uint8
+    seeds: np.ndarray  # (rows,) int64, as the next two
+    steps: np.ndarray
+    left: np.ndarray
+    shards: dict[str, slice]
+    projection: np.ndarray | None = None  # (pooled numbers, d)
+    index: Index | None = None  # the search; None: ExactIndex
+
+    def __post_init__(self) -> None:
+        if self.index is None:
+            object.__setattr__(self, "index", ExactIndex(self.vectors, self.seeds, self.shards))
+
+    @classmethod
+    def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
+        """The datastore in `folder`, made for the target described.
+
+        search: settings of the search (registry kind datastore), None for exact search; each finds the same neighbours.
+
+        Raises:
+            CheckpointError: no datastore there, a damaged one, one that was built for another target, other action
+                statistics or another chunk length, or from evaluation seeds.
+            UsageError: an unknown backend, one whose packages are not installed, a server that does not answer.
+        """
+        manifest = read_manifest(folder)
+        check_target(manifest, description, folder)
+        parts = _read(folder, manifest)
+        index = None
+        if search is not None:
+            part = registry.find("datastore", search.kind, "datastore.kind")
+            index = part.built(parts["vectors"], parts["seeds"], parts["shards"], manifest.content, search)
+        return cls(manifest, **parts, index=index)
+
+    @property
+    def content(self) -> str:
+        """As `Manifest.content`."""
+        return self.manifest.content
+
+    def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
+        """prompt (1, P, E) of the target -> (d,) float32."""
+        return self.key_of(self.pooled(prompt, target).cpu().numpy())
+
+    def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
+        """prompt (1, P, E) of the target -> what `key_of` makes the key from (p,) float32, on the device."""
+        return pooled_key(prompt, target, self.manifest.key)[0]
+
+    def key_of(self, pooled: np.ndarray) -> np.ndarray:
+        """pooled (p,) float32 -> (d,) float32."""
+        return pooled if self.projection is None else projected(pooled[None], self.projection)[0]
+
+    def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
+        """Exact search among the entries of `task`: key (d,) -> its k nearest (all, where there are fewer).
+
+        without: seed of an episode that is passed over, for leave-one-episode-out measurements.
+
+        Raises:
+            UnknownName: a task that the datastore does not hold.
+        """
+        if task not in self.shards:
+            raise UnknownName("task of the datastore", task, self.shards)
+        assert self.index is not None
+        key = np.asarray(key, dtype=np.float32)
+        at, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
+        return Neighbours(similarity, self.tokens[at].astype(np.int64), self.seeds[at], self.steps[at], self.left[at])
+
+
+def _read(folder: Path, manifest: Manifest) -> dict[str, Any]:
+    """Reads a datastore's files and checks them against its manifest."""
+    try:
+        vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
+        payload = _read_payload(folder / PAYLOAD)
+        projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None
+        rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
+        fits = vectors.shape == (rows, manifest.width) and payload["tokens"].shape == (rows, size)
+    except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
+        raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
+    if not fits or not np.isfinite(vectors).all():
+        raise CheckpointError(
+            f"the datastore in {folder} is damaged: its files do not fit its manifest, build it again"
+        )
+    shards = {task: slice(*shard.rows) for task, shard in manifest.tasks.items()}
+    return {"vectors": vectors, "shards": shards, "projection": projection, **payload}
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a datastore; checks that its files are unchanged and its seeds training seeds.
+
+    Raises:
+        CheckpointError: missing, damaged, of another format, or from evaluation seeds.
+    """
+    path = folder / "manifest.json"
+    if not path.is_file():
+        raise CheckpointError(f"no datastore in {folder}: {AGAIN}")
+    manifest = read_file(Manifest, path, f"a datastore's manifest of format {FORMAT}: {AGAIN}")
+    check_files(folder, manifest.files, AGAIN)
+    check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, folder)
+    return manifest
+
+
+def check_target(manifest: Manifest, description: TargetDescription, folder: Path) -> None:
+    """Refuses a datastore that was made for another target, chunk length or action space.
+
+    Raises:
+        CheckpointError: another chunk length, action space or action statistics, other weights.
+    """
+    own = MadeFor(description.sha256, description.actions, description.chunk)
+    made_for = MadeFor(manifest.target, manifest.actions, manifest.chunk)
+    made_for.check_same(own, f"the datastore in {folder}", "built", AGAIN)
+
+
+def _read_payload(path: Path) -> dict[str, np.ndarray]:
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    columns = {name: table[column].to_numpy() for name, column in COLUMNS.items()}
+    flat = table["tokens"].combine_chunks().flatten().to_numpy()
+    return {"tokens": flat.reshape(len(table), -1), **columns}
+
+
+def _check(folder: Path, request: Request) -> str:
+    manifest = read_manifest(folder)
+    check_target(manifest, request.description, folder)
+    return manifest.content
+
+
+def _load(folder: Path, request: Request) -> Datastore:
+    return Datastore.open(folder, request.description, request.search)
+
+
+ARTIFACT = Artifact("datastore", artifact_folder("datastore"), _check, _load)
+
+
+def neighbour_tree(
+    chunks: np.ndarray,
+    start: int,
+    space: ActionSpace,
+    nodes: int = 50,
+    depth: int | None = None,
+    cross: float = CROSS,
+) -> TokenTree:
+    """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
+
+    chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
+    neighbour's next one, but a group of strict DoFs always comes from a neighbour that has the group before it, too.
+    The tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
+
+    Within `nodes` the most probable groups are kept (*ours*): the i-th neighbour weighs 1 / i, and a path changes to
+    other neighbours with probability `cross`; 0 merges whole chunks only.
+    """
+    stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
+    ways = _Ways(chunks.tolist(), list(space.segments(start, stop)), cross)
+    tokens: list[int] = []
+    parents: list[int] = []
+    children: dict[tuple[int, int], int] = {}
+    waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
+    order = count()
+
+    def offer(parent: int, level: int, gave: int, followed: int, cost: float) -> None:
+        for surprise, group, given, staying in ways.on(level, gave, followed):
+            heappush(waiting, (cost + surprise, next(order), parent, level, group, given, staying))
+
+    offer(ROOT, 0, ways.everyone, ways.everyone, 0.0)
+    while waiting and len(tokens) < nodes:
+        cost, _, node, level, group, gave, followed = heappop(waiting)
+        if len(tokens) + len(group) - _shared(children, node, group) > nodes:
+            continue  # a group is in the tree as a whole or not at all
+        for token in group:
+            if (node, token) not in children:
+                children[node, token] = len(tokens)
+                tokens.append(token)
+                parents.append(node)
+            node = children[node, token]
+        offer(node, level + 1, gave, followed, cost)
+    return TokenTree.build(tokens, parents)
+
+
+class _Weights(dict[int, float]):
+    """Bit set of neighbours -> sum of their weights; the i-th neighbour, counted from 1, weighs 1 / i."""
+
+    def __missing__(self, members: int) -> float:
+        weight = sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
+        self[members] = weight
+        return weight
+
+
+class _Ways:
+    """The groups that may follow a path. A path is described by two sets of neighbours: `gave`, those that have its
+    last group, and `followed`, those among them that have all its groups."""
+
+    def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
+        self.everyone = (1 << len(rows)) - 1
+        self.cross, self.weights = cross, _Weights()
+        self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
+        for first, last, strict in cuts:
+            givers: dict[tuple[int, ...], int] = {}
+            for i, row in enumerate(rows):
+                group = tuple(row[first:last])
+                givers[group] = givers.get(group, 0) | 1 << i
+            self.levels.append((strict, list(givers.items())))
+
+    def on(self, level: int, gave: int, followed: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
+        """Yields (−log probability, the group's tokens, the two sets of the lengthened path), best neighbour first."""
+        if level == len(self.levels):
+            return
+        strict, givers = self.levels[level]
+        pool = self.everyone
+        if strict:
+            pool = gave
+            givers = [(group, given & gave) for group, given in givers if given & gave]
+            givers.sort(key=lambda way: way[1] & -way[1])
+        weights, cross = self.weights, self.cross
+        of_followed, of_pool = weights[followed], weights[pool]
+        for group, given in givers:
+            staying = given & followed
+            probability = (1 - cross) * weights[staying] / of_followed + cross * weights[given] / of_pool
+            if probability > 0:
+                yield -math.log(probability), group, given, staying or given
+
+
+def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
+    """Number of the group's leading tokens that the tree already has below `node`."""
+    for depth, token in enumerate(group):
+        if (node, token) not in children:
+            return depth
+        node = children[node, token]
+    return len(group)

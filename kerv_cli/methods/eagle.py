@@ -1,0 +1,236 @@
+"""The EAGLE-style drafter and its dynamic tree (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
+
+Input at position i: concat(embedding of the token at i + 1, the target's last hidden state at i), mapped to the model's
+width; the decoder layers predict the hidden state at i + 1, from which the target's frozen head gives the logits for
+position i + 2. The prompt, vision tokens included, is in the drafter's cache. Rotary positions count from the prompt's
+beginning, in training and at inference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.protocol import Cache as AnyCache
+from kerv_cli.engine.protocol import ReadableTarget, Target
+from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.engine.unread import Unread
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.methods.public import PublicShape, load_public
+from kerv_cli.targets.checkpoint import FLOAT32, Description, read_description, save_module
+from kerv_cli.targets.compact.packed import load_packed
+from kerv_cli.targets.compact.trunk import Cache, LayerStack
+
+
+class DraftsStates(Protocol):
+    """What a drafter is to a decode: our own, or one of the public layout (`public.py`)."""
+
+    def new_cache(self, batch: int, capacity: int) -> AnyCache:
+        """An empty cache for `capacity` positions."""
+
+    def draft_position(self, place: int) -> int:
+        """Rotary position of a drafted token at this place of the sequence; the same, but for public conventions."""
+
+    def __call__(
+        self,
+        following: Tensor,
+        hidden: Tensor,
+        positions: Tensor,
+        cache: Any = None,
+        seen: np.ndarray | Tensor | None = None,
+    ) -> Tensor:
+        """As `Drafter.forward`."""
+
+
+class Drafter(LayerStack):
+    """One decoder layer (or a few) of the target's shape; the head and the token embeddings are the target's own."""
+
+    def __init__(self, settings: DrafterSettings, width: int, heads: int, feed_forward: int) -> None:
+        super().__init__(width, settings.layers, heads, feed_forward)
+        self.settings = settings
+        self.fuse = nn.Linear(2 * width, width)
+
+    @classmethod
+    def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> Drafter:
+        """A fresh drafter of the target's width, heads and feed-forward width."""
+        return cls(settings, target.width, target.heads, target.feed_forward)
+
+    def draft_position(self, place: int) -> int:
+        """As `DraftsStates.draft_position`."""
+        return place
+
+    def forward(
+        self,
+        following: Tensor,
+        hidden: Tensor,
+        positions: Tensor,
+        cache: Cache | None = None,
+        seen: np.ndarray | Tensor | None = None,
+    ) -> Tensor:
+        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
+        `attention_mask`."""
+        x = self.fuse(torch.cat([following, hidden], -1))
+        predicted: Tensor = self.norm(self.run_layers(x, positions, cache, seen))
+        return predicted
+
+
+@dataclass
+class DraftState:
+    """The drafter's state between rounds. cache: every committed position but the last. hidden: (E,) predicted state
+    from which the first draft token follows."""
+
+    cache: AnyCache
+    hidden: Tensor
+
+
+def observe(drafter: DraftsStates, state: DraftState, following: Tensor, hidden: Tensor, first: int) -> None:
+    """Feeds the target's own states: hidden (1, T, E) at positions first, first + 1, … and the embedding of the token
+    after each of them (1, T, E). Cache entries from `first` on (the last draft's) are overwritten."""
+    state.cache.length = first
+    tokens = hidden.shape[1]
+    positions = torch.arange(first, first + tokens, device=hidden.device)
+    state.hidden = drafter(following, hidden, positions, state.cache)[0, -1]
+
+
+def draft_tree(
+    drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
+) -> TokenTree | Unread:
+    """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
+    `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree. It stays on the
+    device, nothing here waits for it; on a CPU, where there is nothing to wait for, a tree is ranked on the host.
+    """
+    if top_k == 1:
+        return Unread.chain(draft_chain(drafter, target, state, min(depth, nodes)))
+    device = state.hidden.device
+    scores = torch.log_softmax(target.head(state.hidden).float(), -1)
+    values, tokens = scores.topk(min(top_k, nodes))
+    width = tokens.shape[0]
+    every, parents, cumulative = [tokens], [torch.full_like(tokens, ROOT)], [values]
+    base, offset = state.cache.length, width
+    first = drafter.draft_position(base)
+    hidden = state.hidden.expand(1, width, -1)
+    level = torch.arange(width, device=device)
+    own = torch.eye(max(width, top_k), dtype=torch.bool, device=device)
+    seen = own[:width, :width]  # of the nodes that were forwarded, level by level
+    for reached in range(1, depth):
+        following = target.embed(tokens[None])
+        position = torch.full((width,), first + reached - 1, device=device)
+        hidden = drafter(following, hidden, position, state.cache, seen.numpy() if device.type == "cpu" else seen)
+        logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
+        child_values, child_tokens = (found.flatten() for found in logp.topk(top_k, -1))
+        values, flat = child_values.topk(top_k)
+        # every child competes for a place in the tree, only the best top_k are expanded further
+        parents.append(level[:, None].expand(-1, top_k).flatten())
+        every.append(child_tokens)
+        cumulative.append(child_values)
+        level, offset, width = offset + flat, offset + child_tokens.shape[0], top_k
+        tokens, chosen = child_tokens[flat], flat // top_k
+        hidden = hidden[:, chosen]
+        seen = torch.cat([seen[chosen], own[:top_k, :top_k]], 1)
+    state.cache.length = base
+    found = torch.cat(every), torch.cat(parents), torch.cat(cumulative)
+    if device.type == "cpu":
+        every_token, every_parent, every_score = (numbers.tolist() for numbers in found)
+        return _best_of(every_token, every_parent, every_score, nodes)
+    return _keep_best(*found, nodes, depth)
+
+
+def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> Tensor:
+    """The greedy draft tokens (depth,) on the device, without the bookkeeping of a tree."""
+    base = state.cache.length
+    first = drafter.draft_position(base)
+    positions = torch.arange(first, first + depth, device=state.hidden.device).split(1)
+    hidden = state.hidden[None, None]
+    drafted = [target.head(hidden[0]).argmax(-1)]
+    for reached in range(depth - 1):
+        following = target.embed(drafted[-1][None])
+        hidden = drafter(following, hidden, positions[reached], state.cache)
+        drafted.append(target.head(hidden[0]).argmax(-1))
+    state.cache.length = base
+    return torch.cat(drafted)
+
+
+def _best_of(tokens: list[int], parents: list[int], scores: list[float], nodes: int) -> TokenTree:
+    # sorted is stable and children stand behind their parents: on equal scores the parent is kept first
+    best = sorted(sorted(range(len(tokens)), key=lambda i: -scores[i])[:nodes])
+    index = {old: new for new, old in enumerate(best)} | {ROOT: ROOT}
+    return TokenTree.build([tokens[i] for i in best], [index[parents[i]] for i in best])
+
+
+def _keep_best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Unread:
+    # as `_best_of`, on the device
+    best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
+    index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
+    index[best] = torch.arange(best.shape[0], device=tokens.device)
+    return Unread.tree(tokens[best], index[parents[best]], depth)
+
+
+@dataclass(frozen=True)
+class DrafterDescription(Description):
+    """A drafter's JSON. target: hash of the weights it imitates; actions: the action space whose tokens it drafts.
+    public: shape and convention of one in the public layout."""
+
+    settings: DrafterSettings
+    target: str
+    actions: ActionSpace
+    provenance: dict[str, Any]
+    public: PublicShape | None = None
+
+
+def save_drafter(
+    folder: Path,
+    drafter: Drafter,
+    target: Target,
+    target_sha256: str,
+    provenance: dict[str, Any],
+    stored: str = FLOAT32,
+) -> str:
+    """Writes the drafter and its description, which names its target by hash -> sha256 of the drafter's weights."""
+    description = {
+        "settings": asdict(drafter.settings),
+        "target": target_sha256,
+        "actions": target.actions.as_dict(),
+        "provenance": provenance,
+    }
+    return save_module(folder, "drafter", drafter, description, stored)
+
+
+def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> DrafterDescription:
+    """The description of the drafter in `folder`. actions: the target's.
+
+    Raises:
+        CheckpointError: none there, a damaged one, one of another target or action space.
+    """
+    description = read_description(folder, "drafter", DrafterDescription)
+    made_for, again = MadeFor(description.target, description.actions), "run 'kerv train drafter'"
+    own = MadeFor(target_sha256, actions)
+    made_for.check_same(own, f"the drafter in {folder}", "trained", again)
+    return description
+
+
+def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tuple[Any, DrafterDescription]:
+    """The drafter, ready for inference, and its description; errors as `read_drafter`."""
+    description = read_drafter(folder, target_sha256, target.actions)
+    if description.public is not None:
+        return load_public(folder, description.public, target), description
+    drafter = Drafter.beside(description.settings, target)
+    return load_packed(drafter, folder, "drafter", target.device, target.dtype), description
+
+
+def _check(folder: Path, request: Request) -> str:
+    return read_drafter(folder, request.description.sha256, request.description.actions).sha256
+
+
+def _load(folder: Path, request: Request) -> DraftsStates:
+    target: Any = request.target
+    return load_drafter(folder, target, request.description.sha256)[0]
+
+
+ARTIFACT = Artifact("drafter", artifact_folder("drafter"), _check, _load)

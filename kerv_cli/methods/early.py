@@ -1,0 +1,248 @@
+"""The early drafter: drafts the whole chunk from the encoded prompt, before the target's trunk runs (docs/methods.md
+§5, ours).
+
+It reads the pooled prompt (scene, proprioception, words and vision tokens) and the last executed actions: a residual
+network gives every token a few features, and one head turns features into bins. Nothing is autoregressive, so a chunk
+costs one small pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.transfer import read, upload
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.methods.packed_early import PackedEarly
+from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
+from kerv_cli.targets.compact.packed import Packable, load_packed
+
+
+def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.ndarray]:
+    """history (m, D), oldest first -> its newest `length` actions (length, D) and which of them are known (length,),
+    both float32; at an episode's start the missing actions are zeros in front."""
+    actions, known = np.zeros((length, dofs), np.float32), np.zeros(length, np.float32)
+    newest = history[max(0, len(history) - length) :]
+    if len(newest):
+        actions[-len(newest) :], known[-len(newest) :] = newest, 1.0
+    return actions, known
+
+
+class Block(nn.Module):
+    """Residual SwiGLU block, pre-norm; in a comparison better than a plain MLP block with as many weights."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.RMSNorm(width, eps=1e-5)
+        self.gate_up = nn.Linear(width, 2 * width)
+        self.down = nn.Linear(width, width)
+        nn.init.zeros_(self.down.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, W) -> (B, W)."""
+        gate, up = self.gate_up(self.norm(x)).chunk(2, -1)
+        return x + self.down(F.silu(gate) * up)
+
+
+class EarlyDrafter(Packable):
+    """A residual network from (pooled prompt (F,), h past actions (h, D)) to the logits (N, V) of all tokens.
+
+    actions: the action space of its tokens; chunk: H; features: F.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    strict: Tensor
+    packed: PackedEarly | None
+
+    def __init__(self, settings: DrafterSettings, actions: ActionSpace, chunk: int, features: int) -> None:
+        super().__init__()
+        self.settings, self.actions, self.chunk = settings, actions, chunk
+        self.tokens = chunk * actions.dofs
+        # prompt embeddings differ in size by orders of magnitude; actions lie in [-1, 1] as they are
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("scale", torch.ones(features))
+        self.register_buffer("strict", torch.from_numpy(actions.strict_tokens(self.tokens)), persistent=False)
+        self.enter = nn.Linear(features + settings.history * (actions.dofs + 1), settings.width)
+        self.blocks = nn.ModuleList(Block(settings.width) for _ in range(settings.layers))
+        self.norm = nn.RMSNorm(settings.width, eps=1e-5)
+        self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
+        self.head = nn.Linear(settings.rank, actions.tokens)
+
+    @classmethod
+    def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> EarlyDrafter:
+        """A fresh early drafter for the target's action space, H and F."""
+        return cls(settings, target.actions, target.chunk, target.pooled_width)
+
+    def pack_weights(self) -> PackedEarly | None:
+        """As `Packable.pack_weights`; None in other number formats than float32."""
+        return PackedEarly(self) if self.mean.dtype == torch.float32 else None
+
+    def standardise(self, features: Tensor) -> None:
+        """Takes mean and spread from the training features (n, F)."""
+        self.mean.copy_(features.float().mean(0))
+        self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
+
+    @torch.inference_mode()
+    def distance(self, features: Tensor) -> float:
+        """Mean square of the standardised features (1, F): 1 on average over the training observations."""
+        return float(((features.float() - self.mean) * self.scale).square().mean())
+
+    def forward(self, features: Tensor, history: Tensor, known: Tensor) -> Tensor:
+        """pooled prompts (B, F), history (B, h, D) normalised, known (B, h) -> logits (B, N, V)."""
+        if self.packed is not None and len(features) == 1:
+            return self.packed(torch.cat([features[0], history.flatten(), known[0]]))[None]
+        x = torch.cat([(features - self.mean) * self.scale, history.flatten(1), known], -1)
+        x = self.enter(x)
+        for block in self.blocks:
+            x = block(x)
+        logits: Tensor = self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
+        return logits
+
+    def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
+        """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
+        radius: r in bins, see `choose`."""
+        numbers, logits = self.unread(features, history, radius)
+        return EarlyDraft.of(read(numbers)[0], logits)
+
+    @torch.inference_mode()
+    def unread(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
+        """As `drafted`, but left on the device: N tokens and the odds (N + 1,) float64, logits (N, V)."""
+        weight = self.head.weight
+        shown = padded(history, self.settings.history, self.actions.dofs)
+        actions, known = (upload(x, weight.device).to(weight.dtype)[None] for x in shown)
+        logits = self(features.to(weight.dtype), actions, known)
+        tokens, odds = choose_with_odds(logits, radius, self.strict)
+        return torch.cat([tokens[0].double(), odds.double()]), logits[0]
+
+    @torch.inference_mode()
+    def tokens_of(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> list[list[int]]:
+        """features (B, F) and the executed actions of B episodes, as in `drafted` -> their drafts of all N tokens."""
+        weight = self.head.weight
+        shown = [padded(history, self.settings.history, self.actions.dofs) for history in histories]
+        actions, known = (torch.from_numpy(np.stack(x)).to(weight) for x in zip(*shown, strict=True))
+        tokens: list[list[int]] = choose(self(features.to(weight), actions, known), radius, self.strict).tolist()
+        return tokens
+
+
+@dataclass(frozen=True)
+class EarlyDraft:
+    """A draft. tokens: N of them. odds: the drafter's estimate that all are accepted, see `acceptance_odds`. logits:
+    (N, V)."""
+
+    tokens: list[int]
+    odds: float
+    logits: Tensor
+
+    @classmethod
+    def of(cls, numbers: np.ndarray, logits: Tensor) -> EarlyDraft:
+        """numbers: as `EarlyDrafter.unread`."""
+        return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]), logits)
+
+    @property
+    def entropy(self) -> float:
+        """Mean over the tokens of their distributions' entropy, nats."""
+        shares = self.logits.float().log_softmax(-1)
+        return float(-(shares.exp() * shares).sum(-1).mean())
+
+
+def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
+    """logits (B, N, V), strict (N,) bool -> tokens (B, N): the bins that are most likely to be accepted at `radius`.
+
+    The most probable bin is not the one with the most probability within ±radius. Many bins tie within a wide radius;
+    probabilities within a third of it and of the bin itself break the tie, so that accepted tokens stay near the target
+    token. Where `strict`, a token must equal the target's: it is always the most probable one.
+    """
+    return logits.argmax(-1) if not radius else choose_with_odds(logits, radius, strict)[0]
+
+
+def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
+    """As `choose`, and the odds (B,): probability that each token lies within `radius` of the target's, the strict ones
+    exactly on it, if the tokens were independent. They are not, and training on soft labels keeps probabilities low:
+    use it to compare chunks, not as a probability."""
+    probability = logits.float().softmax(-1)
+    below = F.pad(probability, (radius + 1, radius)).cumsum(-1)  # one sum for both radii
+    near, best = _between(below, radius, radius, logits.shape[-1]), logits.argmax(-1)
+    tokens = best
+    if radius:
+        score = near + 0.1 * _between(below, radius, radius // 3, logits.shape[-1]) + 0.05 * probability
+        tokens = torch.where(strict, best, score.argmax(-1))
+    exact, within = (of.gather(-1, tokens[..., None])[..., 0] for of in (probability, near))
+    return tokens, torch.where(strict, exact, within).prod(-1)
+
+
+def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
+    """below (…, V + 2 pad + 1): cumulated probability -> that of lying at most `radius` ≤ pad bins away (…, V)."""
+    return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
+
+
+@dataclass(frozen=True)
+class EarlyDescription(Description):
+    """An early drafter's JSON. target: hash of the weights it imitates; chunk: H that it drafts; actions: the action
+    space of its tokens."""
+
+    settings: DrafterSettings
+    target: str
+    chunk: int
+    actions: ActionSpace
+    provenance: dict[str, Any]
+
+
+def save_early(
+    folder: Path, early: EarlyDrafter, target_sha256: str, provenance: dict[str, Any], stored: str = FLOAT32
+) -> str:
+    """Writes the early drafter and its description, which names its target by hash -> sha256 of its own weights."""
+    description = {
+        "settings": asdict(early.settings),
+        "target": target_sha256,
+        "chunk": early.chunk,
+        "actions": early.actions.as_dict(),
+        "provenance": provenance,
+    }
+    return save_module(folder, "early", early, description, stored)
+
+
+def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:
+    """The description of the early drafter in `folder`.
+
+    Raises:
+        CheckpointError: none there, a damaged one, one of another target, chunk or action space.
+    """
+    again = "run 'kerv train drafter drafter=early'"
+    if not (folder / "early.json").is_file():
+        raise CheckpointError(f"no early drafter in {folder}: {again}")
+    own = read_description(folder, "early", EarlyDescription)
+    made_for = MadeFor(own.target, own.actions, own.chunk)
+    wanted = MadeFor(target.sha256, target.actions, target.chunk)
+    made_for.check_same(wanted, f"the early drafter in {folder}", "trained", again)
+    return own
+
+
+def load_early(
+    folder: Path, target: ReadableTarget, description: TargetDescription
+) -> tuple[EarlyDrafter, EarlyDescription]:
+    """The early drafter of `target`, ready for inference, and its own description; errors as `read_early`."""
+    own = read_early(folder, description)
+    early = EarlyDrafter.beside(own.settings, target)
+    return load_packed(early, folder, "early", target.device, target.dtype), own
+
+
+def _load(folder: Path, request: Request) -> EarlyDrafter:
+    drafted_for: Any = request.target
+    return load_early(folder, drafted_for, request.description)[0]
+
+
+ARTIFACT = Artifact(
+    "early", artifact_folder("early"), lambda folder, request: read_early(folder, request.description).sha256, _load
+)

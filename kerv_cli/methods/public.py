@@ -1,0 +1,175 @@
+"""Drafters in the layout of the public EAGLE and Spec-VLA codes (docs/methods.md §2.2): `fc`, one Llama layer without a
+norm in front, no norm behind; embeddings and head are the target's.
+
+Their inputs are those of our own drafter. Where they and kerv disagree is a switch (`Convention`): the rotary positions
+of drafted tokens, and which keys they see. Everything else follows from the layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.manifests import read
+from kerv_cli.engine.attention import attention_mask
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors, save_tensors
+from kerv_cli.targets.openvla.config import Language
+from kerv_cli.targets.openvla.layout import Sizes, layer_tensors
+from kerv_cli.targets.openvla.loading import SINGLE, check_layout, conversion, open_shards
+from kerv_cli.targets.openvla.trunk import KeyValueCache, LlamaLayer, run_layers
+
+POSITIONS, MASKS = ("sequence", "text"), ("causal", "prompt")
+EMBEDDING = "embed_tokens.weight"
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How a public drafter's code differs from kerv's.
+
+    positions: `sequence`, drafted tokens go on counting where the whole prompt ends; `text`, where its text ends: the
+    vision tokens are not counted (EAGLE's tree counts the ids it is handed, and Spec-VLA's hands it none for patches).
+    mask: `causal`, every token sees all before it; `prompt`, tokens see no key behind the prompt's last but one (so
+    Spec-VLA's drafters are trained: its attention mask is zero from there on).
+    """
+
+    positions: str = "sequence"
+    mask: str = "causal"
+
+    def check(self) -> Convention:
+        """This convention. Raises UnknownName for a choice that does not exist."""
+        for what, name, known in (("positions", self.positions, POSITIONS), ("mask", self.mask, MASKS)):
+            if name not in known:
+                raise UnknownName(what, name, known)
+        return self
+
+
+@dataclass(frozen=True)
+class PublicShape:
+    """Shape of a public drafter. skipped: vision tokens, which `positions=text` does not count."""
+
+    language: Language
+    bias: bool
+    convention: Convention
+    skipped: int
+
+
+class DraftCache(KeyValueCache):
+    """A cache that remembers where the prompt ended. prompt: its tokens."""
+
+    prompt = 0
+
+
+class PublicDrafter(nn.Module):
+    """The drafter; called as `Drafter` is."""
+
+    def __init__(self, shape: PublicShape) -> None:
+        super().__init__()
+        self.shape, language = shape, shape.language
+        self.fc = nn.Linear(2 * language.hidden_size, language.hidden_size, bias=shape.bias)
+        self.layers = nn.ModuleList(LlamaLayer(language, normed=i > 0) for i in range(language.num_hidden_layers))
+
+    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> DraftCache:
+        """An empty cache. fixed: of fixed shapes; default: on CUDA."""
+        weight = self.fc.weight
+        return DraftCache(self.shape.language, batch, capacity, weight, weight.is_cuda if fixed is None else fixed)
+
+    def draft_position(self, place: int) -> int:
+        """Rotary position of a drafted token at this place of the sequence."""
+        return place - self.shape.skipped * (self.shape.convention.positions == "text")
+
+    def forward(
+        self,
+        following: Tensor,
+        hidden: Tensor,
+        positions: Tensor,
+        cache: DraftCache | None = None,
+        seen: np.ndarray | Tensor | None = None,
+    ) -> Tensor:
+        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
+        `attention_mask`. A call on an empty cache is the prompt's."""
+        if cache is not None and not cache.length:
+            cache.prompt = hidden.shape[1]
+        x = self.fc(torch.cat([following, hidden], -1))
+        mask = self.prompt_mask(x, cache, seen) if self.shape.convention.mask == "prompt" else None
+        return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
+
+    def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
+        """Additive mask (T, S + T) in which no key behind the prompt's last but one is seen."""
+        prompt = cache.prompt if cache is not None else x.shape[1]
+        mask = attention_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)
+        if mask is None:
+            assert cache is not None
+            mask = x.new_zeros(x.shape[1], cache.length + x.shape[1])
+        mask[:, max(1, prompt - 1) :] = -torch.inf
+        return mask
+
+
+def layout_of(language: Language, bias: bool) -> dict[str, Sizes]:
+    """Name -> shape of a drafter's own tensors."""
+    width, inner = language.hidden_size, language.key_value_heads * language.channels
+    tensors: dict[str, Sizes] = {"fc.weight": (width, 2 * width)}
+    if bias:
+        tensors["fc.bias"] = (width,)
+    for number in range(language.num_hidden_layers):
+        layer = layer_tensors(f"layers.{number}", width, inner, language.intermediate_size)
+        if number == 0:
+            del layer["layers.0.input_layernorm.weight"]
+        tensors |= layer
+    return tensors
+
+
+def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
+    """The shape and tensors of a public drafter's folder (config.json, model.safetensors). Its copy of the embeddings
+    is left out: drafts are made with the target's.
+
+    Raises:
+        CheckpointError: an incomplete, damaged or pickled folder, or a drafter of another width than the target's.
+        UnknownName: no such convention.
+    """
+    value = read_json(folder / "config.json")
+    pickled = folder / "pytorch_model.bin"
+    if not (folder / SINGLE).is_file() and pickled.is_file():
+        raise CheckpointError(
+            f"{pickled} is pickled and can run code when it is opened: convert it where you trust it: "
+            f"{conversion(str(pickled), str(folder / SINGLE))}"
+        )
+    known = {name: value[name] for name in Language.__dataclass_fields__ if name in value}
+    language = read(Language, known, str(folder / "config.json"))
+    if language.hidden_size != target.width:
+        raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")
+    shards = open_shards(folder)
+    bias = "fc.bias" in shards.shapes
+    own = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
+    check_layout(own, layout_of(language, bias), folder)
+    skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
+    shape = PublicShape(language, bias, convention.check(), skipped.stop - skipped.start)
+    return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}
+
+
+def save_public(folder: Path, tensors: Mapping[str, Tensor]) -> str:
+    """Writes the weights -> their SHA-256."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_tensors(folder / WEIGHTS, tensors)
+    return sha256_of(folder / WEIGHTS)
+
+
+def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> PublicDrafter:
+    """The drafter in `folder`, frozen, on the target's device.
+
+    Raises:
+        CheckpointError: the weights are damaged or of another shape.
+    """
+    tensors = load_tensors(folder / WEIGHTS, "drafter")
+    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    check_layout(found, layout_of(shape.language, shape.bias), folder)
+    drafter = PublicDrafter(shape)
+    drafter.load_state_dict(tensors)
+    return drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)

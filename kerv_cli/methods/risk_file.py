@@ -1,0 +1,194 @@
+"""The recorded decodes that certify a gate's level: drafts, their scores and their losses, read and checked (docs/
+methods.md §4.6).
+
+`kerv calibrate risk` writes them (training/risk_recording.py); `skip=risk` reads them. The certificate is computed when
+a method is built, so that ε and δ are settings of the method.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import sha256_of, write_folder, write_json
+from kerv_cli.base.manifests import check_files, read_file
+from kerv_cli.base.registry import find
+from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
+from kerv_cli.methods.certification import Certified, certify, episodes_needed
+
+FORMAT = 1
+DECODES, FEATURES = "decodes.parquet", "features.npy"
+AGAIN = "run 'kerv calibrate risk'"
+ROW = [("source", pa.string()), ("task", pa.string()), ("seed", pa.int64()), ("index", pa.int64())]
+"""Columns of DECODES before `loss` and one column per score: what drafted, the episode, the decode in it."""
+
+
+@dataclass(frozen=True)
+class RiskManifest:
+    """Description of a recording. sources: what drafted -> hash of its artifact, empty where it has none. scale: ε_a.
+    tasks: task -> seeds, all of them selection seeds. scores: columns. files: name -> SHA-256. made_from: what sources
+    and scores read, kind of artifact -> hash; absent from older recordings."""
+
+    target: MadeFor
+    sources: dict[str, str]
+    scale: float
+    tasks: dict[str, list[int]]
+    scores: list[str]
+    files: dict[str, str]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    made_from: dict[str, str] = field(default_factory=dict)
+    format: Literal[1] = 1
+    kind: Literal["risk"] = "risk"
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0 or not set(self.files) <= {DECODES, FEATURES}:
+            raise ValueError("the scale is not above 0, or another file is named")
+
+    @property
+    def artifacts(self) -> dict[str, str]:
+        """Kind -> hash of what was made use of. An older recording names what drafted alone, the early drafter."""
+        return self.made_from or {name: digest for name, digest in self.sources.items() if digest}
+
+    def read_by(self, source: str, scores: Sequence[str]) -> dict[str, str]:
+        """Those of `artifacts` that a source's drafts and these scores read."""
+        parts = [find("proposer", source), *(find("score", name) for name in scores)]
+        wanted = {kind for part in parts for kind in part.needs(None)}
+        return {kind: digest for kind, digest in self.artifacts.items() if kind in wanted}
+
+
+@dataclass(frozen=True)
+class Losses:
+    """n recorded decodes of one source. scores: name -> (n,). losses: (n,) in [0, 1]. episodes: (n,) numbers."""
+
+    scores: dict[str, np.ndarray]
+    losses: np.ndarray
+    episodes: np.ndarray
+
+
+class RiskRecording:
+    """The recorded decodes of a policy's drafts."""
+
+    def __init__(self, manifest: RiskManifest, table: pa.Table) -> None:
+        self.manifest, self._table = manifest, table
+        self._certified: dict[tuple[Any, ...], Certified] = {}
+
+    def losses(self, source: str) -> Losses:
+        """Decodes of one source.
+
+        Raises:
+            CheckpointError: it was not recorded.
+        """
+        if source not in self.manifest.sources:
+            known = ", ".join(self.manifest.sources)
+            raise CheckpointError(f"the risk of drafts from {source} was not recorded, only of {known}: {AGAIN}")
+        columns = self._table.filter(pa.compute.equal(self._table["source"], source))
+        tasks, seeds = (columns[name].to_numpy(zero_copy_only=False) for name in ("task", "seed"))
+        _, numbers = np.unique(tasks, return_inverse=True)
+        _, episodes = np.unique(np.stack([numbers, seeds]), axis=1, return_inverse=True)
+        scores = {name: columns[f"score.{name}"].to_numpy() for name in self.manifest.scores}
+        return Losses(scores, columns["loss"].to_numpy(), episodes.reshape(-1))
+
+    def certified(self, source: str, score: str, epsilon: float, delta: float) -> Certified:
+        """The lowest level of `score` from which on drafts of `source` may be executed unverified.
+
+        Raises:
+            CheckpointError: source or score was not recorded.
+        """
+        key = source, score, epsilon, delta
+        if key not in self._certified:
+            found = self.losses(source)
+            if score not in found.scores:
+                raise CheckpointError(
+                    f"score {score} was not recorded, only {', '.join(found.scores)}: {AGAIN} scores=[…,{score}]"
+                )
+            known = np.isfinite(found.scores[score])
+            values = np.where(known, found.scores[score], -math.inf)
+            self._certified[key] = certify(values, found.losses, found.episodes, epsilon, delta)
+        return self._certified[key]
+
+    def check_size(self, source: str, epsilon: float, delta: float) -> None:
+        """Refuses a recording of too few episodes to certify anything.
+
+        Raises:
+            CheckpointError: it is.
+        """
+        episodes, needed = len(np.unique(self.losses(source).episodes)), episodes_needed(epsilon, delta)
+        if episodes < needed:
+            raise CheckpointError(
+                f"{episodes} recorded episodes cannot certify a risk of {epsilon:g} at δ = {delta:g}: {needed} are "
+                f"needed, without any loss: {AGAIN} with more episodes"
+            )
+
+
+Draw = Callable[[RiskRecording, Path], object]
+"""Draws pictures of a recording into a folder."""
+
+
+def save_risk(
+    folder: Path,
+    manifest: RiskManifest,
+    rows: Sequence[Mapping[str, Any]],
+    features: np.ndarray | None = None,
+    draw: Draw | None = None,
+) -> RiskRecording:
+    """Writes manifest, decodes and pictures atomically, in place of all that the folder held -> the recording.
+    features: (n, F) float16, pooled prompts of the first source's decodes."""
+    schema = pa.schema([*ROW, ("loss", pa.float64()), *((f"score.{name}", pa.float64()) for name in manifest.scores)])
+    table = pa.Table.from_pylist(list(rows), schema=schema)
+    recording = RiskRecording(manifest, table)
+
+    def fill(temporary: Path) -> None:
+        pq.write_table(table, temporary / DECODES, compression="zstd")
+        if features is not None:
+            np.save(temporary / FEATURES, features)
+        files = {path.name: sha256_of(path) for path in sorted(temporary.iterdir())}
+        write_json(temporary / "risk.json", asdict(replace(manifest, files=files)))
+        if draw is not None:
+            draw(recording, temporary)
+
+    write_folder(folder, fill, replace=True)
+    return recording
+
+
+def read_risk(folder: Path, request: Request) -> RiskManifest:
+    """The manifest in `folder`, which must have been recorded for this target.
+
+    Raises:
+        CheckpointError: none there, damaged, or another target's.
+    """
+    path = folder / "risk.json"
+    if not path.is_file():
+        raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
+    manifest = _read(folder)
+    check_files(folder, manifest.files, AGAIN)
+    own = request.description
+    manifest.target.check_same(MadeFor(own.sha256, own.actions, own.chunk), f"the risk in {folder}", "recorded", AGAIN)
+    return manifest
+
+
+def _read(folder: Path) -> RiskManifest:
+    return read_file(RiskManifest, folder / "risk.json", f"a recording of format {FORMAT}: {AGAIN}")
+
+
+def _sources(folder: Path) -> MadeFrom:
+    return MadeFrom(f"the risk in {folder}", "recorded", AGAIN, _read(folder).artifacts)
+
+
+def _check(folder: Path, request: Request) -> str:
+    read_risk(folder, request)
+    return sha256_of(folder / "risk.json")
+
+
+def _load(folder: Path, request: Request) -> RiskRecording:
+    return RiskRecording(read_risk(folder, request), pq.read_table(folder / DECODES))
+
+
+ARTIFACT = Artifact("risk", artifact_folder("risk"), _check, _load, _sources)

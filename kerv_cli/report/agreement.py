@@ -1,0 +1,78 @@
+"""How far two independent runs of a study agree: the speedup of every setting in both (docs/methods.md §7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+from rich import box
+from rich.table import Table
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.report.measures import MICRO
+from kerv_cli.report.summary import number
+from kerv_cli.report.tables import is_number, rows_of, values_of
+
+CLOSE = 0.03
+"""Two runs agree on a ratio where it differs by at most this share."""
+
+_KEPT = ("successes", "pairs", "speedup", "speedup_low", "speedup_high", "time_per_step_ms", "gauge_ms")
+_FROM = ("device_name", "run", "git_commit")
+
+
+def agreement_table(own: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """One row per averaging and setting that both `study_table`s have: the measures of both, with the suffix `_again`
+    for the other run's; ratio: other speedup over own; close: it differs by at most `CLOSE`; overlap: of the intervals.
+
+    Raises:
+        UsageError: they have no setting in common, or another baseline, or are one run.
+    """
+    if set(own["baseline"]) != set(other["baseline"]):
+        raise UsageError(f"two runs with the baselines {own['baseline'].iloc[0]} and {other['baseline'].iloc[0]}")
+    if values_of(own, "run") & values_of(other, "run"):
+        raise UsageError(f"both hold episodes of run {own['run'].iloc[0]}: compare with another run's results folder")
+    keys = ["averaging", "label", "baseline"]
+    columns = [*keys, *_KEPT, *_FROM]
+    both = own[columns].merge(other[columns], on=keys, suffixes=("", "_again"))
+    both = both[both["label"] != both["baseline"]].drop(columns="baseline").reset_index(drop=True)
+    if both.empty:
+        raise UsageError("the two runs have no setting in common")
+    ratio = both["speedup_again"] / both["speedup"]
+    overlap = (both["speedup_low"] <= both["speedup_high_again"]) & (both["speedup_low_again"] <= both["speedup_high"])
+    both.insert(2, "ratio", ratio)
+    both.insert(3, "close", (ratio - 1).abs() <= CLOSE)
+    both.insert(4, "overlap", overlap)
+    return both
+
+
+def agreement_summary(table: pd.DataFrame, averaging: str = MICRO) -> Table:
+    """The rows of one averaging, for the terminal."""
+    rows = table[table["averaging"] == averaging]
+    close, count = int(rows["close"].sum()), len(rows)
+    caption = (
+        f"{close} of {count} ratios agree within {100 * CLOSE:.0f} %, {int(rows['overlap'].sum())} intervals overlap"
+    )
+    printed = Table(
+        title="two runs", caption=caption, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD
+    )
+    printed.add_column("setting")
+    for name in ("speedup", "again", "difference", "success", "again"):
+        printed.add_column(name, justify="right")
+    for row in rows_of(rows):
+        again = {name: row[f"{name}_again"] for name in _KEPT}
+        printed.add_row(
+            str(row["label"]),
+            _speedup(row),
+            _speedup(again),
+            f"{100 * (row['ratio'] - 1):+.1f} %" if is_number(row["ratio"]) else "–",
+            f"{row['successes']}/{row['pairs']}",
+            f"{again['successes']}/{again['pairs']}",
+        )
+    return printed
+
+
+def _speedup(row: Mapping[str, Any]) -> str:
+    if not is_number(row["speedup"]):
+        return "–"
+    return f"{number(row['speedup'])} ({number(row['speedup_low'])}–{number(row['speedup_high'])})"

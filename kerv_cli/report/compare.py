@@ -1,0 +1,192 @@
+"""Two runs side by side: which settings differ, and by how much their results do."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
+from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
+from kerv_cli.lab.plan import Cell
+from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
+
+_MEASURES = ("AL", "forwards_per_step", "time_per_step_ms", "skip_rate", "unverified_share")
+_OF_STATUS = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a comparison: a run, and one of its settings unless it is a training."""
+
+    name: str
+    run: RunEntry
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Something that the two sides do not share. `None`: that side does not have it."""
+
+    key: str
+    first: Any
+    second: Any
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """first, second: names. settings: what differs between them. results: measure -> value of the first, value of the
+    second, difference or ratio, and its 95 % interval where there is one."""
+
+    first: str
+    second: str
+    settings: list[Difference]
+    results: list[dict[str, Any]]
+
+
+def sides(results: str, name: str) -> list[Side]:
+    """`ID` as every setting of a run, `ID:LABEL` as one of them.
+
+    Raises:
+        UsageError, UnknownName: no such run or setting.
+    """
+    identifier, _, label = name.partition(":")
+    run = find_run(results, identifier)
+    if not run.has_episodes:
+        if label:
+            raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
+        return [Side(run.id, run)]
+    labels = store_of(run).read_plan().labels
+    if label and label not in labels:
+        raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
+    many = len(labels) > 1
+    return [Side(f"{run.id}:{own}" if many else run.id, run, own) for own in labels if label in ("", own)]
+
+
+def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, Side]]:
+    """Settings that both runs have, setting by setting; else the first's only or first one with each of the second's.
+
+    Raises:
+        UsageError: as `sides`, or a training beside episodes.
+    """
+    ours, theirs = sides(results, first), sides(results, second)
+    if ours[0].run.has_episodes != theirs[0].run.has_episodes:
+        raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: one of them has no episodes")
+    shared = [(a, b) for a in ours for b in theirs if a.label == b.label]
+    if len(shared) > 1 or (shared and len(ours) == len(theirs) == 1):
+        return shared
+    return [(ours[0], side) for side in theirs if side != ours[0]]
+
+
+def compare(first: Side, second: Side) -> Comparison:
+    """The differences between two sides.
+
+    Raises:
+        UsageError: a run without complete cells. CheckpointError: a damaged one.
+    """
+    if not first.run.has_episodes:
+        rows = _trained_results(first.run, second.run)
+    else:
+        rows = _measured(load_study(store_of(first.run)), first.label, load_study(store_of(second.run)), second.label)
+    return Comparison(first.name, second.name, differences(first, second), rows)
+
+
+def differences(first: Side, second: Side) -> list[Difference]:
+    """Settings, weights, machine and versions in which two sides differ."""
+    ours, theirs = _described(first), _described(second)
+    keys = dict.fromkeys([*ours, *theirs])
+    return [Difference(k, ours.get(k), theirs.get(k)) for k in keys if ours.get(k) != theirs.get(k)]
+
+
+def _described(side: Side) -> dict[str, Any]:
+    if not side.run.has_episodes:
+        made = description_of(side.run)
+        described: dict[str, Any] = dict(made.get("settings", {}))
+        described.update((key, made[key]) for key in ("git_commit", "versions", "demos") if key in made)
+        return flatten(described)
+    store = store_of(side.run)
+    cells = [cell for cell in store.read_plan().cells if cell.label == side.label]
+    cell = cells[0]
+    settings = flatten(without(cell.settings, NOT_DETERMINING - {"policy", "method"}))
+    weights = {name: value[:12] for name, value in cell.identity.items() if name != OBSERVATION}
+    return {**settings, **weights, **_tasks_and_seeds(cells), **_circumstances(side, cells)}
+
+
+def _tasks_and_seeds(cells: list[Cell]) -> dict[str, Any]:
+    from kerv_cli.lab.plan import seeds_text
+
+    tasks = ";".join(sorted({cell.task for cell in cells}))
+    return {"tasks": tasks, "seeds": seeds_text(seed for cell in cells for seed in cell.seeds)}
+
+
+def _circumstances(side: Side, cells: list[Cell]) -> dict[str, Any]:
+    store = store_of(side.run)
+    found, _ = store.read_cells(cells)
+    statuses = [stored.status for stored in found.values()]
+    return {key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _OF_STATUS}
+
+
+def _measured(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[dict[str, Any]]:
+    baseline = first.episodes[first.episodes["label"] == ours]
+    episodes = second.episodes[second.episodes["label"] == theirs]
+    if baseline.empty or episodes.empty:
+        raise UsageError("one of the two settings has no complete cell: run it to the end first")
+    a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO, apart=True)
+    rows = [
+        _row("success", a["success"], b["success"], b, "difference", "difference"),
+        _row("speedup", 1.0, b["speedup"], b, "speedup", "ratio of times per step"),
+    ]
+    rows += [
+        {"measure": name, "first": a[name], "second": b[name], "change": b[name] - a[name]}
+        for name in _MEASURES
+        if is_number(a[name]) and is_number(b[name]) and (a[name] or b[name])
+    ]
+    rows.append({"measure": "pairs", "first": len(baseline), "second": len(episodes), "change": b["pairs"]})
+    return rows
+
+
+def _row(name: str, first: float, second: float, measured: dict[str, Any], column: str, what: str) -> dict[str, Any]:
+    low, high = measured[f"{column}_low"], measured[f"{column}_high"]
+    return {"measure": name, "first": first, "second": second, "change": measured[column], "low": low, "high": high,
+            "what": what}  # fmt: skip
+
+
+def _trained_results(first: RunEntry, second: RunEntry) -> list[dict[str, Any]]:
+    names = [name for name in first.figures if name in second.figures]
+    return [
+        {"measure": name, "first": first.figures[name], "second": second.figures[name],
+         "change": second.figures[name] - first.figures[name]}
+        for name in names
+    ]  # fmt: skip
+
+
+def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
+    """(episodes with equal tokens, episodes) of the settings, tasks and seeds that both runs have.
+
+    Raises:
+        CheckpointError: a cell is damaged. UsageError: no complete cell.
+    """
+    ours, theirs = _tokens(first), _tokens(second)
+    shared = ours.keys() & theirs.keys()
+    return sum(ours[key] == theirs[key] for key in shared), len(shared)
+
+
+def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
+    store = store_of(run)
+    cells = store.read_plan().cells
+    found, _ = store.read_cells(cells)
+    tokens: dict[tuple[str, str, int, int], list[list[int]]] = {}
+    for cell in (cell for cell in cells if cell.id in found):
+        decodes = pd.read_parquet(store.cells / cell.id / "decodes.parquet", columns=["seed", "tokens"])
+        for seed, group in decodes.groupby("seed"):
+            tokens[cell.label, cell.task, int(str(seed)), cell.repeat] = [list(row) for row in group["tokens"]]
+    return tokens
+
+
+def as_plain(comparison: Comparison) -> dict[str, Any]:
+    """A comparison for JSON."""
+    return dataclasses.asdict(comparison)

@@ -1,0 +1,136 @@
+"""Runs for other trackers: trackio, Weights & Biases (offline) and MLflow, each an optional package; or CSV."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.lab.catalogue import TRAINED, RunEntry, description_of, store_of
+from kerv_cli.report.curves import read_log
+from kerv_cli.report.measures import MICRO
+from kerv_cli.report.tables import flatten, load_study, rows_of, study_table, write_csv
+
+PROJECT = "kerv"
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What a tracker shows as one run. config: settings. history: (step, numbers): an episode of a sweep or rollout, a
+    validation of a training. summary: numbers of the whole."""
+
+    name: str
+    group: str
+    config: dict[str, Any]
+    history: list[tuple[int, dict[str, float]]]
+    summary: dict[str, float] = field(default_factory=dict)
+
+
+def export(run: RunEntry, to: str, folder: Path) -> list[str]:
+    """Hands a run to a tracker, or writes it as CSV -> names of what was written. folder: where the tracker stores it.
+
+    Raises:
+        UnknownName: no such tracker. UsageError: its package is not installed; the message says how to.
+    """
+    if to not in TRACKERS:
+        raise UnknownName("tracker", to, TRACKERS)
+    package, extra, write = TRACKERS[to]
+    if package and importlib.util.find_spec(package) is None:
+        raise UsageError(f"--to {to} needs the package {package}: pip install 'kerv[{extra}]'")
+    folder.mkdir(parents=True, exist_ok=True)
+    return [write(tracked, folder) for tracked in tracked_runs(run)]
+
+
+def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
+    """One per setting for a sweep or a rollout, one for any other run."""
+    if not run.has_episodes:
+        yield _training(run)
+        return
+    data = load_study(store_of(run))
+    for row in rows_of(study_table(data), MICRO):
+        own = data.episodes[data.episodes["label"] == row["label"]]
+        history = []
+        for number, episode in enumerate(rows_of(own)):
+            values = {name: float(episode[name]) for name in ("success", "steps", "forwards", "decodes", "seconds")}
+            values["ms_per_step"] = 1000 * values["seconds"] / values["steps"]
+            history.append((number, values))
+        cell = next(cell for cell in data.plan.cells if cell.label == row["label"])
+        config = {"kind": run.kind, "run": run.id, **flatten(cell.settings), **cell.identity}
+        numbers = {name: float(value) for name, value in row.items() if _is_measure(value)}
+        yield Tracked(f"{run.id} {row['label']}", run.id, config, history, numbers)
+
+
+def _training(run: RunEntry) -> Tracked:
+    log = read_log(run.folder) if run.kind in TRAINED else pd.DataFrame()
+    history = [
+        (int(row["step"]), {name: float(value) for name, value in row.items() if name != "step" and _is_measure(value)})
+        for row in rows_of(log)
+    ]
+    settings = description_of(run).get("settings", {})
+    return Tracked(run.id, run.kind, {"kind": run.kind, **flatten(settings)}, history, dict(run.figures))
+
+
+def _is_measure(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _to_csv(tracked: Tracked, folder: Path) -> str:
+    rows = [{"step": step, **numbers} for step, numbers in tracked.history]
+    return str(write_csv(pd.DataFrame(rows), folder / f"{tracked.name.replace('/', '-').replace(' ', '_')}.csv"))
+
+
+def _to_trackio(tracked: Tracked, folder: Path) -> str:
+    import os
+
+    os.environ.setdefault("TRACKIO_DIR", str(folder))  # read when trackio is imported
+    import trackio
+
+    trackio.init(project=PROJECT, name=tracked.name, config=tracked.config, embed=False)
+    for step, numbers in tracked.history:
+        trackio.log(numbers, step=step)
+    if tracked.summary:
+        trackio.log({f"summary/{name}": value for name, value in tracked.summary.items()})
+    trackio.finish()
+    return tracked.name
+
+
+def _to_wandb(tracked: Tracked, folder: Path) -> str:
+    import wandb
+
+    run = wandb.init(
+        project=PROJECT, name=tracked.name, group=tracked.group, config=tracked.config, mode="offline", dir=str(folder)
+    )
+    for step, numbers in tracked.history:
+        run.log(numbers, step=step)
+    run.summary.update(tracked.summary)
+    run.finish()
+    return tracked.name
+
+
+def _to_mlflow(tracked: Tracked, folder: Path) -> str:
+    import mlflow
+
+    mlflow.set_tracking_uri((folder / "mlruns").resolve().as_uri())
+    mlflow.set_experiment(PROJECT)
+    with mlflow.start_run(run_name=tracked.name, tags={"group": tracked.group}):
+        mlflow.log_params({name: str(value)[:500] for name, value in tracked.config.items()})
+        for step, numbers in tracked.history:
+            mlflow.log_metrics(numbers, step=step)
+        mlflow.log_metrics({f"summary.{name}": value for name, value in tracked.summary.items()})
+    return tracked.name
+
+
+Write = Callable[[Tracked, Path], str]
+TRACKERS: dict[str, tuple[str, str, Write]] = {
+    "csv": ("", "", _to_csv),
+    "trackio": ("trackio", "trackio", _to_trackio),
+    "wandb": ("wandb", "wandb", _to_wandb),
+    "mlflow": ("mlflow", "mlflow", _to_mlflow),
+}
+"""Name -> package that it needs, the extra that brings it, and what hands a run over."""

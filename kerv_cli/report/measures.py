@@ -1,0 +1,201 @@
+"""The measures of docs/methods.md §7, from rows of episodes.parquet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from kerv_cli.engine.record import PHASES
+from kerv_cli.report import statistics as stats
+from kerv_cli.report.statistics import Estimate
+
+MICRO = "micro over tasks"
+MACRO = "macro over difficulty groups"
+MARGIN = 0.03  # of success: a method is non-inferior where the difference's lower bound lies above -MARGIN
+
+COMPARABLE = ("device", "device_name", "dtype", "threads")  # columns that must be equal for times to be comparable
+_SAME = (*COMPARABLE, "initial_state")  # columns that must be equal in the two episodes of a pair
+
+_RATIOS = {
+    "AL": ("committed", "verifications"),
+    "accepted_per_round": ("accepted", "verifications"),
+    "AFEP": ("first_rejected_sum", "first_rejected_count"),
+    "forwards_per_step": ("forwards", "steps"),
+    "skip_rate": ("skipped_decodes", "decodes"),
+    "unverified_share": ("unverified_tokens", "executed_tokens"),
+    "compensation_rate": ("compensated_decodes", "decodes"),
+    "retrieval_share": ("retrieval_decodes", "decodes"),
+    "deviation": ("deviation_sum", "deviation_count"),
+    "realised_risk": ("audit_loss", "audits"),
+    "audits_to_alarm": ("alarm_audits", "alarmed"),
+    "felt_latency": ("delay_seconds", "delay_decodes"),
+    "felt_latency_steps": ("delay_steps", "delay_decodes"),
+    "held_share": ("held_steps", "steps"),
+}
+"""Quotients of sums over episodes; NaN where the denominator is 0."""
+
+
+def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apart: bool = False) -> dict[str, Any]:
+    """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
+
+    success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
+    (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs, where no
+    target decodes and where an episode of either side was not timed. They are of the pairs whose sides took turns in
+    one block; with apart=True of all pairs. mcnemar_p is NaN without pairs. same_run: all pairs were measured in one
+    run. same_block: share of the pairs that were measured in one block.
+
+    MACRO takes each measure within every difficulty group and then the unweighted mean of the groups; the speedup is
+    the ratio of the two macro means. Paired counts and p are those of all pairs in either case.
+
+    Args:
+        episodes: the setting's, columns of rows.EPISODE_SCHEMA, decode_seconds, difficulty, run and those of `_SAME`.
+        baseline: the baseline's, same columns; only pairs of equal task, seed, repeat, world and device are compared.
+    """
+    pairs = paired(episodes, baseline)
+    macro = averaging == MACRO
+    worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
+    counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
+    once = episodes[episodes["repeat"] == 0]
+    clocked = pairs if apart else pairs[pairs["in_turn"]]
+    timed = _decodes(episodes) and is_timed(clocked, "time_method") and is_timed(clocked, "time_baseline")
+    return {
+        "successes": int(once["success"].sum()),
+        **_columns("success", _success(once, macro)),
+        **_columns("speedup", _speedup(clocked, "time", macro) if timed else stats.NO_ESTIMATE),
+        **_columns("episode_speedup", _speedup(clocked, "seconds", macro) if timed else stats.NO_ESTIMATE),
+        **(_by_group(episodes, _means) if macro else _means(episodes)),
+        **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
+        **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
+        **paired_columns(counts),
+        "pairs_to_settle": stats.pairs_to_settle(counts, MARGIN),
+        "same_run": bool(len(pairs) and pairs["same_run"].all()),
+        "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
+        "steps": int(episodes["steps"].sum()),
+        "decodes": int(episodes["decodes"].sum()),
+        "deviation_samples": int(episodes["deviation_count"].sum()),
+    }
+
+
+def _acceptance_interval(episodes: pd.DataFrame, macro: bool) -> stats.Interval:
+    """Of AL; in the macro average from the groups' errors, which are independent."""
+    groups = [group for _, group in episodes.groupby("difficulty", sort=True)] if macro else [episodes]
+    known = [group for group in groups if group["verifications"].sum()]
+    found = [stats.ratio(group["committed"].to_numpy(), group["verifications"].to_numpy()) for group in known]
+    if not found:
+        return stats.Interval(math.nan, math.nan)
+    mean = sum(ratio.value for ratio in found) / len(found)
+    reach = math.sqrt(sum((ratio.high - ratio.value) ** 2 for ratio in found)) / len(found)
+    return stats.Interval(mean - reach, mean + reach)
+
+
+def _risk_interval(episodes: pd.DataFrame) -> stats.Interval:
+    """Of the realised risk, pooled over all audits; 0 to 1 where a single episode holds them all."""
+    if not episodes["audits"].sum():
+        return stats.Interval(math.nan, math.nan)
+    found = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
+    if math.isnan(found.low):
+        return stats.Interval(0.0, 1.0)
+    return stats.Interval(max(0.0, found.low), min(1.0, found.high))
+
+
+def paired_columns(counts: stats.PairedCounts) -> dict[str, Any]:
+    """What paired episodes say about success: their number and counts, McNemar's p (NaN without pairs), the difference
+    with its interval, and whether it is above minus the margin."""
+    difference = stats.paired_difference(counts)
+    return {
+        "pairs": sum(counts),
+        **counts._asdict(),
+        "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
+        **_columns("difference", difference),
+        "margin": MARGIN,
+        "non_inferior": bool(difference.low > -MARGIN),
+    }
+
+
+def _columns(name: str, estimate: Estimate) -> dict[str, float]:
+    return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
+
+
+def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
+    """Pairs of equal task, seed, repeat, initial state and device, sorted by task, seed and repeat.
+
+    Columns: task, difficulty, seed, repeat; with the suffixes _baseline and _method: time (seconds per step), seconds
+    (of the episode), success, block; same_run, same_block; in_turn: same_block, and where the oldest episodes name no
+    block the same run.
+    """
+    keys = ["task", "seed", "repeat"]
+    columns = [*keys, "difficulty", "run", "block", "success", "seconds", *_SAME]
+    method = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
+    other = baseline[columns].assign(time=baseline["seconds"] / baseline["steps"])
+    both = method.merge(other, on=keys, suffixes=("_method", "_baseline"))
+    agree = pd.Series(True, index=both.index)
+    for name in _SAME:
+        agree &= both[f"{name}_method"] == both[f"{name}_baseline"]
+    both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
+    both["same_run"] = both["run_method"] == both["run_baseline"]
+    both["same_block"] = (both["block_method"] == both["block_baseline"]) & (both["block_method"] != "")
+    unnamed = (both["block_method"] == "") & (both["block_baseline"] == "")
+    both["in_turn"] = both["same_block"] | (unnamed & both["same_run"])
+    return both.rename(columns={"difficulty_method": "difficulty"})
+
+
+def _decodes(episodes: pd.DataFrame) -> bool:
+    """Whether a target decodes at all; a scripted expert has no decoding time to compare."""
+    return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
+
+
+def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
+    """Whether all episodes have times; those of a batch have none (docs/measuring.md)."""
+    return bool(episodes[column].notna().all())
+
+
+def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
+    blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
+    return stats.speedup(
+        pairs[f"{time}_baseline"].to_numpy(),
+        pairs[f"{time}_method"].to_numpy(),
+        list(pairs["task"]),
+        list(pairs["difficulty"]) if macro else None,
+        list(blocks),
+    )
+
+
+def _means(episodes: pd.DataFrame) -> dict[str, float]:
+    per_step = 1000.0 / episodes["steps"]
+    values = {
+        "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
+        "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
+        **_latencies(episodes["decode_seconds"]),
+        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].any() else math.nan,
+        "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
+    }
+    values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
+    sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
+    values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
+    values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
+    return values
+
+
+def _latencies(decode_seconds: pd.Series) -> dict[str, float]:
+    """Milliseconds from an observation to its actions, over all decodes of all episodes."""
+    times = 1000.0 * np.concatenate(list(decode_seconds))
+    middle, late, worst = np.quantile(times, [0.5, 0.95, 1.0])
+    return {"latency_p50_ms": float(middle), "latency_p95_ms": float(late), "latency_worst_ms": float(worst)}
+
+
+def _by_group(episodes: pd.DataFrame, measure_of: Callable[[pd.DataFrame], dict[str, float]]) -> dict[str, float]:
+    """Unweighted means over difficulty groups; groups without a value of a measure are left out of its mean."""
+    groups = pd.DataFrame([measure_of(group) for _, group in episodes.groupby("difficulty", sort=True)])
+    return {str(name): float(value) for name, value in groups.mean().items()}
+
+
+def _success(episodes: pd.DataFrame, macro: bool) -> Estimate:
+    grouped = [group["success"] for _, group in episodes.groupby("difficulty", sort=True)] if macro else []
+    parts: Sequence[pd.Series] = grouped or [episodes["success"]]
+    counted = [(int(part.sum()), len(part)) for part in parts]
+    rate = sum(successes / episodes_ for successes, episodes_ in counted) / len(counted)
+    return Estimate(rate, *(stats.macro_wilson(counted) if macro else stats.wilson(*counted[0])))

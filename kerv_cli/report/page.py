@@ -1,0 +1,196 @@
+"""A study's HTML page: one file, no script, nothing loaded from elsewhere but the recordings and tables beside it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report import stressed
+from kerv_cli.report.choose import choices, sentence
+from kerv_cli.report.decided import read_verdicts
+from kerv_cli.report.measures import MACRO, MICRO
+from kerv_cli.report.summary import summary_frame
+from kerv_cli.report.tables import StudyData, is_number, rows_of
+
+LOSS = 3.0
+"""Points of success that the verdict at the top of the page allows."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """An extra section of the page: prediction errors, latency, stress."""
+
+    title: str
+    note: str
+    figure: str  # an HTML element
+    table: pd.DataFrame | None = None  # of text
+
+
+@dataclass(frozen=True)
+class Link:
+    """A file beside the page. href: relative to it."""
+
+    text: str
+    href: str
+
+
+def render(
+    store: StudyStore,
+    data: StudyData,
+    whole: pd.DataFrame,
+    per_task: pd.DataFrame,
+    figures: Sequence[str],
+    sections: Sequence[Section],
+    files: Sequence[Path],
+) -> str:
+    """The page.
+
+    Args:
+        whole, per_task: as `study_table` and `per_task_table`.
+        figures: HTML elements.
+        files: the tables and plots that were written, to be linked.
+    """
+    template = Environment(
+        loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
+    ).get_template("report.html.j2")
+    stopped = read_verdicts(store.root)
+    return template.render(
+        name=store.name,
+        title=data.plan.title or store.name,
+        verdict=verdict(data, whole, per_task),
+        caution=caution(whole),
+        note=data.plan.note,
+        about=_about(whole),
+        baseline=data.plan.baseline,
+        absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
+        planned=len({cell.id for cell in data.plan.cells}),
+        how_to_run=_how_to_run(store),
+        suite=_suite(whole),
+        stopped=[] if stopped is None else rows_of(stopped),
+        figures=figures,
+        sections=sections,
+        tasks=_by_task(per_task),
+        recordings=_recordings(store),
+        files=[Link(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
+        commands=_commands(data),
+    )
+
+
+def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str:
+    """The study's answer in one sentence."""
+    if stressed.is_stressed(whole):
+        return stressed.verdict(whole)
+    if not any(row["pairs"] and row["label"] != row["baseline"] for row in rows_of(whole, MICRO)):
+        rows = rows_of(whole, MICRO)
+        told = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
+        return f"Success: {told}."
+    found = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
+    text = sentence(found, data.plan.axis, LOSS, data.plan.baseline)
+    return text[:1].upper() + text[1:] + "."
+
+
+def caution(whole: pd.DataFrame) -> str:
+    """What a reader must know before the numbers; empty where there is nothing."""
+    rows = rows_of(whole, MICRO)
+    privileged = sorted({str(row["target"]) for row in rows if "privileged" in str(row["observation"])})
+    told = []
+    if privileged:
+        told.append(f"{', '.join(privileged)}: privileged, it is given object and goal positions")
+    unverified = [
+        str(row["label"]) for row in rows if is_number(row["unverified_share"]) and row["unverified_share"] == 1
+    ]
+    if unverified:
+        told.append(f"{', '.join(unverified)}: nothing is verified")
+    return "; ".join(told)
+
+
+def policies(whole: pd.DataFrame) -> str:
+    """Names of the targets that a table compares."""
+    return ", ".join(dict.fromkeys(str(name) for name in whole["target"]))
+
+
+def _about(whole: pd.DataFrame) -> str:
+    first = whole.iloc[0]
+    return ", ".join(
+        [
+            f"policy {policies(whole)}",
+            f"{whole['tasks'].max()} tasks",
+            f"{whole['episodes'].max()} episodes per setting",
+            str(first["device_name"]),
+            f"{first['dtype']}, {first['threads']} threads, {first['workers']} processes",
+            f"torch {first['torch_version']}",
+            f"kerv {first['kerv_version']} at {str(first['git_commit'])[:12]}",
+        ]
+    )
+
+
+def _suite(whole: pd.DataFrame) -> pd.DataFrame:
+    """The table of all settings, pooled over tasks, with the two numbers that the average over difficulty changes."""
+    frame = summary_frame(whole, MICRO)
+    macro = {row["label"]: row for row in rows_of(whole, MACRO)}
+    if not macro or whole["difficulty"].astype(str).str.count(";").max() == 0:
+        return frame
+    success = [f"{100 * macro[label]['success']:.1f}" for label in frame["setting"]]
+    speed = [_number(macro[label]["speedup"]) for label in frame["setting"]]
+    frame.insert(len(frame.columns), "success %, by difficulty", success)
+    frame.insert(len(frame.columns), "speedup, by difficulty", speed)
+    return frame
+
+
+def _how_to_run(store: StudyStore) -> str:
+    """The command that completes the study, wherever its results lie."""
+    results = str(store.root.parent.parent)
+    where = "" if results == "results" else f" results={shlex.quote(results)}"
+    return f"Run `kerv sweep study={store.name}{where}`"
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if is_number(value) else "–"
+
+
+def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
+    """A row per task, a column per setting: successes and the speedup. Stress makes many settings: with it the other
+    way round."""
+    labels = list(dict.fromkeys(per_task["label"]))
+    if stressed.is_stressed(per_task):
+        found = {(row["label"], row["task"]): row for row in rows_of(per_task)}
+        tasks = sorted(set(per_task["task"]))
+        return pd.DataFrame(
+            {"setting": label, **{task: _cell(found.get((label, task))) for task in tasks}} for label in labels
+        )
+    rows = []
+    for task in sorted(set(per_task["task"])):
+        own = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}
+        rows.append({"task": task, **{label: _cell(own.get(label)) for label in labels}})
+    return pd.DataFrame(rows)
+
+
+def _cell(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return "–"
+    share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
+    if row["label"] == row["baseline"] or not is_number(row["speedup"]):
+        return share
+    return f"{share} · {row['speedup']:.2f}×"
+
+
+def _recordings(store: StudyStore) -> list[Link]:
+    return [Link(path.stem, _href(path, store.root)) for path in sorted(store.rollouts.glob("*.rrd"))]
+
+
+def _href(path: Path, page: Path) -> str:
+    return quote(Path(os.path.relpath(path, page)).as_posix())
+
+
+def _commands(data: StudyData) -> list[tuple[str, str]]:
+    """(setting, the overrides that make it)."""
+    return [(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()]

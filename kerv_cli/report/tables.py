@@ -1,0 +1,277 @@
+"""Tables of a study from its stored cells: per task and aggregated, as data frames and CSV files."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from kerv_cli.base.files import atomic_path
+from kerv_cli.base.provenance import PACKAGES
+from kerv_cli.base.settings import MODEL
+from kerv_cli.lab.identity import (
+    NOT_DETERMINING,
+    NOT_DETERMINING_RUNTIME,
+    OBSERVATION,
+    flat,
+    stress_of,
+    without,
+    work_of,
+)
+from kerv_cli.lab.plan import Cell, seeds_text
+from kerv_cli.lab.plan_file import StudyPlan
+from kerv_cli.lab.store import StoredCell, StudyStore
+from kerv_cli.report.ceiling import (
+    NONE,
+    Ceiling,
+    ceiling,
+    chunk_ratio,
+    is_autoregressive,
+    verifies_in_prefill,
+)
+from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, measure
+from kerv_cli.worlds import specs
+
+_PLACE = ("executor", "workers", "device_name", "host")
+_CODE = ("git_commit", "engine", "code", "run")
+_STATUS_COLUMNS = (*_PLACE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
+
+
+_OLDER = {"engine": 1}
+"""What a status that lacks the entry means."""
+
+
+@dataclass(frozen=True)
+class StudyData:
+    """A study's plan and the episodes of its complete cells."""
+
+    plan: StudyPlan
+    cells: dict[str, StoredCell]  # by id
+    episodes: pd.DataFrame  # one row per label and episode
+    absent: list[Cell]  # planned, not complete
+
+    @functools.cached_property
+    def autoregressive(self) -> list[Cell]:
+        """The first cell of every label that decodes autoregressively; the baseline is first if it does."""
+        first = {cell.label: cell for cell in reversed(self.plan.cells) if is_autoregressive(cell.settings)}
+        order = [label for label in self.plan.labels if label in first]
+        return [first[label] for label in sorted(order, key=lambda label: label != self.plan.baseline)]
+
+    @functools.cached_property
+    def references(self) -> dict[str, str]:
+        """Label -> the label that it is compared with: the baseline's setting under its own stress where the study has
+        it, else the baseline."""
+        first = {cell.label: cell for cell in reversed(self.plan.cells)}
+        baseline = first.get(self.plan.baseline)
+        if baseline is None:
+            return dict.fromkeys(first, self.plan.baseline)
+        same = {_stress(cell): label for label, cell in first.items() if _unstressed(cell) == _unstressed(baseline)}
+        same[_stress(baseline)] = self.plan.baseline
+        return {label: same.get(_stress(cell), self.plan.baseline) for label, cell in first.items()}
+
+    @functools.cached_property
+    def complete(self) -> dict[str, list[Cell]]:
+        """Label -> its complete cells, in the plan's order."""
+        found: dict[str, list[Cell]] = {}
+        for cell in self.plan.cells:
+            if cell.id in self.cells:
+                found.setdefault(cell.label, []).append(cell)
+        return found
+
+
+def _stress(cell: Cell) -> tuple[str, int]:
+    stress = stress_of(cell.settings)
+    return stress["kind"], stress["level"]
+
+
+def _unstressed(cell: Cell) -> str:
+    """Hash of what determines a setting, apart from its stress."""
+    plain = {**cell.settings, "world": without(cell.settings["world"], {"stress"})}
+    return work_of(plain, cell.identity)
+
+
+def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyData:
+    """The study's plan and complete cells; with `cells`, a plan of only those cells.
+
+    Raises:
+        UsageError: no such study, or no complete cell.
+        CheckpointError: a cell is damaged.
+    """
+    plan = store.read_plan()
+    if cells is not None:
+        plan = replace(plan, cells=tuple(cells))
+    found, absent = store.read_cells(plan.cells)
+    return StudyData(plan, found, _labelled([cell for cell in plan.cells if cell.id in found], found), absent)
+
+
+def _labelled(cells: Sequence[Cell], found: Mapping[str, StoredCell]) -> pd.DataFrame:
+    """The episodes of the cells in order, and what the tables need to know of each one's cell."""
+    stored = [found[cell.id] for cell in cells]
+    own = [one.of(cell) for one, cell in zip(stored, cells, strict=True)]
+    episodes = pd.concat(own, ignore_index=True)
+    groups = {task: difficulty_of(task) for task in {cell.task for cell in cells}}
+    columns: dict[str, list[Any]] = {
+        "label": [cell.label for cell in cells],
+        "cell": [cell.id for cell in cells],
+        "difficulty": [groups[cell.task] for cell in cells],
+        "run": [one.status["run"] for one in stored],
+        "device": [cell.settings["runtime"]["device"] for cell in cells],
+        "device_name": [one.status["device_name"] for one in stored],
+        "dtype": [cell.settings["runtime"]["dtype"] for cell in cells],
+        "threads": [cell.settings["runtime"]["threads"] for cell in cells],
+    }
+    lengths = [len(part) for part in own]
+    spread = {
+        name: np.repeat(np.array(values, dtype=object if isinstance(values[0], str) else None), lengths)
+        for name, values in columns.items()
+    }
+    states = episodes["initial_state"].map(tuple)  # comparable
+    # strings as Python objects: these frames are cut into hundreds of small ones, which arrow's arrays are slow at
+    texts = {name: episodes[name].astype(object) for name in ("task", "block", "started")}
+    return episodes.assign(initial_state=states, **texts, **spread)
+
+
+def difficulty_of(task: str) -> str:
+    """The task's difficulty group; `other` for a task that no environment has."""
+    return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
+
+
+def per_task_table(data: StudyData) -> pd.DataFrame:
+    """One row per task and label: tasks by name, labels in the plan's order."""
+    by_task = [episodes for _, episodes in data.episodes.groupby("task", sort=True)]
+    return _frame([row for episodes in by_task for row in _rows(data, episodes, "one task")])
+
+
+def study_table(data: StudyData) -> pd.DataFrame:
+    """Two rows per label: micro over tasks and macro over difficulty groups."""
+    return _frame([row for averaging in (MICRO, MACRO) for row in _rows(data, data.episodes, averaging)])
+
+
+Sections = list[dict[str, Any]]
+"""One row of a table as sections of columns; settings with different parts share the columns before each section."""
+
+
+def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
+    """Rows as a table; within each section, columns that only later rows have are appended."""
+    columns = [name for parts in zip(*rows, strict=True) for part in parts for name in part]
+    merged = [{name: value for part in row for name, value in part.items()} for row in rows]
+    return pd.DataFrame(merged, columns=list(dict.fromkeys(columns)))
+
+
+def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
+    """One row per label that has episodes here."""
+    for label in data.plan.labels:
+        own = episodes[episodes["label"] == label]
+        if len(own):
+            baseline = episodes[episodes["label"] == data.references[label]]
+            yield _row(data, label, own, baseline, averaging)
+
+
+def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
+    tasks = sorted(set(episodes["task"]))
+    cells = [cell for cell in data.complete[label] if cell.task in tasks]
+    head = {
+        "study": data.plan.name,
+        "averaging": averaging,
+        "label": label,
+        "method": cells[0].settings["method"],
+        "task": ";".join(tasks),
+        "tasks": len(tasks),
+        "difficulty": _joined(sorted(set(episodes["difficulty"]))),
+        "seeds": seeds_text(episodes["seed"]),
+        "repeats": int(episodes["repeat"].nunique()),
+        "episodes": len(episodes),
+        "baseline": data.references[label],
+    }
+    best = _ceiling(data, cells[0], episodes, averaging)
+    return [head, {**measure(episodes, baseline, averaging), **best.columns()}, *_origin(data, cells)]
+
+
+def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:
+    """The ceiling against autoregressive decoding of the same target on the same device: the baseline if it is that,
+    else the first such label."""
+    if is_autoregressive(cell.settings):
+        return NONE
+    target = cell.identity.get("target")
+    found = [other for other in data.autoregressive if other.identity.get("target") == target]
+    if not found:
+        return NONE
+    reference = data.episodes[data.episodes["label"] == found[0].label]
+    for name in ("task", *COMPARABLE):
+        reference = reference[reference[name].isin(set(episodes[name]))]
+    chunks = chunk_ratio(cell.settings, found[0].settings)
+    return ceiling(episodes, reference, verifies_in_prefill(cell.settings), chunks, averaging == MACRO)
+
+
+def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
+    """Settings, weights and provenance of a row; where its cells differ, the values are joined by semicolons."""
+    settings, policy = cells[0].settings, cells[0].settings["policy"]
+    world, runtime, stress = settings["world"], settings["runtime"], stress_of(settings)
+    statuses = [data.cells[cell.id].status for cell in cells]
+    parts = without(settings, {*NOT_DETERMINING, "world", "runtime"})
+    weights = {
+        "policy.kind": policy.get("kind", MODEL),
+        "target": policy["target"],
+        "drafter": policy.get("drafter"),
+        "early": policy.get("early"),
+        OBSERVATION: cells[0].identity.get(OBSERVATION, ""),
+        **{f"{name}_sha256": value for name, value in sorted(cells[0].identity.items()) if name != OBSERVATION},
+    }
+    surroundings = {
+        "horizon": world["horizon"],
+        "camera": world["camera"]["name"],
+        **flatten({"camera": without(world["camera"], {"name"})}),
+        "stress": stress["kind"],
+        "stress_level": stress["level"],
+        **without(runtime, NOT_DETERMINING_RUNTIME),
+        **{key: _joined(status.get(key, _OLDER.get(key, "")) for status in statuses) for key in _STATUS_COLUMNS},
+        "cell": ";".join(cell.id for cell in cells),
+    }
+    return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; lists joined by semicolons."""
+    return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings, prefix).items()}
+
+
+def _joined(values: Iterable[Any]) -> str:
+    return ";".join(dict.fromkeys(str(value) for value in values))
+
+
+def values_of(table: pd.DataFrame, column: str) -> set[str]:
+    """The values of a column whose rows join several by semicolons."""
+    return {value for text in table[column].astype(str) for value in text.split(";")}
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """CSV with six significant digits; empty where a value does not exist."""
+    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> Path:
+    """Writes `csv_text` atomically.
+
+    Raises:
+        StorageError: the disk refused.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(csv_text(table), encoding="utf-8")
+    return path
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value exists: neither None nor NaN."""
+    return value is not None and not math.isnan(value)
+
+
+def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[dict[str, Any]]:
+    """The table's rows, or those of one averaging, as dicts by column."""
+    rows = table if averaging is None else table[table["averaging"] == averaging]
+    return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]

@@ -1,0 +1,89 @@
+"""Two recordings in one: two methods on one seed, side by side on the same time axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.error_utils import catch_and_log_exceptions
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import atomic_path
+from kerv_cli.report.viewing.blueprint import STEP
+from kerv_cli.report.viewing.viewer import chunks_of, read_back
+
+SIDES = ("left", "right")
+
+
+def save_together(paths: Sequence[Path], folder: Path) -> Path:
+    """Writes one recording that shows two side by side -> its path below `folder`.
+
+    Raises:
+        UsageError: not two recordings, or of different tasks or seeds: their worlds would not be the same.
+        KervError: one is damaged. StorageError: the disk refused.
+    """
+    if len(paths) != len(SIDES):
+        raise UsageError(f"--together shows two recordings, not {len(paths)}: name two .rrd files")
+    found = [read_back(path) for path in paths]
+    for key in ("task", "seed"):
+        first, second = (summary["episode"].get(key) for summary in found)
+        if first != second:
+            raise UsageError(f"--together needs the same {key} on both sides, here {first} and {second}")
+    out = folder / f"{paths[0].stem}+{paths[1].stem}.rrd"
+    with catch_and_log_exceptions(strict=True):
+        content = _encode(paths, found)
+    with atomic_path(out) as temporary:
+        temporary.write_bytes(content)
+    return out
+
+
+def _encode(paths: Sequence[Path], found: Sequence[dict[str, Any]]) -> bytes:
+    recording = rr.RecordingStream("kerv_together")
+    memory = recording.memory_recording()
+    episode = found[0]["episode"]
+    methods = [str(summary["episode"].get("method", side)) for side, summary in zip(SIDES, found, strict=True)]
+    recording.send_recording_name(f"{episode.get('task')} · seed {episode.get('seed')} · {' and '.join(methods)}")
+    for side, path in zip(SIDES, paths, strict=True):
+        moved = [
+            chunk.with_entity_path(f"/{side}{chunk.entity_path}")
+            for chunk in chunks_of(path)
+            if not chunk.entity_path.startswith("/__properties")
+        ]
+        recording.send_chunks(moved)
+    columns = [_column(side, name, summary) for side, name, summary in zip(SIDES, methods, found, strict=True)]
+    recording.send_blueprint(
+        rrb.Blueprint(
+            rrb.Horizontal(*columns),
+            rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            auto_layout=False,
+            auto_views=False,
+        )
+    )
+    return bytes(memory.drain_as_bytes())
+
+
+def _column(side: str, method: str, found: dict[str, Any]) -> rrb.Vertical:
+    """One method: camera and path, what became of the tokens, forwards, time, the present decode."""
+    entities, facts = found["entities"], found["episode"]
+    outcome = "success" if facts.get("success") else "failure"
+    top: list[rrb.View] = [rrb.Spatial3DView(origin=f"/{side}/world", name="End effector")]
+    if "/camera" in entities:
+        title = f"{method}: {outcome}, {facts.get('steps')} steps"
+        top.insert(0, rrb.Spatial2DView(origin=f"/{side}/camera", name=title))
+    axis = rrb.TimeAxis(link="LinkToGlobal")
+    lanes = [f"/{side}/{name}" for name in ("decodes", "mode", "tokens/**")]
+    return rrb.Vertical(
+        rrb.Horizontal(*top),
+        rrb.StateTimelineView(origin="/", contents=lanes, name=f"{method}: decodes, mode, tokens", time_view=axis),
+        *(
+            rrb.TimeSeriesView(origin="/", contents=[f"/{side}/decode/{entity}"], name=f"{method}: {name}", axis_x=axis)
+            for entity, name in (("forwards", "forwards per decode"), ("phases", "ms per decode"))
+        ),
+        rrb.Spatial2DView(origin=f"/{side}/chunk", name=f"{method}: current chunk", background=[13, 16, 17]),
+        row_shares=[3, 4, 1.4, 1.8, 2.2],
+    )

@@ -1,0 +1,216 @@
+"""Finds, checks, reads and opens recordings. Rerun is imported only where a file is read."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.errors import KervError, UsageError
+
+if TYPE_CHECKING:
+    from rerun.chunk import RrdReader
+
+MOST_OPENED = 16
+"""Largest number of recordings that one command opens; more would fill the viewer's memory."""
+_START_SECONDS = 2.0
+_TIMELINES = ("step", "time")
+
+
+def find_recordings(places: Sequence[Path]) -> list[Path]:
+    """The .rrd files among and below `places`, the newest first.
+
+    Raises:
+        UsageError: a place does not exist or is not a recording, or no recording was found.
+    """
+    found: dict[Path, float] = {}
+    for place in (Path(p).expanduser() for p in places):
+        if place.is_dir():
+            found |= {path: path.stat().st_mtime for path in place.rglob("*.rrd") if path.is_file()}
+        elif not place.exists():
+            raise UsageError(f"{place} does not exist: name a recording (.rrd) or a folder of them")
+        elif place.suffix != ".rrd":
+            raise UsageError(f"{place} is not a recording: its name does not end in .rrd")
+        else:
+            found[place] = place.stat().st_mtime
+    if not found:
+        where = ", ".join(str(p) for p in places) or "nowhere"
+        raise UsageError(f"no recordings in {where}: make some with 'kerv rollout method=ar task=reach-v3'")
+    return sorted(found, key=lambda path: (-found[path], path))
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def open_recording(paths: Sequence[Path]) -> str:
+    """Opens recordings in the Rerun viewer without waiting for it; without a display, names the commands that do.
+
+    Args:
+        paths: recordings, the newest first; at most MOST_OPENED are opened.
+
+    Returns:
+        A sentence about what was opened, or the commands to type.
+
+    Raises:
+        UsageError: no paths.
+        KervError: a recording is damaged, or the viewer did not start.
+    """
+    if not paths:
+        raise UsageError("no recording to open")
+    chosen = list(paths)[:MOST_OPENED]
+    for path in chosen:
+        _checked(path)
+    more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
+    if not has_display():
+        return _instructions(chosen, more)
+    _start([*viewer_command(), "--bind", "127.0.0.1", *map(str, chosen)])
+    names = chosen[0].name if len(chosen) == 1 else f"{len(chosen)} recordings"
+    return f"opened {names}{more} in the Rerun viewer"
+
+
+def viewer_command() -> list[str]:
+    """The command of the viewer, preferably the one installed beside this Python."""
+    beside = Path(sys.executable).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
+    if beside.is_file():
+        return [str(beside)]
+    found = shutil.which("rerun")
+    return [found] if found else [sys.executable, "-m", "rerun"]
+
+
+def _instructions(paths: Sequence[Path], more: str) -> str:
+    files = " ".join(shlex.quote(str(p)) for p in paths)
+    rerun = shlex.join(viewer_command())
+    return "\n".join(
+        [
+            f"no display here{more}: copy the files to a machine that has one (pip install 'rerun-sdk==0.41.*'):",
+            f"  rerun {' '.join(shlex.quote(p.name) for p in paths)}",
+            "or serve them to a browser on this machine",
+            f"  {rerun} --serve-web --bind 127.0.0.1 {files}",
+            "and open (over ssh: after 'ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 HOST')",
+            "  http://127.0.0.1:9090?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A9876%2Fproxy",
+        ]
+    )
+
+
+def _start(command: list[str]) -> None:
+    """Starts the viewer as a process of its own. KervError: it exited at once, with its last line."""
+    with tempfile.TemporaryFile() as log:
+        try:
+            viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
+        except OSError as error:
+            raise KervError(f"cannot start the Rerun viewer {command[0]}: {error.strerror}") from error
+        try:
+            status = viewer.wait(timeout=_START_SECONDS)
+        except subprocess.TimeoutExpired:
+            viewer.returncode = 0  # it outlives this process: Popen must not warn of it
+            return
+        if status:
+            log.seek(0)
+            lines = log.read().decode(errors="replace").strip().splitlines() or [f"exit status {status}"]
+            raise KervError(f"the Rerun viewer ended at once: {lines[-1]}")
+
+
+def read_back(path: Path) -> dict[str, Any]:
+    """The contents of a recording, read chunk by chunk.
+
+    Returns:
+        `application`, `recording` (ids), `name`, `bytes`, `blueprint` (whether it carries a layout), `episode` (the
+        properties that save_episode wrote), `entities` (path -> rows that are not static), `timelines` (name ->
+        (first, last): control steps, nanoseconds).
+
+    Raises:
+        KervError: the file is missing or damaged.
+    """
+    path = Path(path)
+    reader = _checked(path)
+    entry = reader.recordings()[0]
+    name, episode = "", {}
+    entities: dict[str, int] = {}
+    timelines: dict[str, tuple[int, int]] = {}
+    for chunk in _chunks(reader, path):
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/__properties/episode":
+            episode = {f.name: batch[f.name][0].as_py()[0] for f in batch.schema if not f.name.startswith("rerun.")}
+        elif chunk.entity_path.startswith("/__properties"):
+            if "RecordingInfo:name" in batch.schema.names:
+                name = batch["RecordingInfo:name"][0].as_py()[0]
+        else:
+            rows = 0 if chunk.is_static else chunk.num_rows
+            entities[chunk.entity_path] = entities.get(chunk.entity_path, 0) + rows
+            for timeline in _TIMELINES if rows else ():
+                times = batch[timeline].cast("int64").to_numpy()
+                first, last = timelines.get(timeline, (int(times[0]), int(times[0])))
+                timelines[timeline] = min(first, int(times.min())), max(last, int(times.max()))
+    return {
+        "application": entry.application_id,
+        "recording": entry.recording_id,
+        "name": name,
+        "bytes": path.stat().st_size,
+        "blueprint": bool(reader.blueprints()),
+        "episode": episode,
+        "entities": dict(sorted(entities.items())),
+        "timelines": timelines,
+    }
+
+
+def read_summary(path: Path) -> str:
+    """`read_back` as text; errors as there."""
+    found = read_back(path)
+    lines = [f"{path}: {found['name'] or found['recording']}, {found['bytes'] / 1e6:.2f} MB"]
+    if "step" in found["timelines"]:
+        first, last = found["timelines"]["step"]
+        lines[0] += f", steps {first} to {last}"
+    lines += [f"  {key:<20} {_figure(value)}" for key, value in sorted(found["episode"].items())]
+    rows = ", ".join(f"{entity[1:]} {count}" for entity, count in found["entities"].items() if count)
+    lines.append(f"  rows: {rows}")
+    return "\n".join(lines)
+
+
+def _figure(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _checked(path: Path) -> RrdReader:
+    """A reader of the recording, after checking header, footer and that it holds a recording."""
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a missing footer, which may also raise
+        try:
+            reader = RrdReader(path)
+            recordings = reader.recordings()
+        except ValueError as error:
+            raise KervError(f"{path} is missing") from error
+        except (RuntimeError, OSError) as error:
+            raise KervError(_damaged(path, error)) from error
+    if not recordings:
+        raise KervError(f"{path} holds no recording: record the episode again")
+    return reader
+
+
+def chunks_of(path: Path) -> list[Any]:
+    """Every chunk of a recording. KervError: it is missing or damaged."""
+    return _chunks(_checked(path), path)
+
+
+def _chunks(reader: RrdReader, path: Path) -> list[Any]:
+    try:
+        return list(reader.stream())
+    except (RuntimeError, OSError, ValueError) as error:
+        raise KervError(_damaged(path, error)) from error
+
+
+def _damaged(path: Path, error: Exception) -> str:
+    reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")
+    return f"{path} is damaged ({reason}): delete it and record the episode again"

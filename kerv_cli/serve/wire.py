@@ -1,0 +1,78 @@
+"""Messages of the policy server: msgpack with numpy arrays, as openpi's client writes and reads them.
+
+An array is a map with the *bytes* keys __ndarray__ (true), data, dtype, shape; a scalar one with __npgeneric__, data,
+dtype. Only plain numbers are accepted: nothing is unpickled, and no array is larger than its own bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.base.errors import KervError, UsageError
+
+KINDS = "biuf"  # booleans, integers, floats
+
+
+def packed(value: Any) -> bytes:
+    """A message of dicts, lists, texts, numbers and numpy arrays."""
+    data: bytes = _msgpack().packb(value, default=_plain)
+    return data
+
+
+def unpacked(data: bytes) -> dict[str, Any]:
+    """A message that is a map with text keys.
+
+    Raises:
+        UsageError: it is not one, or holds an array that does not fit its bytes.
+    """
+    try:
+        value = _msgpack().unpackb(data, object_hook=_array, strict_map_key=True)
+    except UsageError:
+        raise
+    except Exception as error:  # msgpack raises many kinds, which mean the same
+        raise UsageError(f"the message cannot be read as msgpack ({type(error).__name__})") from error
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise UsageError(f"the message is a {type(value).__name__}, a map with text keys is wanted")
+    return value
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+    if isinstance(value, np.generic):
+        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+    raise TypeError(f"{type(value).__name__} cannot be sent")
+
+
+def _array(value: dict[Any, Any]) -> Any:
+    if b"__ndarray__" in value:
+        dtype, shape, data = _dtype(value.get(b"dtype")), value.get(b"shape"), value.get(b"data")
+        if not isinstance(shape, list) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
+            raise UsageError(f"an array of shape {str(shape)[:60]}: at most 8 whole numbers are wanted")
+        if not isinstance(data, bytes) or math.prod(shape) * dtype.itemsize != len(data):
+            raise UsageError(f"an array of shape {shape} and type {dtype} does not fit its bytes")
+        return np.frombuffer(data, dtype).reshape(shape).copy()  # one that may be written to
+    if b"__npgeneric__" in value:
+        return _dtype(value.get(b"dtype")).type(value.get(b"data"))
+    return value
+
+
+def _dtype(name: Any) -> np.dtype[Any]:
+    try:
+        dtype = np.dtype(name)
+    except TypeError:
+        dtype = None
+    if not isinstance(name, str) or dtype is None or dtype.kind not in KINDS:
+        raise UsageError(f"an array of type {str(name)[:40]}: booleans, integers and floats are accepted")
+    return dtype
+
+
+def _msgpack() -> Any:
+    try:
+        import msgpack
+    except ImportError as error:
+        raise KervError("the policy server needs more packages: pip install 'kerv[serve]'") from error
+    return msgpack

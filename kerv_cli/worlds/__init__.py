@@ -1,0 +1,85 @@
+"""The registered environments, their tasks and suites.
+
+Imports nothing heavy until a spec is asked for: a spec imports numpy, a world its simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
+
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import load, parts
+
+if TYPE_CHECKING:
+    from kerv_cli.base.settings import WorldSettings
+    from kerv_cli.worlds.spec import EnvironmentSpec
+
+W = TypeVar("W", bound="WorldSettings")
+
+KIND = "environment"
+NAMES = "names"
+"""Trait of an environment's part: `module:tuple` of its suites and tasks, importable without numpy, for completion."""
+
+
+def specs() -> Mapping[str, EnvironmentSpec]:
+    """Name -> specification of every registered environment."""
+    return {name: load(part.build) for name, part in parts(KIND).items()}
+
+
+def spec_of(task: str) -> EnvironmentSpec:
+    """The environment that has the task, given by its full or its short name.
+
+    Raises:
+        UnknownName: no environment has it; the message names the nearest tasks. UsageError: several have it.
+    """
+    known = specs()
+    having = [spec for spec in known.values() if spec.full_name(task) is not None]
+    if not having:
+        raise UnknownName("task", task, [name for spec in known.values() for name in spec.tasks])
+    if len(having) > 1:
+        raise UsageError(f"task '{task}' is one of {' and of '.join(spec.name for spec in having)}: rename one of them")
+    return having[0]
+
+
+def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
+    """Full task names for a list of tasks and suites (`MT10`, `mt50`): order kept, duplicates dropped.
+
+    Raises:
+        UnknownName: a name that is neither a task nor a suite.
+        UsageError: no name, or tasks of several environments, whose action spaces may differ.
+    """
+    if not names:
+        raise UsageError("name at least one task or suite: task=NAME")
+    known = list(specs().values())
+    resolved: dict[str, str] = {}  # full name -> environment
+    for name in names:
+        found = {task: spec.name for spec in known for task in spec.expand(name)}
+        if not found:
+            raise UnknownName("task or suite", name, [n for spec in known for n in (*spec.suites, *spec.tasks)])
+        resolved |= found
+    environments = list(dict.fromkeys(resolved.values()))
+    if len(environments) > 1:
+        raise UsageError(f"task={','.join(names)}: tasks of {' and '.join(environments)} cannot be mixed: name one's")
+    return tuple(resolved)
+
+
+def task_names() -> Iterator[str]:
+    """Suites and tasks of all environments, for completion."""
+    for part in parts(KIND).values():
+        if NAMES in part.traits:
+            yield from load(part.traits[NAMES])
+        else:
+            spec = load(part.build)
+            yield from (*spec.suites, *spec.tasks)
+
+
+def settled(world: W, spec: EnvironmentSpec) -> W:
+    """World settings with the environment's own camera and horizon where `world` leaves them open.
+
+    Raises:
+        UnknownName: the environment has no such camera. UsageError: a horizon that it cannot run.
+    """
+    camera = replace(world.camera, name=spec.camera_name(world.camera.name))
+    return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))

@@ -1,0 +1,155 @@
+"""Does an environment keep the protocol? Checks on one task, from its specification alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.findings import Failed, Finding, run
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.spec import EnvironmentSpec, World
+
+STEPS = 5  # control steps of every check
+SIZE = 48  # pixels of a frame
+
+
+def check_environment(spec: EnvironmentSpec, seed: int) -> list[Finding]:
+    """One finding per check, on the specification's first task. seed: of the episodes."""
+    trial = Trial(spec, next(iter(spec.tasks)), seed)
+    checks: list[tuple[str, Callable[[], str]]] = [
+        ("specification", trial.specification),
+        ("same seed, same episode", trial.repeats),
+        ("another seed, another start", trial.differs),
+        ("observation", trial.observation),
+        ("actions", trial.actions),
+        ("horizon", trial.horizon),
+        ("frames", trial.frames),
+    ]
+    return run(checks) + (run([("expert", trial.expert)]) if spec.expert_class else [])
+
+
+@dataclass
+class Trial:
+    """The checks of one task."""
+
+    spec: EnvironmentSpec
+    task: str
+    seed: int
+
+    def open(self, horizon: int = 0) -> World:
+        """A fresh world of the task."""
+        return self.spec.open_world(self.task, CameraConfig(size=SIZE), horizon)
+
+    def specification(self) -> str:
+        """Names that belong together."""
+        spec = self.spec
+        unknown = {t for suite in spec.suites.values() for t in suite} - set(spec.tasks)
+        if unknown:
+            raise Failed(f"suites name {', '.join(sorted(unknown))}, which are no tasks")
+        if any(task.difficulty not in spec.difficulties for task in spec.tasks.values()):
+            raise Failed(f"a task has a difficulty that is none of {', '.join(spec.difficulties)}")
+        if len(spec.observation.proprioception) > spec.observation.state or not spec.cameras:
+            raise Failed("more proprioception than state, or no camera")
+        return f"{len(spec.tasks)} tasks, {spec.actions.dofs} DoFs, {spec.observation.state} numbers of state"
+
+    def trace(self, seed: int, drawn: bool) -> np.ndarray:
+        """States (STEPS + 1, s) of an episode with seeded actions."""
+        random, space = np.random.default_rng(7), self.spec.actions
+        with self.open() as world:
+            states = [world.reset(seed).state]
+            for _ in range(STEPS):
+                if drawn:
+                    world.frame()
+                states.append(world.step(random.uniform(space.low, space.high)).state)
+        return np.array(states)
+
+    def repeats(self) -> str:
+        """The same to the last bit, whether frames are drawn or not."""
+        first, second = self.trace(self.seed, False), self.trace(self.seed, True)
+        if not np.array_equal(first, second):
+            raise Failed(f"two episodes of seed {self.seed} differ by {np.abs(first - second).max():.3g}")
+        return f"{STEPS} steps, with and without frames"
+
+    def differs(self) -> str:
+        """Seeds are different starts."""
+        starts = []
+        with self.open() as world:
+            for seed in range(self.seed, self.seed + 3):
+                world.reset(seed)
+                starts.append(tuple(np.asarray(world.initial_state).tolist()))
+        if len(set(starts)) < 2:
+            raise Failed("three seeds begin with the same initial_state: pairs of episodes could not be told apart")
+        return f"{len(set(starts))} of 3 seeds begin differently"
+
+    def observation(self) -> str:
+        """Sizes, and that the state begins with the proprioception."""
+        wanted = self.spec.observation
+        with self.open() as world:
+            seen = world.reset(self.seed)
+            if seen.state.shape != (wanted.state,) or seen.proprioception.shape != (len(wanted.proprioception),):
+                raise Failed(f"state {seen.state.shape}, proprioception {seen.proprioception.shape}: not as specified")
+            if not np.array_equal(seen.state[: len(wanted.proprioception)], seen.proprioception):
+                raise Failed("the state does not begin with the proprioception")
+            if world.end_effector.shape != (3,) or not 0 <= world.gripper <= 1:
+                raise Failed(
+                    f"end_effector {world.end_effector.shape}, gripper {world.gripper}: (3,) and 0 to 1 wanted"
+                )
+            return f"instruction '{world.instruction}'"
+
+    def actions(self) -> str:
+        """What lies outside is clipped, what is no number is refused."""
+        space, low = self.spec.actions, np.array(self.spec.actions.low)
+        with self.open() as first, self.open() as second:
+            first.reset(self.seed)
+            second.reset(self.seed)
+            if not np.array_equal(first.step(low).state, second.step(low - np.abs(low) - 1).state):
+                raise Failed("an action below the limits is not clipped to them")
+            for wrong in (np.zeros(space.dofs + 1), np.full(space.dofs, np.nan)):
+                try:
+                    first.step(wrong)
+                except KervError:
+                    continue
+                raise Failed(f"step({wrong}) is accepted")
+        return "clipped to the limits, refused where they are no numbers"
+
+    def horizon(self) -> str:
+        """An episode ends."""
+        with self.open(horizon=2) as world:
+            world.reset(self.seed)
+            for _ in range(2):
+                world.step(np.array(self.spec.actions.low))
+            if not world.done:
+                raise Failed("not done after `horizon` steps")
+            try:
+                world.step(np.array(self.spec.actions.low))
+            except KervError:
+                return f"{self.spec.horizon} control steps"
+        raise Failed("a step past the horizon is accepted")
+
+    def frames(self) -> str:
+        """Every camera draws something."""
+        with self.open() as world:
+            world.reset(self.seed)
+            for name, image in world.observe(self.spec.cameras).images.items():
+                if image.shape != (SIZE, SIZE, 3) or image.dtype != np.uint8:
+                    raise Failed(
+                        f"camera {name} draws {image.shape} {image.dtype}, ({SIZE}, {SIZE}, 3) uint8 is wanted"
+                    )
+                if not image.std():
+                    raise Failed(f"camera {name} draws one colour")
+        return ", ".join(self.spec.cameras)
+
+    def expert(self) -> str:
+        """Actions within the limits."""
+        expert, space = self.spec.expert(self.task), self.spec.actions
+        with self.open() as world:
+            observation = world.reset(self.seed)
+            for _ in range(STEPS):
+                action = np.asarray(expert(observation))
+                if action.shape != (space.dofs,) or (action < space.low).any() or (action > space.high).any():
+                    raise Failed(f"an action of shape {action.shape} or outside the limits")
+                observation = world.step(action)
+        return f"{STEPS} actions within the limits"

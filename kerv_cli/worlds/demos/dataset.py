@@ -1,0 +1,191 @@
+"""A recorded set of demonstrations on disk, checked and read back."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.manifests import read
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
+from kerv_cli.worlds.recorded import register_recorded
+
+FORMAT = 2
+"""Format of manifests. Format 1 did not name the environment, because Meta-World was the only one."""
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """One episode's entry in the manifest. steps: control steps up to the success. bytes, sha256: of its file."""
+
+    seed: int
+    perturbed: bool
+    steps: int
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """The episodes of one task, by seed."""
+
+    episodes: tuple[EpisodeEntry, ...]
+    mean_steps: float = 0.0
+    failed_seeds: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class DemoManifest:
+    """The manifest that `kerv demos` writes.
+
+    environment, actions, observation: of the tasks' environment. config: the fields of DemoConfig without the workers.
+    versions: of the packages that the physics and the frames depend on. sha256: over the hashes of all episode files.
+    seeds: the first and the last. missing: how many of the requested episodes failed. instructions: of the tasks of
+    recorded data, which no registered environment has.
+    """
+
+    format: int
+    environment: str
+    actions: ActionSpace
+    observation: ObservationSpace
+    config: dict[str, Any]
+    tasks: dict[str, TaskEntry]
+    sha256: str
+    versions: dict[str, str] = field(default_factory=dict)
+    seeds: dict[str, int] = field(default_factory=dict)
+    episodes: int = 0
+    missing: int = 0
+    instructions: dict[str, str] = field(default_factory=dict)
+
+
+def with_environment(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The JSON of a recording or manifest in the present format. One of format 1 is of Meta-World."""
+    if value["format"] != 1:
+        return dict(value)
+    from kerv_cli.worlds.metaworld.spec import SPEC
+
+    spaces = {"actions": SPEC.actions.as_dict(), "observation": SPEC.observation.as_dict()}
+    return {**value, "format": FORMAT, "environment": SPEC.name, **spaces}
+
+
+def episode_path(out: Path, task: str, seed: int) -> Path:
+    """File of an episode within the dataset's folder `out`."""
+    return Path(out) / "episodes" / task / f"{seed:06d}.safetensors"
+
+
+def dataset_hash(tasks: Mapping[str, Any]) -> str:
+    """Hex SHA-256 over the hashes of the episode files; tasks: as in a manifest's JSON."""
+    digest = hashlib.sha256()
+    for task, summary in sorted(tasks.items()):
+        for episode in summary["episodes"]:
+            digest.update(f"{task} {episode['seed']} {episode['sha256']}\n".encode())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class DemoEntry(EpisodeEntry):
+    """An episode of a dataset, and its file."""
+
+    task: str
+    path: Path
+
+
+@dataclass(frozen=True)
+class DemoDataset:
+    """A complete recording on disk.
+
+    Attributes:
+        path: the dataset's folder.
+        manifest: what was recorded.
+        episodes: one entry per episode, by task in the recording's order, then by seed.
+    """
+
+    path: Path
+    manifest: DemoManifest
+    episodes: list[DemoEntry]
+
+    @property
+    def sha256(self) -> str:
+        """Hex hash over the hashes of all episode files: two datasets with the same hash are the same."""
+        return self.manifest.sha256
+
+    @classmethod
+    def open(cls, path: Path) -> DemoDataset:
+        """Opens a dataset and checks that its episode files exist in full size; `load` checks their contents.
+
+        Raises:
+            CheckpointError: no dataset there, its recording was not finished, or it is damaged.
+        """
+        path = Path(path)
+        if not (path / "manifest.json").exists():
+            if (path / "recording.json").exists():
+                raise CheckpointError(
+                    f"the demonstrations in {path} are unfinished: run 'kerv demos name={path.name}' again to go on"
+                )
+            raise CheckpointError(f"no demonstrations in {path}: record them with 'kerv demos name={path.name}'")
+        manifest = _read_manifest(path / "manifest.json")
+        if manifest.instructions:
+            camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)
+            register_recorded(manifest.environment, *spaces, manifest.instructions, camera)
+        entries = [
+            DemoEntry(**asdict(entry), task=task, path=episode_path(path, task, entry.seed))
+            for task, summary in manifest.tasks.items()
+            for entry in summary.episodes
+        ]
+        for entry in entries:
+            if not entry.path.is_file() or entry.path.stat().st_size != entry.bytes:
+                raise CheckpointError(f"{entry.path} is missing or cut short: run 'kerv demos' again to restore it")
+        return cls(path, manifest, entries)
+
+    @classmethod
+    def joined(cls, parts: Sequence[DemoDataset]) -> DemoDataset:
+        """All episodes of `parts`, in order. The manifest is the first one's, with the tasks and the hash of all.
+
+        Raises:
+            CheckpointError: they are of different environments or cameras.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        first = parts[0].manifest
+        for part in parts[1:]:
+            for what, ours, theirs in (
+                ("environment", first.environment, part.manifest.environment),
+                ("action space", first.actions, part.manifest.actions),
+                ("observations", first.observation, part.manifest.observation),
+                ("camera", first.config["camera"], part.manifest.config["camera"]),
+            ):
+                if ours != theirs:
+                    raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they do not add up")
+        combined = hashlib.sha256("\n".join(part.sha256 for part in parts).encode()).hexdigest()
+        config = {**first.config, "joined": [part.manifest.config for part in parts[1:]]}
+        episodes = [entry for part in parts for entry in part.episodes]
+        tasks = {name: entry for part in reversed(parts) for name, entry in part.manifest.tasks.items()}
+        return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
+
+    def load(self, index: int) -> DemoEpisode:
+        """Reads the episode of entry `index` of `episodes`.
+
+        Raises:
+            CheckpointError: the file changed since it was recorded.
+        """
+        entry = self.episodes[index]
+        if sha256_of(entry.path) != entry.sha256:
+            raise CheckpointError(f"{entry.path} changed since it was recorded: delete it and run 'kerv demos' again")
+        return load_episode(entry.path, self.manifest.actions, self.manifest.observation)
+
+
+def _read_manifest(path: Path) -> DemoManifest:
+    value = read_json(path)
+    found = value.get("format") if isinstance(value, dict) else None
+    if found not in (1, FORMAT):
+        raise CheckpointError(f"{path} has format {found}, this kerv reads {FORMAT} and 1")
+    value = with_environment(value)
+    manifest = read(DemoManifest, value, str(path))
+    if manifest.sha256 != dataset_hash(value["tasks"]):
+        raise CheckpointError(f"{path} is damaged: its hash does not fit its episodes")
+    return manifest

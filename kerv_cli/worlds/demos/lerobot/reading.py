@@ -1,0 +1,303 @@
+"""Reads a LeRobot dataset of version 3 into demonstrations of ours: tables with images or videos beside them."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
+from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.settings import DemosImportSettings
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
+from kerv_cli.worlds.demos.dataset import FORMAT, dataset_hash, episode_path
+from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
+from kerv_cli.worlds.demos.lerobot.layout import (
+    ACTION,
+    DATA,
+    ENVIRONMENT,
+    EXECUTED,
+    IMAGES,
+    INFO,
+    STATE,
+    TASKS,
+    VIDEO,
+)
+
+OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A LeRobot folder. info: meta/info.json; episodes: rows of meta/episodes; tasks: instruction by task_index."""
+
+    folder: Path
+    info: Mapping[str, Any]
+    episodes: Sequence[Mapping[str, Any]]
+    tasks: Mapping[int, str]
+    camera: str
+
+    @classmethod
+    def open(cls, folder: Path, camera: str) -> Source:
+        """Raises CheckpointError: no dataset of version 3, or a damaged one. UnknownName: no such camera."""
+        info = read_json(folder / INFO)
+        version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
+        if not version.startswith("v3."):
+            raise CheckpointError(
+                f"{folder / INFO} is of version {version}, v3.x is read: convert it with LeRobot's own "
+                "convert_dataset_v21_to_v30"
+            )
+        cameras = [k.removeprefix(IMAGES) for k, v in info["features"].items() if v["dtype"] in ("image", "video")]
+        if not cameras or ACTION not in info["features"]:
+            raise CheckpointError(f"{folder} has no images or no {ACTION}: it cannot be learned from")
+        if camera and camera not in cameras:
+            raise UnknownName("camera", camera, cameras)
+        rows = [row for path in sorted(folder.glob("meta/episodes/*/*.parquet")) for row in _rows(path)]
+        tasks = {int(row["task_index"]): str(_task_of(row)) for row in _rows(folder / TASKS)}
+        return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
+
+    @property
+    def key(self) -> str:
+        """The camera's feature."""
+        return self.camera if self.camera in self.info["features"] else f"{IMAGES}{self.camera}"
+
+    def names(self, feature: str, prefix: str) -> list[str]:
+        """Names of a vector's numbers, as far as the dataset has them."""
+        described = self.info["features"].get(feature)
+        if described is None:
+            return []
+        names, count = described.get("names"), int(np.prod(described["shape"]))
+        if isinstance(names, dict):
+            names = next(iter(names.values()), None)
+        if not isinstance(names, list) or len(names) != count or len(set(names)) != count:
+            return [f"{prefix}_{i}" for i in range(count)]
+        return [str(name) for name in names]
+
+    def table(self, episode: Mapping[str, Any]) -> Any:
+        """The rows of one episode, in order."""
+        import pyarrow.parquet as pq
+
+        place = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
+        path = self.folder / str(self.info.get("data_path") or DATA).format(**place)
+        try:
+            table = pq.read_table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
+        if len(table) != int(episode["length"]):
+            raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
+        return table
+
+    def frames(self, episode: Mapping[str, Any], table: Any) -> np.ndarray:
+        """(T, h, w, 3) uint8 of one episode."""
+        if self.info["features"][self.key]["dtype"] == "image":
+            return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
+        place = {f"{x}_index": int(episode[f"videos/{self.key}/{x}_index"]) for x in ("chunk", "file")}
+        path = self.folder / str(self.info.get("video_path") or VIDEO).format(video_key=self.key, **place)
+        start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
+        return np.stack(list(_decoded(path, start, rate, len(table))))
+
+
+def import_lerobot(
+    settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None] = lambda done, total: None
+) -> dict[str, Any]:
+    """Writes the dataset's episodes as demonstrations -> the manifest.
+
+    Raises:
+        UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
+            episode is damaged. KervError: a video, and no package av.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise UsageError(f"{folder} exists: give the new demonstrations another name")
+    source = Source.open(Path(settings.source).expanduser(), settings.camera)
+    chosen = source.episodes[: settings.episodes or None]
+    names = _task_names(source.tasks)
+    entries: dict[str, list[dict[str, Any]]] = {}
+    actions: list[np.ndarray] = []
+    state = 0
+    for done, row in enumerate(chosen):
+        episode = _episode(source, row, names, settings.tail)
+        actions.append(episode.executed)
+        state = episode.states.shape[1]
+        path = episode_path(folder, episode.task, episode.seed)
+        save_episode(path, episode)
+        size, digest = path.stat().st_size, sha256_of(path)
+        entry = {"seed": episode.seed, "perturbed": False, "steps": episode.steps, "bytes": size, "sha256": digest}
+        entries.setdefault(episode.task, []).append(entry)
+        progress(done + 1, len(chosen))
+    manifest = _manifest(source, settings, entries, names, np.concatenate(actions), state)
+    write_json(folder / "recording.json", {k: manifest[k] for k in ("format", "environment", "config")})
+    write_json(folder / "manifest.json", manifest)
+    return manifest
+
+
+def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], tail: int) -> DemoEpisode:
+    table = source.table(row)
+    number = int(row["episode_index"])
+    columns = {
+        name: np.stack(table[name].to_pylist()).astype(np.float32).reshape(len(table), -1)
+        for name in (ACTION, EXECUTED, STATE, ENVIRONMENT)
+        if name in table.column_names
+    }
+    if not all(np.isfinite(values).all() for values in columns.values()):
+        raise CheckpointError(f"episode {number} of {source.folder} holds numbers that are not finite")
+    labels = columns[ACTION]
+    states = columns.get(ENVIRONMENT, columns.get(STATE, np.zeros((len(table), 0), np.float32)))
+    return DemoEpisode(
+        task=names[int(table["task_index"][0].as_py())],
+        seed=number,
+        perturbed=False,
+        steps=len(table),
+        frames=source.frames(row, table),
+        frame_steps=np.arange(len(table), dtype=np.int64),
+        states=states,
+        labels=np.concatenate([labels, np.repeat(labels[-1:], tail, 0)]),
+        executed=columns.get(EXECUTED, labels),
+        initial_state=states[0].astype(np.float64),
+    )
+
+
+def _manifest(
+    source: Source,
+    settings: DemosImportSettings,
+    entries: Mapping[str, list[dict[str, Any]]],
+    names: Mapping[int, str],
+    actions: np.ndarray,
+    state: int,
+) -> dict[str, Any]:
+    felt = source.names(STATE, "state")
+    observation = ObservationSpace(tuple(felt[:state]), state, (), (0.0, 0.0, 0.0))
+    tasks = {task: _summary(rows) for task, rows in entries.items()}
+    seeds = [e["seed"] for rows in entries.values() for e in rows]
+    config = {
+        "source": str(source.folder.resolve()),
+        "camera": {"name": source.camera},
+        "frame_stride": 1,
+        "tail": settings.tail,
+        "tasks": list(entries),
+    }
+    manifest = {
+        "format": FORMAT,
+        "environment": _identifier(settings.name or source.folder.name),
+        "actions": action_space(source, settings, actions).as_dict(),
+        "observation": observation.as_dict(),
+        "config": config,
+        "versions": {"lerobot": str(source.info["codebase_version"])},
+        "seeds": {"first": min(seeds), "last": max(seeds)},
+        "episodes": len(seeds),
+        "missing": 0,
+        "sha256": dataset_hash(tasks),
+        "tasks": tasks,
+        "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(manifest))
+    return plain
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"mean_steps": sum(e["steps"] for e in rows) / len(rows), "failed_seeds": [], "episodes": rows}
+
+
+def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
+    """The recorded actions' space: limits are the smallest and largest that occur. dofs=openvla: seven DoFs under
+    OpenVLA's names.
+
+    Raises:
+        UsageError: dofs=openvla for another number of DoFs, or an unknown strict one.
+    """
+    names = tuple(source.names(ACTION, "action"))
+    if settings.dofs == "openvla":
+        if len(names) != len(OPENVLA):
+            raise UsageError(f"dofs=openvla: the dataset has {len(names)} DoFs ({', '.join(names)}), OpenVLA has 7")
+        names = OPENVLA
+    elif settings.dofs != "own":
+        raise UnknownName("dofs", settings.dofs, ("own", "openvla"))
+    strict = tuple(settings.strict or (name for name in names if "gripper" in name.lower()))
+    unknown = [name for name in strict if name not in names]
+    if unknown:
+        raise UnknownName("strict DoF", unknown[0], names)
+    low, high = actions.min(0).astype(float), actions.max(0).astype(float)
+    still = high - low < 1e-6
+    low, high = np.where(still, low - 1, low), np.where(still, high + 1, high)
+    rate = float(source.info["fps"])
+    return ActionSpace(names, _groups(names, strict), strict, rate, tuple(low.tolist()), tuple(high.tolist()))
+
+
+def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
+    """Three of position, three of rotation and a gripper where there are seven; else runs of strict and other DoFs."""
+    if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
+        return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
+    groups: list[Group] = []
+    for name in names:
+        kind = "strict" if name in strict else "motion"
+        if groups and groups[-1].name.startswith(kind):
+            groups[-1] = Group(groups[-1].name, groups[-1].size + 1)
+        else:
+            groups.append(Group(f"{kind}_{len(groups)}" if groups else kind, 1))
+    return tuple(groups)
+
+
+def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
+    """task_index -> a name that can be a folder's and a setting's, made from the instruction."""
+    found: dict[int, str] = {}
+    for number, text in tasks.items():
+        name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
+        found[number] = name if name not in found.values() else f"{name}-{number}"
+    return found
+
+
+def _identifier(name: str) -> str:
+    """A registered environment's name: letters, digits and underscores."""
+    return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
+
+
+def _task_of(row: Mapping[str, Any]) -> Any:
+    return row.get("task", row.get("__index_level_0__"))
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    import pyarrow.parquet as pq
+
+    try:
+        return list(pq.read_table(path).to_pylist())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
+
+
+def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
+    from PIL import Image, UnidentifiedImageError
+
+    data = cell.get("bytes")
+    try:
+        with Image.open(io.BytesIO(data) if data else folder / str(cell.get("path"))) as image:
+            return np.asarray(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError) as error:
+        raise CheckpointError(f"an image in {folder} cannot be read: {str(error)[:120]}") from error
+
+
+def _decoded(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
+    """`count` frames of a video at start, start + 1 / rate, … seconds, each the nearest one."""
+    try:
+        import av
+    except ImportError as error:
+        raise KervError("datasets with videos need the package av: pip install 'kerv[lerobot]'") from error
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            if start > 0:
+                container.seek(int(start / float(stream.time_base)), stream=stream)
+            wanted, half = 0, 0.5 / rate
+            for frame in container.decode(stream):
+                while wanted < count and float(frame.time) >= start + wanted / rate - half:
+                    yield frame.to_ndarray(format="rgb24")
+                    wanted += 1
+                if wanted == count:
+                    return
+    except (av.error.FFmpegError, OSError) as error:
+        raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
+    raise CheckpointError(f"{path} ends {count - wanted} frames before its episode does")

@@ -1,0 +1,386 @@
+"""Demonstrations: scripted experts, recorded to disk with clean labels, and read back.
+
+By default half of the episodes are executed with noise, so that they visit states off the expert's path; their labels
+are still the expert's clean actions at those states. Only successful episodes are kept. With an *actor*, e.g. a policy,
+that one moves the robot and the expert only labels what it visits (DAgger, Ross et al. 2011); every episode is kept.
+
+On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:06d>.safetensors`,
+`failed/<task>/<seed:06d>.json` and, when the recording is complete, `manifest.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.limits import check_settings, limits, number
+from kerv_cli.base.manifests import read
+from kerv_cli.base.spaces import Observation
+from kerv_cli.worlds import resolve_tasks, spec_of
+from kerv_cli.worlds.camera import CameraConfig, choose_backend
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, dataset_hash, episode_path, with_environment
+from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
+from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
+from kerv_cli.worlds.spec import EnvironmentSpec, Expert, World
+
+_SEEDS_PER_JOB = 5
+_EXTRA_ATTEMPTS = 20
+"""Seeds tried beyond the requested range: this many, plus one per requested episode."""
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """The configuration of a recording.
+
+    Attributes:
+        tasks: tasks and suites of one environment.
+        episodes: successful episodes per task.
+        first_seed: seeds start here, per task; seeds for selection and evaluation are refused.
+        perturbed: fraction of episodes executed with noise; `is_perturbed` says which.
+        noise_low, noise_high: range of the Gaussian noise's standard deviation on the DoFs that are not strict, drawn
+            once per episode; half of a DoF's range is 1.
+        burst_probability: chance per step that a burst starts: 3 to 8 steps in one random direction.
+        camera: view of the frames; the environment's first camera where none is named.
+        frame_stride: control steps per recorded frame.
+        tail: labels recorded beyond success, so that an action chunk that starts near the end has true labels.
+        workers: processes; the result does not depend on them.
+        horizon: control steps within which the expert must succeed; 0: the environment's.
+        policy: hash of the actor's weights; empty: the expert acts.
+        expert_share: probability that the expert acts for one of the actor's chunks.
+    """
+
+    tasks: tuple[str, ...]
+    episodes: int = field(metadata=limits(1))
+    first_seed: int = 0
+    perturbed: float = number(0.5, 0, 1)
+    noise_low: float = number(0.2, 0)
+    noise_high: float = number(0.6, 0)
+    burst_probability: float = number(0.02, 0, 1)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    frame_stride: int = number(1, 1)
+    tail: int = number(8, 0)
+    workers: int = number(2, 1)
+    horizon: int = 0
+    policy: str = ""
+    expert_share: float = number(0.0, 0, 1)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
+        object.__setattr__(self, "camera", self.spec.camera(self.camera))
+        object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon))
+        check_settings(self, "demonstrations")
+        if self.noise_low > self.noise_high:
+            raise UsageError("demonstrations: noise must satisfy noise_low <= noise_high")
+        if self.tail >= self.spec.horizon:
+            raise UsageError(f"demonstrations: tail={self.tail}: an episode has {self.spec.horizon} control steps")
+        ends = self.first_seed, self.first_seed + self.episodes - 1
+        self.spec.seeds.check(ends, "training", "demonstrations")
+
+    @property
+    def spec(self) -> EnvironmentSpec:
+        """The tasks' environment."""
+        return spec_of(self.tasks[0])
+
+    @property
+    def seed_limit(self) -> int:
+        """One past the last seed that may be tried when experts fail."""
+        return min(self.first_seed + 2 * self.episodes + _EXTRA_ATTEMPTS, self.spec.seeds.training.stop)
+
+
+class Actor(Protocol):
+    """Moves the robot of a recording in the expert's place."""
+
+    def reset(self, world: World, seed: int) -> None:
+        """Begins an episode in a world that was reset."""
+
+    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The action (D,) to execute now; label: the expert's."""
+
+
+MakeActor = Callable[[DemoConfig], Actor]
+"""Makes the actor of a recording, in the process that records; must be picklable."""
+
+
+class NoisyExpert:
+    """The expert as its own actor, with noise where the seed says so."""
+
+    def __init__(self, config: DemoConfig) -> None:
+        self.config = config
+        self.perturb: Perturbation | None = None
+
+    def reset(self, world: World, seed: int) -> None:
+        """See `Actor.reset`."""
+        config, noise = self.config, (self.config.noise_low, self.config.noise_high)
+        noisy = is_perturbed(seed, config.perturbed)
+        arguments = (world.task, seed, world.spec.actions, noise, config.burst_probability)
+        self.perturb = Perturbation(*arguments) if noisy else None
+
+    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `Actor.act`."""
+        return self.perturb(label) if self.perturb else label
+
+
+def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None = None) -> DemoEpisode | None:
+    """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
+    late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
+    expert = world.spec.expert(world.task)
+    mover: Actor = actor or NoisyExpert(config)
+    observation = world.reset(seed)
+    mover.reset(world, seed)
+    states, labels, executed, frames, frame_steps = [], [], [], [], []
+    last_step = min(config.horizon, world.horizon - config.tail)
+    while not world.success:
+        if world.steps >= last_step:
+            if actor is None:
+                return None
+            break
+        if world.steps % config.frame_stride == 0:
+            frames.append(world.frame())
+            frame_steps.append(world.steps)
+        label = expert(observation)
+        action = mover.act(label)
+        states.append(observation.state)
+        labels.append(label)
+        executed.append(action)
+        observation = world.step(action)
+    labels += _tail_labels(world, expert, observation, config.tail)
+    return DemoEpisode(
+        task=world.task,
+        seed=seed,
+        perturbed=actor is not None or is_perturbed(seed, config.perturbed),
+        steps=len(states),
+        frames=np.stack(frames),
+        frame_steps=np.array(frame_steps, dtype=np.int64),
+        states=np.array(states, dtype=np.float32),
+        labels=np.array(labels, dtype=np.float32),
+        executed=np.array(executed, dtype=np.float32),
+        initial_state=world.initial_state,
+    )
+
+
+def _tail_labels(world: World, expert: Expert, observation: Observation, tail: int) -> list[NDArray[np.float64]]:
+    labels = []
+    for _ in range(tail):
+        labels.append(expert(observation))
+        observation = world.step(labels[-1])
+    return labels
+
+
+def record(
+    config: DemoConfig,
+    out: Path,
+    on_progress: Callable[[int, int], None] | None = None,
+    make_actor: MakeActor | None = None,
+) -> DemoManifest:
+    """Records demonstrations into the folder `out`; an interrupted recording resumes.
+
+    A seed whose expert fails is replaced by the next one beyond the range, up to `config.seed_limit`. Which episodes
+    come out does not depend on the number of workers.
+
+    Args:
+        config: of the recording.
+        out: the dataset's folder.
+        on_progress: called with (episodes done, episodes wanted).
+        make_actor: makes the actor that moves the robot in the expert's place.
+
+    Returns:
+        The manifest, as written to `out/manifest.json`. Where an expert failed too often, its `missing` is the number
+        of requested episodes that could not be recorded.
+
+    Raises:
+        UsageError: `out` holds demonstrations of another configuration.
+        RenderingUnavailable: no frame can be drawn here.
+        StorageError: writing failed.
+        KervError: a task's expert never succeeded.
+    """
+    out = Path(out)
+    choose_backend()
+    identity = _identity(config)
+    _claim_folder(out, identity)
+    try:
+        kept, failed = _collect(config, out, on_progress, make_actor)
+    finally:
+        _release_world()
+    manifest = {**identity, **_summary(config, kept, failed)}
+    write_json(out / "manifest.json", manifest)
+    return read(DemoManifest, manifest, str(out / "manifest.json"))
+
+
+_Entries = dict[str, list[dict[str, Any]]]  # task -> the manifest's entries
+_Failures = dict[str, list[int]]  # task -> seeds
+
+
+def _collect(
+    config: DemoConfig,
+    out: Path,
+    on_progress: Callable[[int, int], None] | None,
+    make_actor: MakeActor | None,
+) -> tuple[_Entries, _Failures]:
+    kept: _Entries = {task: [] for task in config.tasks}
+    failed: _Failures = {task: [] for task in config.tasks}
+    wanted = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
+    while any(wanted.values()):
+        for task, outcomes in _run_jobs(config, out, _jobs(wanted), make_actor):
+            kept[task] += [entry for entry in outcomes.values() if entry is not None]
+            failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
+            if on_progress is not None:
+                on_progress(sum(map(len, kept.values())), config.episodes * len(config.tasks))
+        wanted = {task: _next_seeds(config, len(kept[task]), wanted[task]) for task in config.tasks}
+    return kept, failed
+
+
+def _jobs(wanted: Mapping[str, range]) -> list[tuple[str, range]]:
+    return [
+        (task, seeds[start : start + _SEEDS_PER_JOB])
+        for task, seeds in wanted.items()
+        for start in range(0, len(seeds), _SEEDS_PER_JOB)
+    ]
+
+
+def _next_seeds(config: DemoConfig, kept: int, tried: range) -> range:
+    # One new seed per failure, in order: the outcome does not depend on how the work is divided.
+    return range(tried.stop, min(tried.stop + config.episodes - kept, config.seed_limit))
+
+
+def _identity(config: DemoConfig) -> dict[str, Any]:
+    settings = asdict(config)
+    del settings["workers"]
+    if not config.policy:
+        del settings["policy"], settings["expert_share"]  # as recordings without an actor always were
+    spec = config.spec
+    versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
+    identity = {
+        "format": FORMAT,
+        "environment": spec.name,
+        "actions": spec.actions.as_dict(),
+        "observation": spec.observation.as_dict(),
+        "config": settings,
+        "versions": versions,
+    }
+    return dict(json.loads(json.dumps(identity)))  # as it will be read back: lists for tuples
+
+
+def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
+    path = out / "recording.json"
+    if not path.exists():
+        write_json(path, identity)
+        return
+    there = read_json(path)
+    packages = spec_of(identity["config"]["tasks"][0]).packages
+    try:
+        here, before = _comparable(identity, packages), _comparable(there, packages)
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged: {error} is not in it") from error
+    if here != before:
+        key = next(key for key in [*here, *before] if here.get(key) != before.get(key))
+        raise UsageError(
+            f"{out} holds demonstrations with {key}={before.get(key)}, not {here.get(key)}: choose another folder"
+        )
+
+
+def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[str, Any]:
+    # Another Python or numpy may resume a recording; another simulator version may have other physics.
+    identity = json.loads(json.dumps(with_environment(identity)))
+    same = ("environment", "format", "actions", "observation")
+    versions = {name: identity["versions"].get(name) for name in packages}
+    return {**{key: identity[key] for key in same}, **identity["config"], **versions}
+
+
+_Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, None where the expert failed
+
+
+def _run_jobs(
+    config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]], make_actor: MakeActor | None
+) -> Iterator[tuple[str, _Outcomes]]:
+    if config.workers == 1 or len(jobs) == 1:
+        yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
+        return
+    from joblib import Parallel, delayed, parallel_config
+
+    # loky starts fresh interpreters: a fork after this process has drawn would deadlock in the GL driver.
+    with parallel_config(backend="loky", n_jobs=min(config.workers, len(jobs)), inner_max_num_threads=1):
+        work = (delayed(_record_seeds)(config, out, task, seeds, make_actor) for task, seeds in jobs)
+        yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
+
+
+_world: World | None = None
+
+
+def _record_seeds(
+    config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
+) -> tuple[str, _Outcomes]:
+    """Runs in a worker: records each seed that has no file yet."""
+    actor = make_actor(config) if make_actor else None
+    return task, {seed: _record_seed(config, out, task, seed, actor) for seed in seeds}
+
+
+def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Actor | None) -> dict[str, Any] | None:
+    path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
+    if failure.exists():
+        return None
+    episode = _valid_episode(path, task, seed, config.spec)
+    if episode is None:
+        episode = run_expert(_world_for(task, config), seed, config, actor)
+        if episode is None:
+            write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
+            return None
+        save_episode(path, episode)
+    return {
+        "seed": seed,
+        "perturbed": episode.perturbed,
+        "steps": episode.steps,
+        "bytes": path.stat().st_size,
+        "sha256": sha256_of(path),
+    }
+
+
+def _world_for(task: str, config: DemoConfig) -> World:
+    global _world
+    if _world is None or (_world.task, _world.camera) != (task, config.camera):
+        _release_world()
+        _world = config.spec.open_world(task, config.camera)
+    return _world
+
+
+def _release_world() -> None:
+    global _world
+    if _world is not None:
+        _world.close()
+    _world = None
+
+
+def _valid_episode(path: Path, task: str, seed: int, spec: EnvironmentSpec) -> DemoEpisode | None:
+    try:
+        episode = load_episode(path, spec.actions, spec.observation)
+    except CheckpointError:
+        return None
+    return episode if (episode.task, episode.seed) == (task, seed) else None
+
+
+def _summary(config: DemoConfig, kept: _Entries, failed: _Failures) -> dict[str, Any]:
+    empty = [task for task, entries in kept.items() if not entries]
+    if empty:
+        raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
+    tasks = {}
+    for task in config.tasks:
+        entries = sorted(kept[task], key=lambda entry: entry["seed"])
+        mean = sum(entry["steps"] for entry in entries) / len(entries)
+        tasks[task] = {"mean_steps": round(mean, 2), "failed_seeds": sorted(failed[task]), "episodes": entries}
+    seeds = [entry["seed"] for entries in kept.values() for entry in entries]
+    return {
+        "seeds": {"first": min(seeds), "last": max(seeds)},
+        "episodes": len(seeds),
+        "missing": config.episodes * len(config.tasks) - len(seeds),
+        "sha256": dataset_hash(tasks),
+        "tasks": tasks,
+    }

@@ -1,0 +1,50 @@
+"""Light: the model's lamps and headlight are brighter or darker and shine from elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, either, level_of
+from kerv_cli.worlds.stress.turning import turned
+
+
+@dataclass(frozen=True)
+class Level:
+    """gain: all light is multiplied by it or by its inverse. degrees: by which each lamp's direction is turned about
+    a random axis, and the lamp moved around the origin with it."""
+
+    gain: float
+    degrees: float
+
+
+LEVELS = (Level(1.1, 10), Level(1.2, 15), Level(1.3, 20), Level(1.8, 45))
+
+
+class Light(Stress):
+    """It changes the model's lights, not the picture, and nothing of the dynamics."""
+
+    kind = "light"
+    changes_model = True
+
+    def begin(self, task: str, seed: int, space: ActionSpace) -> None:
+        """As `Stress.begin`."""
+        self._draws = Draws(task, seed, self.kind, self.level)
+
+    def change(self, model: Any, changes: ModelChanges) -> None:
+        """As `Stress.change`."""
+        level: Level = level_of(LEVELS, self.level)
+        random, head = self._draws.random(), model.vis.headlight
+        lights = (model.light_ambient, model.light_diffuse, model.light_specular)
+        strengths = (*lights, head.ambient, head.diffuse, head.specular)
+        changes.keep(*strengths, model.light_dir, model.light_pos)
+        gain = either(random, level.gain)
+        for strength in strengths:
+            strength[...] *= gain
+        for lamp in range(model.nlight):
+            turn = turned(random, np.deg2rad(level.degrees))
+            model.light_dir[lamp] = turn @ model.light_dir[lamp]
+            model.light_pos[lamp] = turn @ model.light_pos[lamp]

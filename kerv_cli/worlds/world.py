@@ -1,0 +1,200 @@
+"""Bases of worlds: an environment implements the start, the step and the frame of its simulator."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.spaces import Observation
+from kerv_cli.base.views import View, views_of
+from kerv_cli.worlds.camera import Camera, CameraConfig
+from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.stress.base import NO_STRESS, ModelChanges, Stress
+
+
+class EpisodeWorld(ABC):
+    """Implements the protocol `World` except for the simulator. Not thread-safe.
+
+    stress: the shift of its episodes, from the next reset on. stressable: what a stress can change of this world
+    (docs/stress.md); one whose `_start` widens the range of initial states by `stress.spread` adds `range`.
+    """
+
+    stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})
+
+    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
+        """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
+
+        Raises:
+            UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
+        """
+        found = spec.task(task)
+        self.spec, self.task, self.instruction = spec, found.name, found.instruction
+        self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
+        self.steps, self.success, self.succeeded = 0, False, False
+        self.stress: Stress = NO_STRESS
+        self._observation: Observation | None = None
+        self._drawn: dict[tuple[CameraConfig, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}  # of delayed views
+
+    @abstractmethod
+    def _start(self, seed: int) -> NDArray[np.float64]:
+        """Puts the simulator into the episode's initial state; returns the privileged state (s,)."""
+
+    @abstractmethod
+    def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+        """Executes an action (D,) within the limits; returns the privileged state (s,) and the success flag."""
+
+    @abstractmethod
+    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+        """(size, size, 3) uint8 RGB, upright, of one camera."""
+
+    @property
+    @abstractmethod
+    def initial_state(self) -> NDArray[np.float64]:
+        """As `World.initial_state`."""
+
+    @property
+    def observation(self) -> Observation:
+        """The latest observation, without images. Raises KervError before the first reset."""
+        if self._observation is None:
+            raise KervError(f"{self.task}: reset the world before using it")
+        return self._observation
+
+    @property
+    def done(self) -> bool:
+        """As `World.done`."""
+        self.observation  # noqa: B018 - raises before the first reset
+        return self.succeeded or self.steps >= self.horizon
+
+    @property
+    def end_effector(self) -> NDArray[np.float64]:
+        """The first three numbers of the proprioception, (3,) metres."""
+        return self.observation.proprioception[:3].copy()
+
+    @property
+    def gripper(self) -> float:
+        """The number `gripper` of the proprioception; 1 without one."""
+        names, felt = self.spec.observation.proprioception, self.observation.proprioception
+        return float(felt[names.index("gripper")]) if "gripper" in names else 1.0
+
+    def reset(self, seed: int) -> Observation:
+        """As `World.reset`."""
+        if seed < 0:
+            raise UsageError(f"episode seed must be 0 or more, not {seed}")
+        self.stress.begin(self.task, seed, self.spec.actions)
+        self._drawn.clear()
+        state = self._start(seed)
+        self.steps, self.success, self.succeeded = 0, False, False
+        return self._told(state)
+
+    def step(self, action: ArrayLike) -> Observation:
+        """As `World.step`."""
+        executed = np.asarray(action, dtype=np.float64)
+        space = self.spec.actions
+        if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
+            raise KervError(f"{self.task}: an action is {space.dofs} finite numbers, not {action!r}")
+        self.observation  # noqa: B018 - raises before the first reset
+        if self.steps >= self.horizon:
+            raise KervError(
+                f"{self.task}: the episode ended at step {self.steps}, its horizon; reset before stepping on"
+            )
+        executed = self.stress.act(np.clip(executed, space.low, space.high), self.steps)
+        state, self.success = self._advance(executed)
+        self.succeeded = self.succeeded or self.success
+        self.steps += 1
+        return self._told(state)
+
+    def _told(self, state: NDArray[np.float64]) -> Observation:
+        felt = state[: len(self.spec.observation.proprioception)]
+        self._observation = Observation(felt, state, self.instruction)
+        return self._observation
+
+    def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
+        """As `World.frame`."""
+        self.observation  # noqa: B018 - raises before the first reset
+        return self._picture(self.camera if camera is None else self.spec.camera(camera), observed=False)
+
+    def observe(self, cameras: Sequence[str]) -> Observation:
+        """As `World.observe`; images have the size of the world's own camera."""
+        self.observation  # noqa: B018 - raises before the first reset
+        images = {name: self._picture(self.spec.camera(replace(self.camera, name=name)), True) for name in cameras}
+        return self.observation.with_images(images)
+
+    def _picture(self, config: CameraConfig, observed: bool) -> NDArray[np.uint8]:
+        """A frame, put together of its views. observed: by a policy, so that a stress changes each camera's picture;
+        recorded frames have a past of their own."""
+        views = views_of(config.name)
+        now = {
+            view.shown: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
+        }
+        if observed:
+            now = {shown: self.stress.see(shown, image, self.steps) for shown, image in now.items()}
+        parts = [self._at((config, view, observed), now[view.shown]) for view in views]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def _at(self, key: tuple[CameraConfig, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A part of a frame; now: what its camera shows. A delayed view shows the newest picture that is at least
+        `delay` control steps old; before there is one, the episode's first."""
+        delay = key[1].delay
+        if not delay:
+            return now
+        drawn = self._drawn.setdefault(key, [])
+        if not drawn or drawn[-1][0] < self.steps:
+            drawn.append((self.steps, now))
+        while len(drawn) > 1 and drawn[1][0] <= self.steps - delay:
+            drawn.pop(0)
+        return drawn[0][1]
+
+    def close(self) -> None:
+        """As `World.close`."""
+        self._observation = None
+        self._drawn.clear()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class MujocoWorld(EpisodeWorld):
+    """A world with a MuJoCo model. Each view has a graphics context, opened when it is first drawn. What a stress
+    changes of the model is put back at the next reset."""
+
+    stressable = EpisodeWorld.stressable | {"model"}
+
+    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
+        super().__init__(spec, task, camera, horizon)
+        self._cameras: dict[CameraConfig, Camera] = {}
+        self._changes = ModelChanges()
+
+    @abstractmethod
+    def _drawable(self) -> tuple[Any, Any]:
+        """The MjModel, and MjData in which all poses are up to date."""
+
+    def reset(self, seed: int) -> Observation:
+        """As `World.reset`."""
+        self._changes.restore()
+        observation = super().reset(seed)
+        if self.stress.changes_model:
+            self.stress.change(self._drawable()[0], self._changes)
+        return observation
+
+    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+        model, data = self._drawable()
+        if camera not in self._cameras:
+            self._cameras[camera] = Camera(model, camera, camera.name in self.spec.upside_down)
+        return self._cameras[camera].render(data)
+
+    def close(self) -> None:
+        """As `World.close`."""
+        self._changes.restore()
+        for camera in self._cameras.values():
+            camera.close()
+        self._cameras.clear()
+        super().close()
