@@ -326,7 +326,6 @@ def description(**changes: Any) -> TargetDescription:
         (lambda v: v["skip"]["tasks"]["reach-v3"].update(low=0.95), "the skip levels are not in order"),
         (lambda v: v["skip"]["tasks"]["reach-v3"].update(s_min=float("nan")), "damaged: skip.tasks.reach-v3.s_min"),
         (lambda v: v["skip"]["tasks"]["reach-v3"].pop("high"), "damaged: skip.tasks.reach-v3.high"),
-        (lambda v: v.update(extra=1), "damaged: extra"),
         (lambda v: v.update(format=1), "damaged: format"),
         (lambda v: v.update(kind="target"), "damaged: kind"),
         (lambda v: v["target"].update(sha256="c" * 64), "was made for target cccccccccccc, not for aaaaaaaaaaaa"),

@@ -109,7 +109,7 @@ def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path: Path) -> N
     for cell in cells:
         store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
     store.write_plan(StudySettings("stopped", ""), cells)
-    assert [len(look) for look in decided.looks_of(cells)] == [2, 2]
+    assert [len(look) for look in decided.looks_of(cells, 2)] == [2, 2]
     (found,) = decided.verdicts(load_study(store), ["spec_vla"], 0.5, 2, 2)
     assert found.pairs == 4
     decided.write_verdicts(store.root, {"spec_vla": found}, 50.0, 2)

@@ -123,13 +123,17 @@ def damaged(folder: Path, **changes: object) -> Path:
         ({"settings": {"chunk": 2, "observation": "state", "width": 32}}, "does not fit its own settings"),
         ({"words": "insert"}, "damaged: words"),
         ({"format": 9}, "written by another version"),
-        ({"surplus": 1}, "damaged: surplus"),
     ],
 )
 def test_a_damaged_description_is_one_line(tmp_path: Path, changes: dict[str, object], says: str) -> None:
     with pytest.raises(CheckpointError, match=says) as caught:
         load_target(damaged(tmp_path, **changes))
     assert "\n" not in str(caught.value)
+
+
+def test_a_field_of_a_newer_kerv_is_no_damage(tmp_path: Path) -> None:
+    target, description = load_target(damaged(tmp_path, surplus=1))
+    assert (target.chunk, description.family) == (description.chunk, "compact")
 
 
 def test_an_unknown_family_names_the_known_ones(tmp_path: Path) -> None:

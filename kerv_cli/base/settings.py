@@ -549,7 +549,9 @@ def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSe
     """
     settings = manifests.read(RolloutSettings, dict(plain), "a stored setting", tolerant)
     for group in parts.PART_GROUPS:
-        value = dict(getattr(settings, group))
+        value = getattr(settings, group)
+        if not isinstance(value, Mapping):
+            continue  # a kind of part that is younger than these settings: its default
         schema = parts.part_of(group, value["kind"]).settings
         setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}", tolerant))
     return settings

@@ -190,7 +190,7 @@ def _left_over(settings: DoctorSettings) -> list[Path]:
     from kerv_cli.lab.claims import void
 
     root = results_dir(settings.results)
-    claims = [path for store in _stores(settings) for path in void(store.claims)]
+    claims = [path for folder in sorted(root.glob("*/*/claims")) for path in void(folder)]
     return [*left_over(root), *claims]
 
 
