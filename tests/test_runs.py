@@ -165,7 +165,7 @@ def test_results_that_cannot_be_written_are_refused_at_once(tmp_path: Path) -> N
 
 def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     from kerv_cli.cli.rollout import warn_unseen
-    from kerv_cli.lab.rollout_runs import resolve_rollout
+    from kerv_cli.lab.resolve import resolve_rollout
 
     resolved = resolve_rollout(["method=ar,spec_vla", "task=coffee-button,reach"], multirun=True)
     warn_unseen(resolved, ("coffee-button-v3", "reach-v3"))

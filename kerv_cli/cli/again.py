@@ -16,7 +16,7 @@ from kerv_cli.lab.execute import execute
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
 from kerv_cli.lab.policy import check, identity_of
-from kerv_cli.lab.rollout_runs import new_name
+from kerv_cli.lab.reuse import new_name
 from kerv_cli.lab.run_file import note_invocation
 from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore
 

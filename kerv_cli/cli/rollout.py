@@ -54,7 +54,7 @@ def rollout(
     from kerv_cli.base.config import to_yaml
     from kerv_cli.base.places import check_writable
     from kerv_cli.lab.effects import without_effect
-    from kerv_cli.lab.rollout_runs import resolve_rollout
+    from kerv_cli.lab.resolve import resolve_rollout
     from kerv_cli.worlds import resolve_tasks
 
     words = list(overrides or [])
@@ -139,7 +139,7 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     from kerv_cli.lab import events
     from kerv_cli.lab.cells import CellRunner, reference_decode
     from kerv_cli.lab.execute import execute
-    from kerv_cli.lab.rollout_runs import begin
+    from kerv_cli.lab.reuse import begin
     from kerv_cli.lab.run import close_worlds
     from kerv_cli.lab.run_file import note_invocation
 

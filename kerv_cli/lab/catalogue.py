@@ -60,11 +60,6 @@ class RunEntry:
     made_from: dict[str, str] = field(default_factory=dict)
 
     @property
-    def complete(self) -> bool:
-        """Whether nothing of it is left to do."""
-        return self.state == "complete"
-
-    @property
     def has_episodes(self) -> bool:
         """Whether it is a sweep or a rollout."""
         return self.kind in (SWEEP, ROLLOUT)

@@ -16,7 +16,6 @@ class TimeEstimate:
     seconds: float  # wall time
     to_run: int  # cells
     reused: int
-    measured: bool  # False: a guess from `prior_seconds`
     source: str  # of the figure, in words
 
 
@@ -46,4 +45,4 @@ def estimate(covered: Covered, store: StudyStore, workers: int, prior_seconds: f
     total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
     source = f"measured on {stored} stored episodes" if stored else f"a guess of {prior_seconds:g} s per episode"
     at_once = max(1, min(workers, len(blocks_of(todo, workers))))
-    return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), bool(stored), source)
+    return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), source)

@@ -1,4 +1,4 @@
-"""Composes a study's settings from its YAML and the command line."""
+"""Composes the settings of a study, from its YAML and the command line, and of a rollout."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.lab.effects import without_effect
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
+
+EPISODES_PER_CELL = 1
+"""Of a rollout: Ctrl-C loses at most the episode that runs."""
 
 _OF_THE_SWEEP = ("study", "results", "until", "loss", "rerun")
 
@@ -61,6 +64,40 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
     texts = {label: " ".join(words) for label, words in written.items()}
     return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, sweep.rerun, tuple(theirs))
+
+
+def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
+    """The settings of `kerv rollout`: one, or with -m every point of the grid that comma lists form. Tasks are no axis
+    of the grid: every point runs on all of them. The first point without a drafter is the baseline.
+
+    Raises:
+        UsageError: an unknown key or name, a value that cannot be, a grid over `results`.
+    """
+    shared = [word for word in overrides if word.startswith("task=")]
+    words = [word for word in overrides if word not in shared]
+    varied = [key for key in swept_keys(words) if key != "method"] if multirun else []
+    if "results" in varied:
+        raise UsageError("results= names one folder: a run lies in one place")
+    settings: dict[str, RolloutSettings] = {}
+    written: dict[str, str] = {}
+    for point in expand(words) if multirun else [words]:
+        composed = compose("rollout", [*shared, *point], RolloutSettings)
+        composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
+        values = [f"{key.rsplit('.', 1)[-1]}={_value(point, key)}" for key in varied]
+        label = " ".join([composed.method, *values])
+        settings[label], written[label] = composed, " ".join(point)
+    baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
+    study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
+    return ResolvedStudy(study, settings, written)
+
+
+def _value(point: Sequence[str], key: str) -> str:
+    return next(word.split("=", 1)[1] for word in point if word.split("=", 1)[0] == key)
+
+
+def _is_ar(settings: RolloutSettings) -> bool:
+    drafts = (settings.prefill_draft, settings.proposer, settings.skip)
+    return all(part.kind == "none" for part in drafts) and settings.method == "ar"
 
 
 def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:

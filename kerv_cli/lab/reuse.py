@@ -1,20 +1,27 @@
-"""What a results folder already holds of a plan, and why the rest of it is to run."""
+"""What a results folder already holds of a plan, why the rest of it is to run, and where it is stored."""
 
 from __future__ import annotations
 
+import contextlib
+import re
+import secrets
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
 from kerv_cli.lab.code import code_hash
 from kerv_cli.lab.identity import ENGINE, OBSERVATION, depends_on_order, effective, flat, work_of
-from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.store import StudyStore, studies_of
+from kerv_cli.lab.plan import Cell, unique_cells
+from kerv_cli.lab.store import ROLLOUTS, StudyStore, stores, studies_of
+
+_MOST_NAME = 32  # letters of the methods in a rollout's name
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """What `rerun=` runs again: nothing; settings whose times were not taken in turn; cells of other code; everything."""
@@ -266,6 +273,29 @@ def _copy(source: StudyStore, store: StudyStore, name: str) -> None:
     write_folder(
         store.cells / name, lambda temporary: shutil.copytree(source.cells / name, temporary, dirs_exist_ok=True)
     )
+
+
+def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
+    """Where the cells are stored, the cells under the names that they have there, and how many of them are complete:
+    in a new folder, or in the newest run of the same cells that was interrupted. A run that is complete is not reused:
+    a rollout is asked for in order to be run."""
+    work = {(*cell.work, cell.seeds) for cell in cells}
+    for store in reversed(stores(Path(results).expanduser(), ROLLOUTS)):
+        with contextlib.suppress(UsageError, CheckpointError):
+            if {(*cell.work, cell.seeds) for cell in store.read_plan().cells} != work:
+                continue
+            there = cover(cells, Stock(store, others=False))
+            if there.reasons:
+                return store, there.cells, len(there.cells) - len(there.reasons)
+    return StudyStore(results, new_name(results, cells), ROLLOUTS), list(cells), 0
+
+
+def new_name(results: str | Path, cells: Sequence[Cell]) -> str:
+    """A free name: date, time and methods, e.g. `20260301-142530-ar-spec_vla`."""
+    methods = "-".join(dict.fromkeys(str(cell.settings["method"]) for cell in unique_cells(cells)))
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
+    taken = (Path(results).expanduser() / ROLLOUTS / name).exists()
+    return f"{name}-{secrets.token_hex(2)}" if taken else name
 
 
 def disagreements(cells: Iterable[Cell], stock: Stock) -> list[str]:

@@ -348,23 +348,6 @@ class StudyStore:
             )
         return read
 
-    def executed_actions(self, cell_id: str) -> dict[int, np.ndarray]:
-        """Seed -> the actions (T, D) that its episode executed, environment units, of a complete cell's repeat.
-
-        Raises:
-            CheckpointError: the cell is damaged.
-        """
-        folder = self.cells / cell_id
-        try:
-            decodes = pq.read_table(folder / "decodes.parquet", columns=["seed", "index", "actions"]).to_pandas()
-            steps = pq.read_table(folder / "episodes.parquet", columns=["seed", "steps"]).to_pandas()
-        except (OSError, pa.ArrowException) as error:
-            raise self._damaged(folder, error) from error
-        lengths = dict(zip(steps["seed"], steps["steps"], strict=True))
-        ordered = decodes.sort_values(["seed", "index"]).groupby("seed")["actions"]
-        # the last chunk of an episode may go beyond its end
-        return {int(s): np.concatenate([np.stack(c) for c in chunks])[: lengths[s]] for s, chunks in ordered}
-
     def write_failure(self, name: str, text: str) -> None:
         """Stores the traceback of a cell that failed."""
         with atomic_path(self.failures / f"{name}.txt") as temporary:
