@@ -16,6 +16,9 @@ from kerv_cli.base.limits import check_settings
 
 T = TypeVar("T")
 
+_UNKNOWN = "unexpected_keyword_argument"
+"""pydantic's name for a field that a dataclass does not have."""
+
 
 @functools.cache
 def _adapter(kind: Any) -> Any:
@@ -46,12 +49,14 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
 
     try:
         adapter: Any = _adapter(kind)  # type: ignore[arg-type]
-        checked: T = adapter.validate_python(_known(kind, value) if tolerant else value)
+        checked: T = adapter.validate_python(value)
+        check_settings(checked)
     except ValidationError as error:
         first = error.errors()[0]
+        if tolerant and any(one["type"] == _UNKNOWN for one in error.errors()):
+            return read(kind, _known(kind, value), what)
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
-        check_settings(checked)
     except KervError as error:  # what the dataclass itself refuses, and settings out of range
         raise CheckpointError(f"{what} is damaged: {error}") from error
     return checked

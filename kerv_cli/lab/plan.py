@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -39,7 +40,7 @@ class Cell:
     identity: dict[str, str] = field(default_factory=dict)  # hashes of target, drafter, ...
     repeat: int = 0  # the same episodes are measured `study.repeats` times
 
-    @property
+    @functools.cached_property
     def work(self) -> tuple[str, str, int]:
         """What it means apart from its seeds: setting, task and repeat."""
         return work_of(self.settings, self.identity), self.task, self.repeat
