@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.environments.spec import EnvironmentSpec, Expert
+from kerv_cli.environments.vectors import length
 from kerv_cli.errors import UnknownName, UsageError
 from kerv_cli.spaces import Observation
 
@@ -84,8 +85,8 @@ class Detour:
         first = ((action[self._dofs] - self._middle) / self._half)[:2]
         places = [observation.state[place.first : place.first + 2] for place in self.spec.observation.places]
         offsets = [place - hand[:2] for place in places]
-        aim = max(offsets, key=lambda offset: float(first @ offset) / max(float(np.linalg.norm(offset)), 1e-9))
-        distance = float(np.linalg.norm(aim))
+        aim = max(offsets, key=lambda offset: float(first @ offset) / max(length(offset), 1e-9))
+        distance = length(aim)
         along = np.array([*aim / distance, 0.0]) if distance > NEAR else np.array([0.0, 1.0, 0.0])
         left = np.array([-along[1], along[0], 0.0])
         aside = {"left": left, "right": -left, "above": np.array([0.0, 0.0, 1.0])}[self.way]
@@ -97,7 +98,7 @@ class Detour:
     def _passed(self, hand: Array, point: Array) -> bool:
         """Whether the hand is at the way point, or as far along as it."""
         on = float((hand - self._begin) @ self._along)
-        return bool(np.linalg.norm(point - hand) < NEAR or on > self._ahead)
+        return length(point - hand) < NEAR or on > self._ahead
 
     def _straight(self, offset: Array) -> Array:
         """The largest action in the direction of an offset (3,), metres."""

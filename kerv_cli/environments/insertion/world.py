@@ -25,6 +25,7 @@ from kerv_cli.environments.insertion.pose import (
     turn_between,
 )
 from kerv_cli.environments.spec import EnvironmentSpec
+from kerv_cli.environments.vectors import length
 from kerv_cli.environments.world import MujocoWorld
 
 INSERTED = 0.03
@@ -125,7 +126,7 @@ class InsertionWorld(MujocoWorld):
             self._data.eq_active[0] = False
         elif before >= _HOLDS:
             off = hand.seen_from(self._peg.along(GRASP))
-            if np.linalg.norm(off.position) <= _REACH and off.angle <= _REACH_ANGLE:
+            if length(off.position) <= _REACH and off.angle <= _REACH_ANGLE:
                 self._hold()
 
     def _drawable(self) -> tuple[Any, Any]:

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.environments.stress.base import Draws, ModelChanges, Stress, level_of, unit_vector
+from kerv_cli.environments.stress.base import Draws, ModelChanges, Stress, level_of
 from kerv_cli.environments.stress.turning import turned_quaternion
+from kerv_cli.environments.vectors import unit_vector
 from kerv_cli.spaces import ActionSpace
 
 

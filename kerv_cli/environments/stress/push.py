@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kerv_cli.environments.stress.base import Array, Draws, Spells, Stress, level_of, unit_vector
+from kerv_cli.environments.stress.base import Array, Draws, Spells, Stress, level_of
+from kerv_cli.environments.vectors import unit_vector
 from kerv_cli.spaces import ActionSpace
 
 SECONDS = 0.1

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kerv_cli.environments.stress.base import Array, unit_vector
+from kerv_cli.environments.stress.base import Array
+from kerv_cli.environments.vectors import unit_vector
 
 
 def turned(random: np.random.Generator, angle: float) -> Array:
