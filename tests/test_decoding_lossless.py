@@ -27,6 +27,8 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.protocol import Target
 
+pytestmark = pytest.mark.bits
+
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 

@@ -18,6 +18,7 @@ from kerv_cli.spaces import Observation
 CPU = torch.device("cpu")
 
 
+@pytest.mark.bits
 def test_the_stand_in_is_decoded_as_a_target() -> None:
     """Strict methods give AR's tokens in fewer forwards: every draft ends at the first wrong token."""
     observation = Observation(np.zeros(1), np.zeros(1), "", {})

@@ -109,6 +109,7 @@ def test_every_episode_takes_the_way_of_its_seed(recorded: Path) -> None:
         assert aside > 0.05 if way_of(entry.task, entry.seed, BOTH) == "left" else aside < -0.05, (entry.seed, aside)
 
 
+@pytest.mark.bits
 def test_labels_are_the_clean_expert_at_the_states_that_were_visited(recorded: Path) -> None:
     dataset = DemoDataset.open(recorded)
     index = next(i for i, entry in enumerate(dataset.episodes) if entry.perturbed)
@@ -126,6 +127,7 @@ def test_labels_are_the_clean_expert_at_the_states_that_were_visited(recorded: P
             observation = world.step(action)
 
 
+@pytest.mark.bits
 def test_a_recording_in_ways_goes_on_and_others_are_what_they_were(recorded: Path, tmp_path: Path) -> None:
     dataset = DemoDataset.open(recorded)
     (recorded / "manifest.json").unlink()
