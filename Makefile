@@ -6,13 +6,13 @@ STAMP := $(VENV)/.kerv-installed$(if $(filter-out 0,$(CUDA)),-cuda)
 CODE := kerv_cli tests scripts
 
 # One thread: the models are small, and results and timings must not depend on the number of cores.
-test: export OMP_NUM_THREADS := 1
+test test-cpus: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test demo torture lint format pages lock clean
+.PHONY: help setup test test-cpus demo torture lint format pages lock clean
 
 help: ## list these rules
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 setup: $(STAMP) ## install kerv and its tools into .venv (CUDA=1: with PyTorch for NVIDIA GPUs), and the OpenGL libraries if MuJoCo cannot draw
 	@scripts/graphics.sh $(BIN)/python
@@ -21,8 +21,13 @@ $(STAMP): pyproject.toml requirements/cpu.txt requirements/cuda.txt
 	@PYTHON="$(PYTHON)" CUDA="$(CUDA)" scripts/install.sh $@
 
 # Files stay whole: their fixtures are shared. More than four processes wait for each other's rendering.
+PARALLEL = -n $$($(BIN)/python -c 'import os; print(min(4, os.cpu_count() or 1))') --dist loadfile
+
 test: lint ## check style and types, then run the tests
-	@$(BIN)/python -m pytest -n $$($(BIN)/python -c 'import os; print(min(4, os.cpu_count() or 1))') --dist loadfile
+	@$(BIN)/python -m pytest $(PARALLEL)
+
+test-cpus: setup ## run the tests of equal bits and tokens under four kinds of CPU kernels
+	@$(BIN)/python scripts/cpus.py $(PARALLEL)
 
 demo: setup ## run the demo study and report it
 	@$(BIN)/kerv sweep study=demo

@@ -165,6 +165,7 @@ cases = {
 }
 
 
+@pytest.mark.bits
 @settings(max_examples=60, deadline=None)
 @given(space=st.sampled_from([SEVEN, SPEC.actions]), **cases)
 @pytest.mark.parametrize("kind", ["relaxed", "hybrid"])
@@ -176,6 +177,7 @@ def test_the_loop_accepts_by_definition(
     assert_same(target, prompt, kind, r, strict_dofs, seed, inside, nodes)
 
 
+@pytest.mark.bits
 @settings(max_examples=10, deadline=None)
 @given(**{**cases, "chunk": st.sampled_from([1, 2])})
 @pytest.mark.parametrize("kind", ["relaxed", "hybrid"])

@@ -86,6 +86,7 @@ def same(alone: Sequence[Any], together: Sequence[Any]) -> None:
         assert all(map(math.isnan, other.phases.values()))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("batch", [1, 2, 7])
 def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, batch: int) -> None:
@@ -99,17 +100,20 @@ def test_autoregressive_tokens_of_a_batch_are_those_of_its_rows(packed: bool, ba
     same(alone, together)
 
 
+@pytest.mark.bits
 def test_a_shorter_chunk_and_a_smaller_batch_after_a_larger_one() -> None:
     policy = target()
     for count in (3, 1, 2):
         same(*decoded(Decoder(policy, chunk=1), shown(count)))
 
 
+@pytest.mark.bits
 def test_parallel_passes_of_a_batch_are_those_of_its_rows() -> None:
     policy = target("target.parallel=true")
     same(*decoded(Decoder(policy, Parts(skip=ParallelPass(policy))), shown(5)))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(("radius", "history"), [(0, 0), (9, 1), (9, 30)])
 def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, history: int) -> None:
     policy = target()
@@ -124,6 +128,7 @@ def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, h
     assert {one.mode for one in together} == {"skip"}
 
 
+@pytest.mark.bits
 def test_prompts_of_different_lengths_are_decoded_apart() -> None:
     policy = MockTarget()
     seen = [Observation(np.array([0.1 * i]), np.zeros(0), "on " * (i % 3)) for i in range(6)]
@@ -223,6 +228,7 @@ def test_stopping_early_closes_the_worlds(stubs: type[Stub]) -> None:
 # --- real episodes
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("policy", ["nano-state", "nano-vision"])
 def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, policy: str) -> None:
     words = [f"policy.target={policy}", "deviation_every=2"]

@@ -88,6 +88,7 @@ def test_bytes_and_operations_of_a_forward() -> None:
     assert flops == 2 * weights * 3 + 4 * s.layers * s.width * (3 * 10 + 1 + 2 + 3)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_a_verification_and_single_tokens_agree(dtype: str) -> None:
     differ, compared = flipped(open_model(dataclasses.replace(NANO, dtype=dtype)), 3, 8)
@@ -163,6 +164,7 @@ def test_a_projection_keeps_the_share_of_the_floor() -> None:
     assert projected([phase], Machine(1e10, 1e12), Machine(1e12, 1e14), overhead=1e-3)[0].seconds == 1e-3
 
 
+@pytest.mark.bits
 def test_a_stage_reports_the_targets_own_tokens() -> None:
     model = open_model(NANO)
     stage = Stage(model)

@@ -251,6 +251,7 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
         np.testing.assert_allclose(ahead, 0.25)
 
 
+@pytest.mark.bits
 def test_the_presampled_variability_is_the_decoders_own(results: Path) -> None:
     """The decoder's K is the function of the tokens it records."""
     run = CalibrationRun(settings(results))

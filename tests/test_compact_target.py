@@ -204,6 +204,7 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.bits
 def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(seven: Path) -> None:
     target, description = load_target(seven / "artifacts/target/arm")
     target.actions.check_same(SEVEN, "the target", "the arm")

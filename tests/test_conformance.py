@@ -38,6 +38,7 @@ def test_the_examples_keep_the_protocol(target: Any) -> None:
     assert len(found) == 12
 
 
+@pytest.mark.bits
 def test_the_example_without_a_cache_is_decoded_losslessly() -> None:
     target = OwnPolicy()
     prompt = target.encode(SEEN)

@@ -128,6 +128,7 @@ def store_of(vectors: np.ndarray, shards: dict[str, slice], seeds: np.ndarray | 
     return Datastore(any_manifest(vectors), vectors, tokens, rows if seeds is None else seeds, rows, rows, shards)
 
 
+@pytest.mark.bits
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(0, 20), st.integers(1, 12), st.integers(1, 4))
 def test_the_search_is_brute_force_with_ties_in_stored_order(seed: int, n: int, before: int, k: int, span: int) -> None:
@@ -148,6 +149,7 @@ def test_the_search_is_brute_force_with_ties_in_stored_order(seed: int, n: int, 
         assert found.chunks.tolist() == [[row % 251, row // 251] for row in ranked]
 
 
+@pytest.mark.bits
 def test_the_search_is_exact_at_real_size_and_duplicates_keep_their_order() -> None:
     rng = np.random.default_rng(0)
     for rows, width in ((9001, 192), (6, 1024), (1999, 128), (10, 32)):
@@ -165,6 +167,7 @@ def test_the_search_is_exact_at_real_size_and_duplicates_keep_their_order() -> N
             assert found.similarity == pytest.approx(exact[found.steps], abs=1e-6)
 
 
+@pytest.mark.bits
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 9), st.sampled_from([0.0, 1e-7, 1e-3, 0.1]))
 def test_the_search_is_exact_where_an_outline_says_most(seed: int, rank: int, k: int, noise: float) -> None:
@@ -191,6 +194,7 @@ def test_few_rows_are_read_whole() -> None:
     assert max(len(index.candidates(vectors[row], "a", 5, None)) for row in range(0, 9000, 500)) < 30
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("name", ["nano-state", "nano-vision"])
 def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
     store, _, description = opened(results, name)
@@ -520,6 +524,7 @@ def test_a_full_disk_is_one_line(copy: Path, monkeypatch: pytest.MonkeyPatch, fu
     assert opened(copy)[0].manifest.rows == 52
 
 
+@pytest.mark.bits
 def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> None:
     first = {p.name: p.read_bytes() for p in folder_of(copy).iterdir()}
     DatastoreBuild(asked(copy, episodes=1)).build()

@@ -28,6 +28,8 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.worlds.metaworld.spec import SPEC
 
+pytestmark = pytest.mark.bits
+
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 

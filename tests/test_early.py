@@ -118,6 +118,7 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
         assert drafted(moved, history) != plain
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("is_intel", [True, False])
 @pytest.mark.parametrize("history", [0, 2])
 def test_packed_weights_give_the_same_logits(history: int, is_intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,6 +295,7 @@ def test_a_share_of_the_observations_is_spread_evenly(nano: CompactTarget, share
     assert np.ptp(np.diff([*where, 10])) <= 1
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
 def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: str) -> None:
     """Batched over episodes, yet sample by sample what the decoder gives for that observation."""
@@ -351,6 +353,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
         read_early(results / "artifacts/early/whole", foreign)
 
 
+@pytest.mark.bits
 def test_an_interrupted_run_ends_where_the_uninterrupted_one_does(results: Path) -> None:
     def run(name: str) -> EarlyRun:
         overrides = ["drafter=early", "policy.target=nano-state", f"policy.early={name}", "demos=few"]
@@ -375,6 +378,7 @@ def test_an_interrupted_run_ends_where_the_uninterrupted_one_does(results: Path)
     assert logs[0] == logs[1]
 
 
+@pytest.mark.bits
 def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_path: Path, policies: Path) -> None:
     target, description = load_target(policies / "artifacts/target/nano-state")
     early = drafter(SMALL, target)

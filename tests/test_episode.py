@@ -26,6 +26,7 @@ def episodes(chosen: RolloutSettings, count: int = 2) -> list[EpisodeRecord]:
     return list(run.run_task(chosen, "drawer-open-v3", range(EVALUATION_SEED, EVALUATION_SEED + count)))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("policy", ["nano-state", "nano-vision"])
 def test_strict_speculation_is_ar_in_closed_loop(policies: Path, policy: str) -> None:
     ar = episodes(settings(policies, "method=ar", f"policy.target={policy}"))

@@ -51,6 +51,7 @@ def test_nobody_succeeds_who_does_not_turn(task: str) -> None:
             assert states[:, 2].min() > 0.03  # the hand was never pushed through anything
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("task", TASKS)
 def test_a_seed_names_one_episode_to_the_last_bit(task: str) -> None:
     with SPEC.open_world(task, SMALL) as world:

@@ -107,8 +107,9 @@ def test_it_is_reported_as_it_was(results: str, tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(now[before.columns], before)
 
 
+@pytest.mark.bits
 def test_its_tokens_are_those_of_today(results: str, tmp_path: Path) -> None:
-    """A run of every method on the stored weights, again; compared on the machine at hand."""
+    """A run of every method on the stored weights, again, whatever the CPU."""
     told = answer("runs", "rerun", "four-methods", results)
     assert told["episodes"] == 24
     assert told["same_tokens"] == 24

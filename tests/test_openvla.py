@@ -246,6 +246,7 @@ def published_action(ids: list[int], vocabulary: int) -> np.ndarray:
     return np.where(mask, 0.5 * (normalised + 1) * (high - low) + low, normalised)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("key_value_heads", [None, 2])
 def test_logits_and_actions_equal_transformers(
     checkpoint: Path, target: OpenVLATarget, tmp_path: Path, key_value_heads: int | None
@@ -313,6 +314,7 @@ def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
 # --- the engine: lossless at D = 7, N = 7
 
 
+@pytest.mark.bits
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10_000), nodes=st.integers(0, 24), inside=st.booleans(), fixed=st.booleans())
 def test_strict_decoding_equals_ar(
@@ -332,6 +334,7 @@ def test_strict_decoding_equals_ar(
     assert_adds_up(result)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", ["chain", "tree", "jacobi"])
 def test_the_methods_run_on_it(target: OpenVLATarget, kind: str) -> None:
     torch.manual_seed(0)

@@ -54,6 +54,7 @@ def results(policies: Path, tmp_path: Path) -> Path:
     return copied
 
 
+@pytest.mark.bits
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 2, 4]), depth=st.integers(0, 20), data=st.data())
 @pytest.mark.parametrize("place", ["proposer", "prefill_draft", "merged"])
@@ -111,6 +112,7 @@ def test_a_perfect_table_drafts_the_whole_chunk_in_one_forward() -> None:
     assert (chunk.forwards, chunk.tokens) == (1, truth.flatten().tolist())
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(
     ("overrides", "wanted"),
     [

@@ -22,6 +22,8 @@ from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.worlds.metaworld.spec import SPEC
 
+pytestmark = pytest.mark.bits
+
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 ALONE = ObservationSpace(("x", "y", "z"), 3, (Place("hole", 0),), (0.1, 0.2, 0.3))  # the least there can be

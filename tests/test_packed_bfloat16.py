@@ -13,7 +13,10 @@ from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.trunk import Trunk
 
-pytestmark = pytest.mark.skipif(not multiplies_bfloat16(), reason="this CPU does not multiply bfloat16")
+pytestmark = [
+    pytest.mark.bits,
+    pytest.mark.skipif(not multiplies_bfloat16(), reason="this CPU does not multiply bfloat16"),
+]
 
 
 @pytest.fixture(scope="module")

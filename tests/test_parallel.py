@@ -59,6 +59,7 @@ def oracle(policy: CompactTarget, prompt: torch.Tensor) -> list[int]:
     return policy.head(policy.trunk.norm(x))[0, size:].argmax(-1).tolist()
 
 
+@pytest.mark.bits
 @torch.inference_mode()
 @pytest.mark.parametrize("packed", [False, True])
 def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(packed: bool) -> None:
@@ -84,6 +85,7 @@ def test_a_later_query_changes_the_first_token_s_logits() -> None:
     assert not torch.allclose(before, policy.parallel_pass(prompt)[0, 0])
 
 
+@pytest.mark.bits
 def test_training_shows_it_no_action_token() -> None:
     policy = target("target.parallel=true")
     one = some_observation()

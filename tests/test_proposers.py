@@ -101,6 +101,7 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
     }
 
 
+@pytest.mark.bits
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), data=st.data())
 @pytest.mark.parametrize("name", ["hold", "linear", "kalman", "early", "retrieval", "merged", "hybrid"])
@@ -120,6 +121,7 @@ def test_every_proposer_is_lossless(name: str, seed: int, chunk: int, data: st.D
         assert all(len(r.drafted) <= 4 for r in result.rounds if r.proposer == "drafter")  # its depth
 
 
+@pytest.mark.bits
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 4, 8]), executed=st.integers(0, 12), carry_on=st.booleans()
@@ -258,6 +260,7 @@ def test_a_chunk_longer_than_the_target_knows_is_refused() -> None:
         Decoder(random_target(0, 1, 1, 4), chunk=5)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("before", [True, False])
 def test_the_cache_has_room_for_the_largest_tree_a_proposer_names(before: bool) -> None:
     """A proposer that drafts more nodes than a chunk has tokens."""

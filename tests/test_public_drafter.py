@@ -61,6 +61,7 @@ def written(folder: Path, drafter: PublicDrafter, embedding: Tensor) -> Path:
     return folder
 
 
+@pytest.mark.bits
 def test_it_computes_what_the_public_layer_does(target: OpenVLATarget) -> None:
     """EAGLE's forward, spelt out with transformers' layer: fc over (embedding, state), no norm in front or behind."""
     from transformers import LlamaConfig
@@ -84,6 +85,7 @@ def test_it_computes_what_the_public_layer_does(target: OpenVLATarget) -> None:
     torch.testing.assert_close(drafter(following, hidden, positions), wanted.view(1, 9, 64), atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("convention", [KERV, TEXT, PROMPT, Convention("text", "prompt")])
 @pytest.mark.parametrize("top_k", [1, 3])
 def test_decoding_with_it_is_lossless_under_every_convention(

@@ -72,6 +72,7 @@ def vectors_of(kind: str, width: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", ["random", "ties", "still"])
 @pytest.mark.parametrize("width", [3, 48])
 def test_the_neighbours_are_those_of_exact_search(searched: Open, kind: str, width: int) -> None:

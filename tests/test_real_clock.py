@@ -80,6 +80,7 @@ def constant(steps: float, compensation: str = "none") -> RealClock:
     return RealClock(Constant(steps / HZ), SPEC.actions, compensation)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("compensation", ["none", "hold", "linear", "kalman", "chunk", "position"])
 def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: str) -> None:
     waiting, real = point_episode(None), point_episode(constant(0, compensation))
@@ -90,6 +91,7 @@ def test_without_latency_an_episode_is_the_one_in_a_waiting_world(compensation: 
     assert all(d.delay is None for d in waiting.decodes)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("compensation", ["none", "kalman"])
 def test_without_latency_a_policy_is_bit_for_bit_the_same(policies: Path, compensation: str) -> None:
     real = ["rollout.clock=real", "rollout.latency=constant", f"rollout.delay_compensation={compensation}"]

@@ -349,6 +349,7 @@ def test_a_damaged_recording_is_refused(recorded: Path, tmp_path: Path) -> None:
     assert "does not match its manifest" in output
 
 
+@pytest.mark.bits
 def test_an_interrupted_recording_goes_on_and_ends_as_an_undisturbed_one(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,6 +111,7 @@ def test_comparison_says_what_differs_in_settings_and_results(results: Path) -> 
     assert kerv("runs", "compare", single, "target/nano-state", f"results={results}").exit_code == 2
 
 
+@pytest.mark.bits
 def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_path: Path) -> None:
     copy = tmp_path / "results"
     shutil.copytree(results, copy)

@@ -102,6 +102,7 @@ def until(condition: Any) -> None:
     raise AssertionError("waited in vain")
 
 
+@pytest.mark.bits
 def test_a_client_gets_the_actions_of_the_policy(policy: tuple[Interface, Decoder], policies: Path) -> None:
     target: Any = Artifacts(str(policies), PolicySettings(target="nano-vision")).target
     with serving(policy, every=2) as (port, log):

@@ -50,6 +50,7 @@ def noise_of(episode):
     return Perturbation(episode.task, episode.seed, SPEC.actions, noise, CONFIG.burst_probability)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("index", [0, 1])
 def test_an_episode_can_be_replayed_from_its_seed(recorded, index):
     episode = DemoDataset.open(recorded).load(index)
@@ -114,6 +115,7 @@ def test_the_manifest_tells_what_was_recorded(recorded):
     assert task.mean_steps == pytest.approx(np.mean([entry.steps for entry in task.episodes]), abs=0.01)
 
 
+@pytest.mark.bits
 def test_a_killed_recording_goes_on(copied):
     before = DemoDataset.open(copied)
     missing, damaged = before.episodes[1].path, before.episodes[4].path
@@ -128,6 +130,7 @@ def test_a_killed_recording_goes_on(copied):
     assert {path.name for path in again if again[path] != kept[path]} == {missing.name, damaged.name}
 
 
+@pytest.mark.bits
 def test_the_number_of_workers_changes_nothing(recorded, tmp_path):
     manifest = record(replace(CONFIG, workers=2), tmp_path / "parallel")
     assert manifest == DemoDataset.open(recorded).manifest
@@ -231,6 +234,7 @@ def as_format_1(folder):
         (folder / name).write_text(json.dumps({**value, "format": 1}))
 
 
+@pytest.mark.bits
 def test_a_dataset_of_format_1_is_metaworlds_and_can_be_gone_on_with(copied):
     before = DemoDataset.open(copied)
     as_format_1(copied)
@@ -255,6 +259,7 @@ def test_a_dataset_of_experts_with_several_ways_is_read_and_not_gone_on_with(cop
         record(CONFIG, copied)
 
 
+@pytest.mark.bits
 def test_noise_is_what_it_was_in_every_dataset_so_far():
     """Datasets recorded before must come out bit-equal when they are recorded again."""
     perturb = Perturbation("reach-v3", 1, SPEC.actions, (0.2, 0.6), 0.02)

@@ -36,6 +36,7 @@ def world():
         yield world
 
 
+@pytest.mark.bits
 def test_a_seed_names_one_episode_to_the_last_bit_drawn_or_not(world):
     first = episode(world, 57, draw=True)
     other = episode(world, 3)
@@ -72,6 +73,7 @@ def test_reset_and_step_report_what_happened(world):
     assert moved.state[18:36].tolist() == start.state[:18].tolist()
 
 
+@pytest.mark.bits
 def test_actions_are_clipped(world):
     world.reset(0)
     wild = [world.step([9.0, -9.0, 0.5, 3.0]).state for _ in range(5)]
@@ -212,6 +214,7 @@ def test_frames_are_fast(world):
     assert np.median(times) < 0.04
 
 
+@pytest.mark.bits
 def test_a_world_can_be_closed_twice_and_used_again():
     world = SPEC.open_world(TASK)
     world.close()

@@ -92,6 +92,7 @@ def test_every_kind_is_a_part_and_has_numbers_for_every_level() -> None:
         assert (np.diff(np.array(rows), axis=0) > 0).all(), kind  # every number grows with the level
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["insertion", "metaworld"])
 def test_level_0_is_no_stress_to_the_last_bit(kind: str, name: str, request: pytest.FixtureRequest) -> None:
@@ -101,6 +102,7 @@ def test_level_0_is_no_stress_to_the_last_bit(kind: str, name: str, request: pyt
     assert plain.images.tobytes() == zero.images.tobytes()
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["insertion", "metaworld"])
 def test_a_kind_changes_what_it_should_and_nothing_else(kind: str, name: str, request: pytest.FixtureRequest) -> None:
@@ -112,6 +114,7 @@ def test_a_kind_changes_what_it_should_and_nothing_else(kind: str, name: str, re
     assert (plain.start.tobytes() == stressed.start.tobytes()) == (kind != "object")
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_seed_gives_the_same_stress_and_another_seed_another(insertion: MujocoWorld, kind: str) -> None:
     first, other, again = (play(insertion, kind, 4, seed) for seed in (SEED, SEED + 1, SEED))
@@ -120,6 +123,7 @@ def test_the_same_seed_gives_the_same_stress_and_another_seed_another(insertion:
     assert first.images.tobytes() != other.images.tobytes()
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("name", ["insertion", "metaworld"])
 def test_the_model_is_whole_again_at_the_next_episode(name: str, request: pytest.FixtureRequest) -> None:
     world = request.getfixturevalue(name)
@@ -203,6 +207,7 @@ def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction(met
     assert np.linalg.norm(metaworld.end_effector - begin) > 0.02
 
 
+@pytest.mark.bits
 def test_what_a_policy_does_changes_neither_pushes_nor_noise() -> None:
     def executed(kind: str, wanted: float) -> np.ndarray:
         stress = stressing.build(StressSettings(kind, 1))
@@ -220,6 +225,7 @@ def test_what_a_policy_does_changes_neither_pushes_nor_noise() -> None:
     assert ((gain > 0.08) & (gain < 0.12)).all()
 
 
+@pytest.mark.bits
 def test_a_picture_depends_on_the_control_step_and_not_on_how_often_the_policy_looked(insertion: MujocoWorld) -> None:
     camera = INSERTION.cameras[0]
 
@@ -292,6 +298,7 @@ def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metawor
     assert all(np.linalg.norm(start[:2] - start[3:5]) >= 0.15 for start in starts)
 
 
+@pytest.mark.bits
 def test_worlds_are_shared_between_stressed_and_plain_settings() -> None:
     words = ["policy=expert", "task=insert-peg", "record=0"]
     plain = Runner(compose("rollout", words, RolloutSettings), "insert-peg")

@@ -186,6 +186,7 @@ def test_two_level_interval_covers_the_truth_where_pairs_alone_would_not() -> No
     assert inside[1] / 200 < 0.75
 
 
+@pytest.mark.bits
 def test_same_numbers_every_time() -> None:
     rng = np.random.default_rng(1)
     baseline, method = rng.uniform(1, 2, 9), rng.uniform(1, 2, 9)

@@ -58,6 +58,7 @@ def quadratic(folder: Path, identity: str = "a") -> Loop:
     return Loop(job, TINY, folder, identity)
 
 
+@pytest.mark.bits
 def test_an_interrupted_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     whole = quadratic(tmp_path / "whole")
     whole.run()
@@ -76,6 +77,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(("number", "last"), [(signal.SIGINT, 7), (signal.SIGTERM, 7), (signal.SIGINT, 2)])
 def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
     tmp_path: Path, number: signal.Signals, last: int
@@ -241,6 +243,7 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
     assert torch.allclose(token_loss(logits, tokens, soft_labels(255, 0.0)), plain)
 
 
+@pytest.mark.bits
 def test_batched_greedy_decoding_is_the_decoders() -> None:
     from kerv_cli.engine.decoder import Decoder
 
@@ -269,6 +272,7 @@ def train(results: Path, *arguments: str) -> list[str]:
     ]
 
 
+@pytest.mark.bits
 def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results: Path) -> None:
     settings = [
         "target=nano",

@@ -77,6 +77,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.bits
 def test_a_run_begins_with_the_weights_statistics_and_words(results: Path) -> None:
     folder = trained(results, "train.lr=0", "train.weight_decay=0")
     old, _ = load_target(results / "artifacts/target/old")
@@ -103,6 +104,7 @@ def test_training_changes_the_new_target_and_not_the_old_one(results: Path) -> N
     assert not torch.equal(before["head.weight"], after["head.weight"])
 
 
+@pytest.mark.bits
 def test_an_interrupted_run_goes_on_where_it_was(results: Path) -> None:
     whole = trained(results, "name=whole")
     with pytest.raises(KeyboardInterrupt):

@@ -54,6 +54,7 @@ def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPat
         join("cuda:1", 63)
 
 
+@pytest.mark.bits
 def test_two_processes_train_what_one_does(results: Path) -> None:
     words = ["train", "target", "task=drawer-close-v3", "demos=few", *SIZES, "train.steps=4", "train.batch=8"]
     words += ["train.validate_every=2", "train.bf16=false", "train.warmup=1", f"results={results}"]
@@ -105,6 +106,7 @@ def test_datasets_of_other_cameras_do_not_add_up(results: Path, tmp_path: Path) 
         DemoDataset.joined([open_demos(str(results), "few"), DemoDataset.open(tmp_path / "other")])
 
 
+@pytest.mark.bits
 def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
     acts = TargetActs.of("results", "mt10-state", SPEC, WorldSettings())
     tasks, share = ("reach-v3",), 0.5

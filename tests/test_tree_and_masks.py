@@ -144,6 +144,7 @@ def test_commit_leaves_the_path_behind_the_prefix(start: int, path: list[int]) -
     assert (cache.layers[1][1][0, 1, : cache.length, 0] == torch.tensor(expected, dtype=torch.float32)).all()
 
 
+@pytest.mark.bits
 def test_tree_forward_equals_forwarding_every_path_alone() -> None:
     """Positions and masks together: each node's state is what the plain causal trunk gives for its own path."""
     torch.manual_seed(0)

@@ -120,6 +120,7 @@ def test_variability_does_not_grow_with_the_chunk(make: Callable[[], Any], befor
 # --- skip=always
 
 
+@pytest.mark.bits
 def test_always_skip_executes_the_sources_tokens_without_a_forward() -> None:
     target = MockTarget()
     source = Near(target, target.encode(SHOWN), bins=5)

@@ -129,6 +129,7 @@ def shown(camera: str, seed: int = 0) -> Observation:
     return Observation(rng.normal(size=4), rng.normal(size=39), "close the drawer", {camera: image})
 
 
+@pytest.mark.bits
 def test_every_view_has_tokens_of_its_own() -> None:
     one, two = made("corner4"), made(HAND)
     cells = one.settings.grid**2
@@ -144,6 +145,7 @@ def test_every_view_has_tokens_of_its_own() -> None:
     assert not torch.allclose(places, moved)
 
 
+@pytest.mark.bits
 @pytest.mark.skipif(not has_blocked_layouts(), reason="no packed vision encoder in this build of torch")
 @pytest.mark.parametrize("camera", ["corner4", HAND, "corner4+corner4@4+gripperPOV"])
 def test_packed_weights_compute_the_same_prompt(camera: str) -> None:
@@ -162,6 +164,7 @@ def test_a_frame_of_other_views_is_refused() -> None:
         made(HAND).encode(seen.with_images({HAND: seen.images["corner4"]}))
 
 
+@pytest.mark.bits
 def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates() -> None:
     one = made("corner4", seed=3)
     two = continued_target(one.settings, one, HAND).eval()

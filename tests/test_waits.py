@@ -102,6 +102,7 @@ CASES = [
 ]
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(("family", "captured"), dict.fromkeys(CASES))
 def test_a_round_waits_once(family: str, captured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """And the tokens are those of the host, draft for draft: the same rounds."""

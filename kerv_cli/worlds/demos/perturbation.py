@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.worlds.vectors import unit_vector
 
 _BURST_STEPS = (3, 8)
 
@@ -49,8 +50,7 @@ class Perturbation:
         noise = self._random.normal(0.0, self.sigma, size=dofs)
         if self._burst_left == 0 and self._random.random() < self._burst_probability:
             self._burst_left = int(self._random.integers(_BURST_STEPS[0], _BURST_STEPS[1] + 1))
-            direction = self._random.normal(size=dofs)
-            self._direction = direction / np.linalg.norm(direction)
+            self._direction = unit_vector(self._random, dofs)
         moved = action[self._noisy] + noise * self._half
         if self._burst_left > 0:
             self._burst_left -= 1

@@ -108,12 +108,6 @@ class Spells:
         return lasts, begins
 
 
-def unit_vector(random: np.random.Generator, size: int) -> Array:
-    """(size,) of length 1, in a direction that is uniform over the sphere."""
-    drawn = random.normal(size=size)
-    return np.asarray(drawn / np.linalg.norm(drawn))
-
-
 def either(random: np.random.Generator, factor: float) -> float:
     """`factor` or its inverse."""
     return factor if random.random() < 0.5 else 1.0 / factor

@@ -46,5 +46,5 @@ class Light(Stress):
             strength[...] *= gain
         for lamp in range(model.nlight):
             turn = turned(random, np.deg2rad(level.degrees))
-            model.light_dir[lamp] = turn @ model.light_dir[lamp]
-            model.light_pos[lamp] = turn @ model.light_pos[lamp]
+            for vector in (model.light_dir[lamp], model.light_pos[lamp]):
+                vector[:] = sum((turn * vector).T)  # in this order on every CPU; `turn @ vector` is OpenBLAS's

@@ -6,6 +6,7 @@ import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds.stress.base import Array, Draws, Spells, Stress, level_of, unit_vector
+from kerv_cli.worlds.vectors import unit_vector
 
 SECONDS = 0.1
 """Of a burst."""

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kerv_cli.worlds.stress.base import Array, unit_vector
+from kerv_cli.worlds.vectors import unit_vector
 
 
 def turned(random: np.random.Generator, angle: float) -> Array:

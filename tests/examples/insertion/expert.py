@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.vectors import length
 
 from .pose import GRASP, PEG_HALF, Pose, limited, misfit, turn_between
 
@@ -35,7 +36,7 @@ class InsertionExpert:
         peg, slot = Pose.of(state[7:10], state[16:19]), Pose.of(state[10:13], state[13:16])
         grasp = peg.along(GRASP)
         off = hand.seen_from(grasp)
-        near = float(np.linalg.norm(off.position))
+        near = length(off.position)
         if opening < 0.5 and near < _HELD_NEAR:
             return self._towards(hand, hand.seen_from(peg).within(_next_peg(peg, slot)), 0.0)
         if near < _GRASP_NEAR and off.angle < _GRASP_ALIGNED:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.worlds.camera import load_mujoco
+from kerv_cli.worlds.vectors import length
 
 load_mujoco()  # chooses the GL backend, which mujoco reads when it is imported
 import mujoco  # noqa: E402
@@ -23,7 +24,7 @@ PEG_HALF = 0.04
 
 def quaternion_of(vector: Array) -> Array:
     """Rotation vector (3,), radians -> quaternion (w, x, y, z)."""
-    angle = float(np.linalg.norm(vector))
+    angle = length(vector)
     found = np.array([1.0, 0.0, 0.0, 0.0])
     if angle > 0.0:
         mujoco.mju_axisAngle2Quat(found, np.asarray(vector) / angle, angle)
@@ -76,7 +77,7 @@ class Pose:
     @property
     def angle(self) -> float:
         """Angle of the rotation, radians."""
-        return float(np.linalg.norm(self.vector))
+        return length(self.vector)
 
     def along(self, distance: float) -> Pose:
         """The pose moved by `distance` metres along its own z axis."""
@@ -108,5 +109,5 @@ def misfit(peg: Pose, slot: Pose) -> tuple[float, float, float]:
 
 def limited(vector: Array, most: float) -> Array:
     """The vector, shortened to length `most` if it is longer."""
-    length = float(np.linalg.norm(vector))
-    return vector if length <= most else vector * (most / length)
+    own = length(vector)
+    return vector if own <= most else vector * (most / own)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import EnvironmentSpec
+from kerv_cli.worlds.vectors import length
 from kerv_cli.worlds.world import MujocoWorld
 
 from .pose import (
@@ -126,7 +127,7 @@ class InsertionWorld(MujocoWorld):
             self._data.eq_active[0] = False
         elif before >= _HOLDS:
             off = hand.seen_from(self._peg.along(GRASP))
-            if np.linalg.norm(off.position) <= _REACH and off.angle <= _REACH_ANGLE:
+            if length(off.position) <= _REACH and off.angle <= _REACH_ANGLE:
                 self._hold()
 
     def _drawable(self) -> tuple[Any, Any]:
