@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kerv_cli.environments import spec_of
-from kerv_cli.environments import stress as stressing
-from kerv_cli.environments.camera import CameraConfig
-from kerv_cli.environments.demos.recording import DemoConfig, record
-from kerv_cli.environments.demos.ways import WAYS
-from kerv_cli.environments.vectors import length
-from kerv_cli.registry import parts
-from kerv_cli.settings import StressSettings
+
+from kerv_cli.base.registry import parts
+from kerv_cli.base.settings import StressSettings
+from kerv_cli.worlds import spec_of
+from kerv_cli.worlds import stress as stressing
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+from kerv_cli.worlds.vectors import length
 
 pytestmark = pytest.mark.bits
 
@@ -37,10 +37,12 @@ def test_a_length_is_rounded_once_per_number_and_for_the_root(numbers: list[floa
 
 
 def recordings(folder: Path) -> list[str]:
-    """Hashes of demonstrations with noise, in two environments, with ways in one."""
-    plain = DemoConfig(("INSERTION",), episodes=2, camera=SMALL, frame_stride=25, workers=1, tail=5)
-    ways = DemoConfig(("reach",), episodes=2, camera=SMALL, frame_stride=25, workers=1, tail=5, ways=WAYS)
-    return [record(config, folder / config.spec.name).sha256 for config in (plain, ways)]
+    """Hashes of demonstrations with noise, in two environments."""
+    configs = [
+        DemoConfig((tasks,), episodes=2, camera=SMALL, frame_stride=25, workers=1, tail=5)
+        for tasks in ("INSERTION", "reach")
+    ]
+    return [record(config, folder / config.spec.name).sha256 for config in configs]
 
 
 def stressed() -> list[str]:
@@ -67,7 +69,8 @@ def test_another_kernel_records_and_draws_the_same(tmp_path: Path) -> None:
     """OpenBLAS's kernels for Prescott run on every x86-64 and round other bits than those of later CPUs; on other
     machines the variable has no effect. Of Meta-World the float32 state of recordings is compared: in float64 the last
     bit of its gripper's opening is `np.linalg.norm`'s."""
-    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}
+    plugins = {"KERV_PLUGINS": "examples.insertion", "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = os.environ | plugins | {"OPENBLAS_CORETYPE": "Prescott"}
     command = [sys.executable, __file__, str(tmp_path / "other")]
     other = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert other.stdout.split() == digests(tmp_path / "own"), other.stderr

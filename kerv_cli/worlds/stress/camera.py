@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, level_of, unit_vector
+from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, level_of
 from kerv_cli.worlds.stress.turning import turned_quaternion
 from kerv_cli.worlds.vectors import unit_vector
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Draws, Spells, Stress, level_of, unit_vector
+from kerv_cli.worlds.stress.base import Array, Draws, Spells, Stress, level_of
 from kerv_cli.worlds.vectors import unit_vector
 
 SECONDS = 0.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kerv_cli.worlds.stress.base import Array, unit_vector
+from kerv_cli.worlds.stress.base import Array
 from kerv_cli.worlds.vectors import unit_vector
 
 
