@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml requirements/cpu.txt requirements/cuda.txt
 # Files stay whole: their fixtures are shared. More than four processes wait for each other's rendering.
 PARALLEL = -n $$($(BIN)/python -c 'import os; print(min(4, os.cpu_count() or 1))') --dist loadfile
 
-test: lint ## check style and types, then run the tests
+test: lint ## check style, types and imports, then run the tests
 	@$(BIN)/python -m pytest $(PARALLEL)
 
 test-cpus: setup ## run the tests of equal bits and tokens under four kinds of CPU kernels
@@ -38,10 +38,11 @@ torture: export OMP_NUM_THREADS := 1
 torture: setup ## kill commands and damage files for at most 15 minutes (MINUTES=, SHORT=1); see docs/torture.md
 	@$(BIN)/python scripts/torture.py --minutes $(or $(MINUTES),15) $(if $(SHORT),--short)
 
-lint: setup ## check style and types
+lint: setup ## check style, types and which room imports which
 	@$(BIN)/ruff check $(CODE)
 	@$(BIN)/ruff format --check $(CODE)
 	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-logo
 
 format: setup ## rewrite the code in the project's style
 	@$(BIN)/ruff check --fix --quiet $(CODE)
@@ -54,5 +55,5 @@ lock: setup ## write requirements/*.txt from what is installed
 	@scripts/lock.sh $(BIN)/python
 
 clean: ## remove caches and built packages; keeps .venv and results
-	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis MUJOCO_LOG.TXT
+	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis MUJOCO_LOG.TXT
 	@find kerv_cli tests scripts conf -name __pycache__ -prune -exec rm -rf {} +

@@ -24,9 +24,10 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle import load_drafter, read_drafter
 from kerv_cli.methods.early import load_early
 from kerv_cli.methods.proposers import DrafterProposer, EarlyProposer
-from kerv_cli.targets.checkpoint import load_target, read_target, save_target
+from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
+from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk

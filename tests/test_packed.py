@@ -15,8 +15,9 @@ from kerv_cli.base.settings import DrafterSettings, TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
 from kerv_cli.methods.eagle import Drafter
-from kerv_cli.targets.compact import packed
-from kerv_cli.targets.compact.packed import FastLinear, has_blocked_layouts, pack
+from kerv_cli.targets.compact import kernels
+from kerv_cli.targets.compact.kernels import FastLinear, has_blocked_layouts
+from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
@@ -245,11 +246,11 @@ def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
 
 @pytest.mark.parametrize("intel", [True, False])
 def test_one_row_on_either_processor(intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packed, "is_intel", lambda: intel)
+    monkeypatch.setattr(kernels, "is_intel", lambda: intel)
     weight, x, other = torch.randn(24, 16), torch.randn(16), torch.randn(24)
     fast = FastLinear(weight)
-    products, plain = [], packed.row_product
-    monkeypatch.setattr(packed, "row_product", lambda *both: products.append(both) or plain(*both))
+    products, plain = [], kernels.row_product
+    monkeypatch.setattr(kernels, "row_product", lambda *both: products.append(both) or plain(*both))
     torch.testing.assert_close(fast.of_vector(x, 0.5), 0.5 * (weight @ x))
     torch.testing.assert_close(fast.added_to_vector(other, x), other + weight @ x)
     assert len(products) == (0 if intel else 2)

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.loss import chunk_loss, target_tokens
+from kerv_cli.engine.loss import auc, chunk_loss, target_tokens
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.methods.audit import Audit, Evidence
@@ -28,7 +28,7 @@ from kerv_cli.methods.certification import certify, episodes_needed, hoeffding_b
 from kerv_cli.methods.parts import RiskSkipSettings
 from kerv_cli.methods.risk import RiskSkip
 from kerv_cli.methods.scores import Draft
-from kerv_cli.report.risk import auc, coverage
+from kerv_cli.report.risk import coverage
 from kerv_cli.training import risk_recording
 
 # --- the certificate

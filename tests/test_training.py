@@ -21,7 +21,8 @@ from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainSettings
-from kerv_cli.targets.checkpoint import load_target, save_target, save_tensors
+from kerv_cli.targets.checkpoint import load_target, save_tensors
+from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary

@@ -17,7 +17,8 @@ from kerv_cli.base.settings import TargetSettings, TrainTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import View, frame_shape, views_of
 from kerv_cli.cli.app import app
-from kerv_cli.targets.compact.packed import has_blocked_layouts, pack
+from kerv_cli.targets.compact.kernels import has_blocked_layouts
+from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary
 from kerv_cli.worlds.camera import CameraConfig

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from kerv_cli.targets.compact.packed import FastLinear
+from kerv_cli.targets.compact.kernels import FastLinear
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear, multiplies_bfloat16
 
 _BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: a server's caches hold 100 MB and more

@@ -183,7 +183,7 @@ def fastest(device: torch.device) -> torch.dtype:
     if not multiplies_bfloat16():
         return torch.float32
     from kerv_cli.bench.machine import median_seconds
-    from kerv_cli.targets.compact.packed import FastLinear
+    from kerv_cli.targets.compact.kernels import FastLinear
     from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear
 
     weight, row = torch.ones(8192, 4096), torch.ones(1, 4096)

@@ -19,6 +19,7 @@ from kerv_cli.lab.policy import check, identity_of
 from kerv_cli.lab.reuse import new_name
 from kerv_cli.lab.run_file import note_invocation
 from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore
+from kerv_cli.report.viewing import save_recording
 
 if TYPE_CHECKING:
     from kerv_cli.training.runs import DrafterRun, TargetRun
@@ -72,7 +73,8 @@ def run_again(again: Again, results: str) -> RunEntry:
     """
     again.store.write_plan(again.study, again.cells)
     note_invocation(again.store.root, ["runs", "rerun", again.run.id])
-    outcome = execute(again.cells, CellRunner(again.store.rollouts, keep=True), again.store, gauge=reference_decode)
+    runner = CellRunner(again.store.rollouts, save_recording, keep=True)
+    outcome = execute(again.cells, runner, again.store, gauge=reference_decode)
     if outcome.failed:
         raise KervError(outcome.failed[0].reason)
     return find_run(results, again.store.name)

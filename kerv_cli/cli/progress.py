@@ -17,7 +17,6 @@ from rich.progress import (
 )
 
 from kerv_cli.lab import events
-from kerv_cli.lab.cells import CellLike
 from kerv_cli.lab.plan import Block, Cell
 
 
@@ -58,7 +57,7 @@ class ProgressDisplay:
             self._finish(event.cell, "completed by another sweep")
         self._refresh()
 
-    def on_step(self, cell: CellLike, seed: int, step: int) -> None:
+    def on_step(self, cell: Cell, seed: int, step: int) -> None:
         """Shows that `step` control steps of a seed's episode were executed; at most one episode runs at a time."""
         if self._bar is None:
             return

@@ -142,6 +142,7 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     from kerv_cli.lab.reuse import begin
     from kerv_cli.lab.run import close_worlds
     from kerv_cli.lab.run_file import note_invocation
+    from kerv_cli.report.viewing import save_recording
 
     store, cells, done = begin(results, cells)
     if done:
@@ -157,7 +158,8 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
             display(event)
 
         here = runtime.workers == 1
-        failure = _Remembering(CellRunner(store.rollouts, keep=True, on_step=display.on_step if here else None))
+        on_step = display.on_step if here else None
+        failure = _Remembering(CellRunner(store.rollouts, save_recording, keep=True, on_step=on_step))
         try:
             execute(cells, failure if here else failure.runner, store, runtime, on_event, reference_decode)
         except KeyboardInterrupt:

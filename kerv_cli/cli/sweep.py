@@ -110,6 +110,7 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
     from kerv_cli.lab.execute import execute
     from kerv_cli.lab.reuse import take_over
     from kerv_cli.lab.run_file import note_finished, note_invocation
+    from kerv_cli.report.viewing import save_recording
 
     runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
     cells = covered.cells
@@ -119,7 +120,7 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
     note_invocation(store.root, ["sweep", *words])
     here = runtime.executor == "local" and runtime.workers == 1
     with ProgressDisplay(console(stderr=True)) as display:
-        runner = CellRunner(store.rollouts, on_step=display.on_step if here else None)
+        runner = CellRunner(store.rollouts, save_recording, on_step=display.on_step if here else None)
         try:
             if resolved.until == "decided":
                 outcome = _until_decided(resolved, cells, store, lambda own: execute(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,8 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.transfer import upload
+
+BAD = 0.5  # a draft with a larger loss is one that should have been verified
 
 
 def chunk_loss(space: ActionSpace, drafted: Sequence[int], wanted: Sequence[int], scale: float) -> float:
@@ -48,6 +51,16 @@ def executed_loss(chunk: Chunk, chain: Sequence[int], scale: float) -> float:
         return 1.0
     off = np.abs(space.values_of(np.array(chain[: values.size])) - values).mean()
     return min(1.0, float(off) / scale)
+
+
+def auc(scores: np.ndarray, bad: np.ndarray) -> float:
+    """Probability that a bad draft scores below a good one, ties counting half; NaN where all are alike. scores (n,),
+    bad (n,) bool."""
+    low, high = np.sort(scores[bad]), scores[~bad]
+    if not low.size or not high.size:
+        return math.nan
+    below, not_above = (np.searchsorted(low, high, side) for side in ("left", "right"))
+    return float((below + not_above).mean() / (2 * low.size))
 
 
 @torch.inference_mode()

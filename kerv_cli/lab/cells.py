@@ -10,16 +10,16 @@ import dataclasses
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from kerv_cli.base.settings import RolloutSettings, settings_from
 from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.lab.plan import Cell
 from kerv_cli.lab.policy import artifacts_of
 from kerv_cli.lab.run import Runner, is_recorded, run_batch
 from kerv_cli.lab.together import Wanted
@@ -27,53 +27,29 @@ from kerv_cli.lab.together import Wanted
 _TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
 
 
-class CellLike(Protocol):
-    """The attributes of a study's cell that are used here; a protocol, because `studies` imports `rollouts`."""
-
-    @property
-    def id(self) -> str:
-        """Hash that names the cell."""
-
-    @property
-    def label(self) -> str:
-        """Name of its setting in the study."""
-
-    @property
-    def task(self) -> str:
-        """Full task name."""
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """One episode each."""
-
-    @property
-    def repeat(self) -> int:
-        """Number of the study's repeat, from 0."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """RolloutSettings as plain values."""
-
-
-C = TypeVar("C", bound=CellLike)
-
-OnStep = Callable[[CellLike, int, int], None]
+OnStep = Callable[[Cell, int, int], None]
 """Told the cell, the seed and the number of control steps executed, after each of them."""
+
+Save = Callable[[EpisodeRecord, Path, str, Mapping[str, float]], None]
+"""Writes a recording: the record of the episode, the .rrd file, the label of the setting, and the limits that its
+signals are compared with."""
 
 
 @dataclass(frozen=True)
 class CellRunner:
     """Prepares cells for their episodes; picklable without `on_step`.
 
-    rollouts: folder of the .rrd files, one per recorded episode. keep: cells of one setting and task share a decoder,
-    so that what it learns and its warm-up carry over from cell to cell. on_step: shows progress within an episode.
+    rollouts: folder of the .rrd files, one per recorded episode, written by `save`. keep: cells of one setting and task
+    share a decoder, so that what it learns and its warm-up carry over from cell to cell. on_step: shows progress within
+    an episode.
     """
 
     rollouts: Path
+    save: Save
     keep: bool = False
     on_step: OnStep | None = None
 
-    def __call__(self, cell: CellLike) -> Callable[[int], EpisodeRecord]:
+    def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
         """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
         settings = settings_from(cell.settings)
         runner = (
@@ -85,15 +61,13 @@ class CellRunner:
                 runner.on_step = functools.partial(self.on_step, cell, seed)
             record = runner.episode(seed, cell.repeat == 0 and is_recorded(settings, seed))
             if record.frames:
-                from kerv_cli.report.viewing.rerun_log import save_episode  # only a recording needs rerun
-
                 name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
-                save_episode(record, self.rollouts / name, method=cell.label, limits=limits_of(settings, cell.task))
+                self.save(record, self.rollouts / name, cell.label, limits_of(settings, cell.task))
             return dataclasses.replace(record, frames={}, places={})
 
         return episode
 
-    def together(self, cells: Sequence[C]) -> Iterator[tuple[C, int, EpisodeRecord | Exception]]:
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
         """Runs the episodes of cells whose settings differ in the task alone, `rollout.batch` at a time; yields each as
         it ends: its cell, its seed, and its record or the error that its world raised."""
         settings = settings_from(cells[0].settings)

@@ -25,8 +25,9 @@ from kerv_cli.engine.unread import Unread
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.methods.public import PublicShape, load_public
 from kerv_cli.targets.checkpoint import FLOAT32, Description, read_description, save_module
+from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.packed import load_packed
-from kerv_cli.targets.compact.trunk import Cache, LayerStack
+from kerv_cli.targets.compact.trunk import LayerStack
 
 
 class DraftsStates(Protocol):

@@ -26,7 +26,8 @@ from kerv_cli.engine.transfer import read, upload
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.methods.packed_early import PackedEarly
 from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
-from kerv_cli.targets.compact.packed import Packable, load_packed
+from kerv_cli.targets.compact.packable import Packable
+from kerv_cli.targets.compact.packed import load_packed
 
 
 def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import torch.nn.functional as F
 from torch import Tensor
 
-from kerv_cli.targets.compact.packed import FastLinear, Packed, RowNorm, gain_of
+from kerv_cli.targets.compact.kernels import FastLinear, RowNorm, gain_of
+from kerv_cli.targets.compact.packable import Packed
 
 if TYPE_CHECKING:
     from kerv_cli.methods.early import Block, EarlyDrafter

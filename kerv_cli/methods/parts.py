@@ -364,7 +364,7 @@ for _name, _module, _class, _needs in (
 ):
     _add("stress", _name, f"worlds.stress.{_module}:{_class}", needed=_needs)
 _add("stress", "none")
-_add("target", "compact", "targets.compact.target:build")
+_add("target", "compact", "targets.compact.folder:build")
 _add(
     *("target", "openvla", "targets.openvla.target:build"),
     weights="kerv_cli.targets.openvla.target:check_weights",

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from scipy.stats import rankdata
 
 from kerv_cli.base.files import atomic_path
+from kerv_cli.engine.loss import BAD, auc
 from kerv_cli.methods.certification import certify, episode_means
 from kerv_cli.methods.risk_file import Losses, RiskRecording
 from kerv_cli.report.drawing import COLOURS, DASHES, MUTED, STYLE, colour, entitle, figure_bytes, new_figure
 
 REPEATS = 200
-BAD = 0.5  # a draft with a larger loss is one that should have been verified
 
 
 def coverage(scores: np.ndarray, losses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -25,16 +24,6 @@ def coverage(scores: np.ndarray, losses: np.ndarray) -> tuple[np.ndarray, np.nda
     order = np.argsort(-scores, kind="stable")
     count = np.arange(1, len(order) + 1)
     return count / len(order), np.cumsum(losses[order]) / count
-
-
-def auc(scores: np.ndarray, bad: np.ndarray) -> float:
-    """Probability that a bad draft scores below a good one, ties counting half; NaN where all are alike."""
-    below = int(bad.sum())
-    above = len(bad) - below
-    if not below or not above:
-        return math.nan
-    ranks = rankdata(scores)
-    return float(1 - (ranks[bad].sum() - below * (below + 1) / 2) / (below * above))
 
 
 def held(found: Losses, score: str, epsilon: float, delta: float, repeats: int = REPEATS) -> float:

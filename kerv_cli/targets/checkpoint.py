@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -18,8 +18,6 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 if TYPE_CHECKING:  # torch is imported where weights are read or written: a description is read without it
     import torch
     from torch import Tensor, nn
-
-    from kerv_cli.targets.compact.target import CompactTarget
 
 FORMAT = 2
 WEIGHTS = "model.safetensors"
@@ -228,24 +226,6 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(f"{kind} in {folder} does not fit its own settings: {reason}") from error
-
-
-def save_target(
-    folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], stored: str = FLOAT32
-) -> str:
-    """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
-    `save_module`."""
-    description = {
-        "family": "compact",
-        "environment": environment,
-        "settings": asdict(target.settings),
-        "actions": target.actions.as_dict(),
-        "observation": target.observation.as_dict(),
-        "cameras": list(target.cameras),
-        "words": list(target.words.words),
-        "provenance": provenance,
-    }
-    return save_module(folder, "target", target, description, stored)
 
 
 def read_target(folder: Path) -> TargetDescription:

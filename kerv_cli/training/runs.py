@@ -21,7 +21,8 @@ from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTar
 from kerv_cli.methods.artifacts import artifact_folder
 from kerv_cli.methods.eagle import Drafter, save_drafter
 from kerv_cli.methods.early import EarlyDrafter, save_early
-from kerv_cli.targets.checkpoint import load_target, read_target, save_target
+from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import covered
 from kerv_cli.training.demonstrations import open_demos

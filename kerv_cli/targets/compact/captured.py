@@ -7,13 +7,12 @@ how it is tested on a CPU.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from kerv_cli.targets.compact.trunk import Cache, LayerStack
+from kerv_cli.targets.compact.cache import Cache, Slots
 
 _AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets of verifications; those of prefills follow with the first ones
 _WARM_UP = 3  # runs before a capture: libraries choose kernels and allocate workspaces
@@ -26,10 +25,34 @@ def bucket(tokens: int) -> int:
     return -(-tokens // 16) * 16
 
 
+class Stack(Protocol):
+    """What a graph captures: the layers of a `LayerStack` of width E."""
+
+    width: int
+
+    def compute(
+        self, x: Tensor, positions: Tensor, cache: Cache | None, slots: Slots | None, mask: Tensor | None
+    ) -> Tensor:
+        """As `LayerStack.compute`."""
+
+
+class CapturedCache(Cache):
+    """A cache of fixed shapes. captured: the graphs that write to it, from the first forward that runs in one."""
+
+    def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
+        super().__init__(layers, batch, heads, capacity, channels, like, fixed=True)
+        self.captured: CapturedLayers | None = None
+
+    def run(self, stack: Stack, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+        """As `CapturedLayers.__call__`; every forward over a cache is of the same stack."""
+        self.captured = self.captured or CapturedLayers(stack, self)
+        return self.captured(x, positions, mask)
+
+
 class CapturedLayers:
     """The layers of one stack over one cache of fixed shapes and batch 1."""
 
-    def __init__(self, stack: LayerStack, cache: Cache) -> None:
+    def __init__(self, stack: Stack, cache: Cache) -> None:
         self.stack, self.cache = stack, cache
         self.steps: dict[int, _Step] = {}
         if cache.buffer.is_cuda:  # in the warm-up's first forward: a capture in the middle of an episode would be timed
@@ -47,7 +70,7 @@ class CapturedLayers:
 class _Step:
     """The buffers of one bucket, and its graph."""
 
-    def __init__(self, stack: LayerStack, cache: Cache, size: int) -> None:
+    def __init__(self, stack: Stack, cache: Cache, size: int) -> None:
         self.stack, self.cache = stack, cache
         like, slots = cache.buffer, cache.buffer.shape[-2]
         self.x = like.new_zeros((1, size, stack.width))
@@ -70,12 +93,7 @@ class _Step:
         return graph
 
     def _compute(self) -> Tensor:
-        from kerv_cli.targets.compact.trunk import Slots
-
-        x, rotary, slots = self.x, self.stack.rotary(self.positions), Slots.at(self.index)
-        for layer, kept in zip(self.stack.layers, self.cache.layers, strict=True):
-            x = layer(x, rotary, kept, slots, self.mask)
-        return x
+        return self.stack.compute(self.x, self.positions, self.cache, Slots.at(self.index), self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """As `CapturedLayers.__call__`."""

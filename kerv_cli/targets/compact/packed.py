@@ -12,95 +12,29 @@ and the module computes without them.
 from __future__ import annotations
 
 import math
-import platform
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, singledispatch
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, TypeVar
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.targets.checkpoint import load_state
+from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
-
-if TYPE_CHECKING:
-    from kerv_cli.targets.compact.target import CompactTarget, Inputs
-    from kerv_cli.targets.compact.trunk import Cache, Layer, LayerStack
-    from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.targets.compact.kernels import FastConv, FastLinear, RowNorm, gain_of, has_blocked_layouts
+from kerv_cli.targets.compact.packable import Packable, Packed
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.trunk import Layer, LayerStack, PackedStack
+from kerv_cli.targets.compact.vision import VisionEncoder
 
 M = TypeVar("M", bound=nn.Module)
 
-BLOCKED_FROM = 600_000  # multiplications below which a plain product beats oneDNN's call overhead of 15 µs (measured)
 EXPLICIT = range(24, 513)  # query tokens for which three plain calls beat the fused attention of a CPU (measured)
 Affine = tuple[Tensor, Tensor]  # bias (O,), weight (I, O)
-
-
-def has_blocked_layouts() -> bool:
-    """Whether this build of torch carries oneDNN's fused operators."""
-    names = ("_linear_pointwise", "_convolution_pointwise", "_reorder_linear_weight", "_reorder_convolution_weight")
-    return torch.backends.mkldnn.is_available() and all(hasattr(torch.ops.mkldnn, name) for name in names)
-
-
-@lru_cache(maxsize=1)
-def is_intel() -> bool:
-    """Whether the CPU is Intel's. On others MKL, with which torch is built, multiplies one row slowly: the products of
-    one token of `small` take 1.7 ms on an AMD EPYC, with numpy's OpenBLAS 0.8 ms (measured)."""
-    described = Path("/proc/cpuinfo")
-    text = described.read_text(encoding="utf-8", errors="replace") if described.exists() else platform.processor()
-    return "Intel" in text
-
-
-def row_product(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """x (I,), weight (I, O) -> (O,). torch's profiler does not see it; the bench times it here."""
-    return np.dot(x, weight)
-
-
-def wants_gradient(x: Tensor) -> bool:
-    """Whether x needs gradients, which packed weights do not have: then the modules compute."""
-    return x.requires_grad and torch.is_grad_enabled()
-
-
-class Packed:
-    """Base of packed weights. Copies and pickles as None, because oneDNN's layouts can be neither copied nor
-    pickled."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
-
-
-class Packable(nn.Module):
-    """A module that can have packed weights. Moving it, loading weights, unfreezing or training it drops them. After
-    writing weights in another way (`parameter.data`, a part's own `load_state_dict`) call `pack` again."""
-
-    packed: Any = None
-
-    def pack_weights(self) -> Packed | None:
-        """Packed weights of this module, which is frozen on a CPU; None where they would not be faster."""
-        raise NotImplementedError
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        self.packed = None
-        return super()._apply(fn, recurse)
-
-    def _load_from_state_dict(self, *arguments: Any, **keywords: Any) -> None:
-        self.packed = None
-        super()._load_from_state_dict(*arguments, **keywords)
-
-    def train(self, mode: bool = True) -> Self:
-        """As `nn.Module.train`; training mode drops the packed weights."""
-        if mode:
-            self.packed = None
-        return super().train(mode)
-
-    def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """As `nn.Module.requires_grad_`; unfreezing drops the packed weights of all parts."""
-        for part in self.modules():
-            if requires_grad and isinstance(part, Packable):
-                part.packed = None
-        return super().requires_grad_(requires_grad)
 
 
 def pack(module: nn.Module) -> None:
@@ -117,7 +51,7 @@ def pack(module: nn.Module) -> None:
         with torch.no_grad():
             for part in module.modules():
                 if isinstance(part, Packable):
-                    part.packed = part.pack_weights()
+                    part.packed = packed_weights(part)
 
 
 def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
@@ -130,65 +64,6 @@ def load_packed(module: M, folder: Path, kind: str, device: str | torch.device, 
     module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)
     pack(module)
     return module
-
-
-class FastLinear:
-    """x (n, I) -> (n, O) with a weight (O, I): input-major for a few rows, oneDNN's blocks for many."""
-
-    def __init__(self, weight: Tensor) -> None:
-        self.input_major = weight.t().contiguous()
-        self.weight = self.input_major.t()
-        self.nothing = weight.new_zeros(1)
-        self.array = None if is_intel() else self.input_major.numpy()
-        self.rows = -(-BLOCKED_FROM // weight.numel())
-        self.blocked: Tensor | None = None
-        if has_blocked_layouts():
-            self.blocked = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous(), 32)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        if self.blocked is not None and x.shape[0] >= self.rows:
-            return torch.ops.mkldnn._linear_pointwise(x, self.blocked, None, "none", [], "")
-        return torch.mm(x, self.input_major)
-
-    def added_to(self, other: Tensor, x: Tensor) -> Tensor:
-        """other (n, O) + the product."""
-        if self.blocked is not None and x.shape[0] >= self.rows:
-            return torch.ops.mkldnn._linear_pointwise.binary(x, other, self.blocked, None, "add")
-        return torch.addmm(other, x, self.input_major)
-
-    def of_vector(self, x: Tensor, scale: float) -> Tensor:
-        """x (I,) -> scale · the product (O,)."""
-        if self.array is not None:
-            product = row_product(x.numpy(), self.array)
-            product *= scale
-            return torch.from_numpy(product)
-        return torch.addmv(self.nothing, self.weight, x, beta=0, alpha=scale)
-
-    def added_to_vector(self, other: Tensor, x: Tensor) -> Tensor:
-        """other (O,) + the product of x (I,)."""
-        if self.array is not None:
-            return torch.from_numpy(row_product(x.numpy(), self.array)).add_(other)
-        return torch.addmv(other, self.weight, x)
-
-
-class RowNorm:
-    """x / √(Σ x² + E ε): RMSNorm without its gain and √E, which are folded into the next weight."""
-
-    def __init__(self, norm: nn.RMSNorm) -> None:
-        self.width_eps = norm.weight.shape[0] * (norm.eps or 0.0)
-        self.floor = torch.tensor(math.sqrt(self.width_eps))
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return x / torch.hypot(torch.linalg.vector_norm(x, 2, -1, True), self.floor)
-
-    def of_vector(self, x: Tensor) -> float:
-        """The factor for a single row (E,)."""
-        return 1.0 / math.sqrt(float(torch.dot(x, x)) + self.width_eps)
-
-
-def gain_of(norm: nn.RMSNorm) -> Tensor:
-    """The factor (E,) that `RowNorm` leaves out: gain · √E."""
-    return norm.weight * norm.weight.shape[0] ** 0.5
 
 
 @lru_cache(maxsize=128)
@@ -259,7 +134,7 @@ class PackedLayer:
         return self.down.added_to_vector(row, F.silu(gate).mul_(up)).view(1, 1, self.width)
 
 
-class PackedLayers(Packed):
+class PackedLayers(PackedStack):
     """Packed weights of a stack's layers and its final norm. Keys in its caches have neighbouring channel pairs."""
 
     def __init__(self, stack: LayerStack) -> None:
@@ -273,7 +148,7 @@ class PackedLayers(Packed):
         self.rows, self.gain = RowNorm(stack.norm), gain_of(stack.norm)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """As `LayerStack.run_layers`; mask: from `attention_mask`."""
+        """As `PackedStack`."""
         turn = self.turns.index_select(0, positions).view(torch.complex64)
         start = cache.length if cache is not None else 0
         for i, layer in enumerate(self.layers):
@@ -281,29 +156,8 @@ class PackedLayers(Packed):
         return x
 
     def norm(self, x: Tensor) -> Tensor:
-        """The final RMSNorm with its gain."""
+        """As `PackedStack`."""
         return self.rows(x).mul_(self.gain)
-
-
-class FastConv:
-    """A convolution on channels-last maps of one fixed size, with a blocked weight and a fused function `pointwise`."""
-
-    def __init__(self, conv: nn.Conv2d, size: int, weight: Tensor | None = None, bias: Tensor | None = None) -> None:
-        weight = conv.weight if weight is None else weight
-        self.bias = conv.bias if bias is None else bias
-        self.geometry = (list(conv.padding), list(conv.stride), list(conv.dilation), conv.groups)
-        self.weight = torch.ops.mkldnn._reorder_convolution_weight(
-            weight.contiguous(memory_format=torch.channels_last), *self.geometry, [1, conv.in_channels, size, size]
-        )
-
-    def __call__(self, x: Tensor, pointwise: str = "none") -> Tensor:
-        return torch.ops.mkldnn._convolution_pointwise(x, self.weight, self.bias, *self.geometry, pointwise, [], "")
-
-    def added_to(self, other: Tensor, x: Tensor) -> Tensor:
-        """other += the convolution of x, in place -> other."""
-        return torch.ops.mkldnn._convolution_pointwise_.binary(
-            other, x, self.weight, self.bias, *self.geometry, "add", 1.0, None, [], None
-        )
 
 
 class PackedStage:
@@ -442,3 +296,29 @@ class PackedPrompt(Packed):
         assert images is not None
         seen = [encoder(view) for encoder, view in zip(self.encoders, images.split(self.size, -1), strict=True)]
         return [tokens for tokens, _ in seen], [points for _, points in seen]
+
+
+@singledispatch
+def packed_weights(part: Packable) -> Packed | None:
+    """Packed weights by the type of a frozen part on a CPU; None where they would not be faster. A type that is not
+    registered here gives its own."""
+    return part.pack_weights()
+
+
+@packed_weights.register
+def _(stack: LayerStack) -> Packed | None:
+    if stack.norm.weight.dtype == torch.float32:
+        return PackedLayers(stack)
+    if stack.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
+        return BlockedLayers(stack.rotary, stack.layers, stack.norm)  # type: ignore[arg-type]
+    return None
+
+
+@packed_weights.register
+def _(vision: VisionEncoder) -> Packed | None:
+    return PackedVision(vision) if has_blocked_layouts() and vision.columns.dtype == torch.float32 else None
+
+
+@packed_weights.register
+def _(target: CompactTarget) -> Packed | None:
+    return PackedPrompt(target) if target.cameras and target.dtype == torch.float32 else None

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.packed import Packed, RowNorm, has_blocked_layouts
-
-if TYPE_CHECKING:
-    from kerv_cli.targets.compact.trunk import Cache, Layer, Rotary
+from kerv_cli.targets.compact.cache import Cache
+from kerv_cli.targets.compact.kernels import RowNorm, has_blocked_layouts
+from kerv_cli.targets.compact.trunk import Layer, PackedStack, Rotary
 
 ROWS = 32  # for which the layout is chosen; measured, 154 M weights: one row 27 ms, 31 rows 33 ms, 47 rows 41 ms
 
@@ -103,7 +101,7 @@ class BlockedLayer:
         return row.mul(self.norm.of_vector(row)).to(torch.bfloat16)[None]
 
 
-class BlockedLayers(Packed):
+class BlockedLayers(PackedStack):
     """Packed weights of a stack's layers and its final norm. Its caches are float32."""
 
     cache_dtype = torch.float32
@@ -116,7 +114,7 @@ class BlockedLayers(Packed):
         self.rows, self.gain = RowNorm(norm), full_gain(norm)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """As `LayerStack.run_layers`; x (B, T, E) bfloat16; mask: from `attention_mask`."""
+        """As `PackedStack`; x (B, T, E) bfloat16."""
         rows = x.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
         turn = self.turns.index_select(0, positions)
         start = cache.length if cache is not None else 0
@@ -126,5 +124,5 @@ class BlockedLayers(Packed):
         return rows.to(torch.bfloat16)
 
     def norm(self, x: Tensor) -> Tensor:
-        """The final RMSNorm with its gain."""
+        """As `PackedStack`."""
         return self.rows(x.float()).mul_(self.gain).to(torch.bfloat16)

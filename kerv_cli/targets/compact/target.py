@@ -12,21 +12,19 @@ privileged, to separate decoding from perception.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape, views_of
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.features import (
     hand_features,
     places_of,
@@ -35,9 +33,9 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.packed import Packable, PackedPrompt, load_packed
+from kerv_cli.targets.compact.packable import Packable
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.targets.compact.trunk import Cache, Trunk
+from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
 
 
@@ -61,7 +59,7 @@ class CompactTarget(Packable):
     """
 
     centre: Tensor
-    packed: PackedPrompt | None
+    packed: Callable[[Inputs], tuple[Tensor, Tensor]] | None
 
     def __init__(
         self,
@@ -162,10 +160,6 @@ class CompactTarget(Packable):
     def dtype(self) -> torch.dtype:
         """Number format of the weights."""
         return self.head.weight.dtype
-
-    def pack_weights(self) -> PackedPrompt | None:
-        """As `Packable.pack_weights`; None for a state policy and in other number formats than float32."""
-        return PackedPrompt(self) if self.cameras and self.dtype == torch.float32 else None
 
     def inputs(self, observation: Observation) -> Inputs:
         """One observation as a batch of one.
@@ -296,17 +290,3 @@ def _smooth_table(tokens: int, width: int) -> Tensor:
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit
     phase = torch.rand(width, generator=generator) * 2 * torch.pi
     return 0.03 * torch.cos(centres * frequency + phase)
-
-
-def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """The target in `folder`, frozen and packed for inference.
-
-    Raises:
-        CheckpointError: the description is not a compact target's, or the weights do not fit it.
-    """
-    settings = read(TargetSettings, description.settings, str(folder / "target.json"))
-    camera = description.cameras[0] if description.cameras else ""
-    words = WordTokenizer(description.words)
-    target = CompactTarget(settings, description.actions, description.observation, words, camera)
-    target.sha256 = description.sha256
-    return load_packed(target, folder, "target", device, dtype)

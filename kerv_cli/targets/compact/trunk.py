@@ -1,4 +1,4 @@
-"""The Llama-style trunk: RMSNorm, RoPE, SwiGLU, a key/value cache in fixed buffers, tree attention.
+"""The Llama-style trunk: RMSNorm, RoPE, SwiGLU, tree attention over a key/value cache.
 
 Shapes: B batch, T new tokens, S cached tokens, E width, A heads, C = E / A.
 
@@ -9,66 +9,17 @@ On a CPU slices are faster, and a frozen stack has packed weights (`packed.py`, 
 
 from __future__ import annotations
 
-from typing import Any
+from abc import ABC, abstractmethod
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.engine.attention import Buffered, attention_mask, rotate
-from kerv_cli.targets.compact.captured import CapturedLayers
-from kerv_cli.targets.compact.packed import Packable, PackedLayers, wants_gradient
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
-
-
-class Cache(Buffered):
-    """Keys and values of every layer in fixed buffers (layers, 2, B, A, slots, C) with slots ≥ capacity; the first
-    `length` slots are valid.
-
-    fixed: every forward has the same shapes. captured: the graphs that write to it. Modules and packed weights order
-    key channels differently, so they must not share a cache.
-    """
-
-    def __init__(
-        self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor, fixed: bool | None = None
-    ) -> None:
-        self.fixed = like.is_cuda if fixed is None else fixed
-        slots = capacity + self.fixed  # a spare one, for the rows that fill up a graph's bucket
-        self.buffer = like.new_zeros((layers, 2, batch, heads, slots, channels))
-        self.layers = list(self.buffer)  # (2, B, A, slots, C): keys, values
-        self.capacity = capacity
-        self.length = 0
-        self.captured: CapturedLayers | None = None
-
-
-class Slots:
-    """The slots of a cache that a forward of `tokens` tokens writes: a slice, for fixed shapes a tensor `index`
-    (T,)."""
-
-    def __init__(self, cache: Cache, tokens: int) -> None:
-        self.start, self.stop = cache.length, cache.length + tokens
-        self.index: Tensor | None = None
-        if cache.fixed:
-            self.index = torch.arange(self.start, self.stop, device=cache.buffer.device)
-
-    @classmethod
-    def at(cls, index: Tensor) -> Slots:
-        """The slots `index` (T,) of a cache of fixed shapes."""
-        slots = cls.__new__(cls)
-        slots.start = slots.stop = 0
-        slots.index = index
-        return slots
-
-    def write(self, layer: Tensor, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """k, v (B, A, T, C) into a layer (2, B, A, capacity, C) -> the keys and values to attend to."""
-        if self.index is not None:
-            layer[0].index_copy_(2, self.index, k)
-            layer[1].index_copy_(2, self.index, v)
-            return layer[0], layer[1]
-        layer[0][:, :, self.start : self.stop] = k
-        layer[1][:, :, self.start : self.stop] = v
-        return (layer[0][:, :, : self.stop], layer[1][:, :, : self.stop]) if self.start else (k, v)
+from kerv_cli.engine.attention import attention_mask, rotate
+from kerv_cli.targets.compact.cache import Cache, Slots
+from kerv_cli.targets.compact.captured import CapturedCache
+from kerv_cli.targets.compact.packable import Packable, Packed, wants_gradient
 
 
 class Rotary(nn.Module):
@@ -128,10 +79,25 @@ class Layer(nn.Module):
         return x + self.down(F.silu(gate) * up)
 
 
+class PackedStack(Packed, ABC):
+    """Packed weights of a stack's layers and its final norm. cache_dtype: number format of its caches, by default that
+    of the weights."""
+
+    cache_dtype: torch.dtype | None = None
+
+    @abstractmethod
+    def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
+        """As `LayerStack.run_layers`, but the cache's length stays; mask: from `attention_mask`."""
+
+    @abstractmethod
+    def norm(self, x: Tensor) -> Tensor:
+        """The final RMSNorm with its gain."""
+
+
 class LayerStack(Packable):
     """Decoder layers and their rotary embedding, the base of the trunk and the drafter."""
 
-    packed: PackedLayers | BlockedLayers | None
+    packed: PackedStack | None
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__()
@@ -140,23 +106,16 @@ class LayerStack(Packable):
         self.layers = nn.ModuleList(Layer(width, heads, feed_forward) for _ in range(layers))
         self.norm = nn.RMSNorm(width, eps=1e-5)
 
-    def pack_weights(self) -> Any:
-        """As `Packable.pack_weights`."""
-        if self.norm.weight.dtype == torch.float32:
-            return PackedLayers(self)
-        if self.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
-            return BlockedLayers(self.rotary, self.layers, self.norm)  # type: ignore[arg-type]
-        return None
-
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
         """An empty cache. fixed: of fixed shapes; default: on CUDA."""
-        channels = self.width // self.heads
         like: Tensor = self.norm.weight
-        if isinstance(self.packed, BlockedLayers):
+        if self.packed is not None and self.packed.cache_dtype is not None:
             like = like.to(self.packed.cache_dtype)
-        return Cache(self.depth, batch, self.heads, capacity, channels, like, fixed)
+        sizes = self.depth, batch, self.heads, capacity, self.width // self.heads
+        fixed = like.is_cuda if fixed is None else fixed
+        return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
-    def packed_for(self, x: Tensor, cache: Cache | None) -> PackedLayers | BlockedLayers | None:
+    def packed_for(self, x: Tensor, cache: Cache | None) -> PackedStack | None:
         """The packed weights where they can compute x: without gradients, and with no cache of fixed shapes."""
         return None if wants_gradient(x) or (cache is not None and cache.fixed) else self.packed
 
@@ -172,16 +131,24 @@ class LayerStack(Packable):
         if packed is not None:
             x = packed(x, positions, cache, mask)
         elif self.captures(x, cache):
-            assert cache is not None
+            assert isinstance(cache, CapturedCache)
             assert mask is not None
-            cache.captured = cache.captured or CapturedLayers(self, cache)
-            x = cache.captured(x, positions, mask)
+            x = cache.run(self, x, positions, mask)
         else:
-            rotary, slots = self.rotary(positions), Slots(cache, x.shape[1]) if cache is not None else None
-            for i, layer in enumerate(self.layers):
-                x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
+            slots = Slots(cache, x.shape[1]) if cache is not None else None
+            x = self.compute(x, positions, cache, slots, mask)
         if cache is not None:
             cache.length += x.shape[1]
+        return x
+
+    def compute(
+        self, x: Tensor, positions: Tensor, cache: Cache | None, slots: Slots | None, mask: Tensor | None
+    ) -> Tensor:
+        """As `run_layers` by the modules, written at `slots` of the cache, whose length stays; mask: from
+        `attention_mask`."""
+        rotary = self.rotary(positions)
+        for i, layer in enumerate(self.layers):
+            x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
         return x
 
 

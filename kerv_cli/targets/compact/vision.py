@@ -7,11 +7,13 @@ are not shifted for augmentation: positions in the image carry that information.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.packed import Packable, PackedVision, has_blocked_layouts
+from kerv_cli.targets.compact.packable import Packable
 
 
 class Residual(nn.Module):
@@ -33,7 +35,7 @@ class VisionEncoder(Packable):
     first stage. width: E. Raises ValueError where size and grid do not fit."""
 
     columns: Tensor
-    packed: PackedVision | None
+    packed: Callable[[Tensor], tuple[Tensor, Tensor]] | None
 
     def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int) -> None:
         super().__init__()
@@ -50,11 +52,6 @@ class VisionEncoder(Packable):
         self.grid_position = nn.Parameter(torch.randn(grid * grid, width) * 0.02)
         self.temperature = nn.Parameter(torch.ones(keypoints) * 2.0)
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
-
-    def pack_weights(self) -> PackedVision | None:
-        """As `Packable.pack_weights`; None where torch lacks oneDNN's fused operators and in other number formats than
-        float32."""
-        return PackedVision(self) if has_blocked_layouts() and self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """images (B, 3, size, size) uint8 -> tokens (B, grid², E), points (B, 2K) in [-1, 1]."""

@@ -1,0 +1,48 @@
+"""The folder of a compact target: `save_target` writes it, `build` reads it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from kerv_cli.base.manifests import read
+from kerv_cli.base.settings import TargetSettings
+from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module
+from kerv_cli.targets.compact.packed import load_packed
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.text import WordTokenizer
+
+
+def save_target(
+    folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], stored: str = FLOAT32
+) -> str:
+    """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
+    `save_module`."""
+    description = {
+        "family": "compact",
+        "environment": environment,
+        "settings": asdict(target.settings),
+        "actions": target.actions.as_dict(),
+        "observation": target.observation.as_dict(),
+        "cameras": list(target.cameras),
+        "words": list(target.words.words),
+        "provenance": provenance,
+    }
+    return save_module(folder, "target", target, description, stored)
+
+
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
+    """The target in `folder`, frozen and packed for inference.
+
+    Raises:
+        CheckpointError: the description is not a compact target's, or the weights do not fit it.
+    """
+    settings = read(TargetSettings, description.settings, str(folder / "target.json"))
+    camera = description.cameras[0] if description.cameras else ""
+    words = WordTokenizer(description.words)
+    target = CompactTarget(settings, description.actions, description.observation, words, camera)
+    target.sha256 = description.sha256
+    return load_packed(target, folder, "target", device, dtype)
