@@ -1,4 +1,4 @@
-"""Object: what the task is about is larger or smaller, heavier or lighter, smoother or rougher, and begins outside the
+"""Object: the task's objects are larger or smaller, heavier or lighter, smoother or rougher, and begin outside the
 range of the training."""
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Objects(Stress):
         self.spread = level_of(LEVELS, level).spread
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers."""
         self._draws = Draws(task, seed, self.kind, self.level)
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """As `Stress.change`."""
+        """Scales the objects' size, mass and friction."""
         level: Level = level_of(LEVELS, self.level)
         random = self._draws.random()
         size, mass, friction = (either(random, factor) for factor in (level.size, level.mass, level.friction))

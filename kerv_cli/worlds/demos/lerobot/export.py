@@ -42,7 +42,7 @@ from kerv_cli.worlds.demos.lerobot.layout import (
     numbers,
 )
 
-EVERY = 10  # of the images every so many are read for the statistics
+EVERY = 10  # statistics are computed from every tenth image
 
 
 @dataclass
@@ -67,14 +67,14 @@ class Moments:
         """For stats.json."""
         mean = self.total / self.count
         std = np.sqrt(np.maximum(self.squares / self.count - mean**2, 0))
-        named = {"min": self.low, "max": self.high, "mean": mean, "std": std}
+        values = {"min": self.low, "max": self.high, "mean": mean, "std": std}
         shape = self.shape or (-1,)
-        return {name: np.reshape(x, shape).tolist() for name, x in named.items()} | {"count": [self.count]}
+        return {name: np.reshape(x, shape).tolist() for name, x in values.items()} | {"count": [self.count]}
 
 
 @dataclass
 class Export:
-    """A dataset on its way to `folder`."""
+    """The state of an export of `dataset` to `folder`."""
 
     dataset: DemoDataset
     folder: Path
@@ -94,12 +94,12 @@ class Export:
     def columns(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
         """Every numeric column of an episode (n, …), one row per frame."""
         steps = episode.frame_steps
-        felt = len(self.dataset.manifest.observation.proprioception)
+        width = len(self.dataset.manifest.observation.proprioception)
         count = len(steps)
         done = np.zeros(count, dtype=bool)
         done[-1] = True
         return {
-            STATE: episode.states[steps, :felt].astype(np.float32),
+            STATE: episode.states[steps, :width].astype(np.float32),
             ENVIRONMENT: episode.states[steps].astype(np.float32),
             ACTION: episode.labels[steps].astype(np.float32),
             EXECUTED: episode.executed[steps].astype(np.float32),
@@ -112,7 +112,8 @@ class Export:
         }
 
     def table(self, episode: DemoEpisode, file: int) -> Any:
-        """The episode's rows as a pyarrow table; its entry in the list of episodes is added. file: where it goes."""
+        """The episode's rows as a pyarrow table; adds the episode's entry to `episodes`. file: number of its data
+        file."""
         import pyarrow as pa
 
         columns, arrays = self.columns(episode), {}
@@ -226,10 +227,10 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
         raise UsageError("two tasks have the same instruction, which LeRobot tells tasks apart by: export them apart")
     tasks = {name: number for number, name in enumerate(names)}
     (folder / INFO).unlink(missing_ok=True)
-    made = Export(dataset, folder, config["camera"]["name"], rate, tasks)
-    made.write_data(progress)
-    made.write_meta()
-    return made
+    result = Export(dataset, folder, config["camera"]["name"], rate, tasks)
+    result.write_data(progress)
+    result.write_meta()
+    return result
 
 
 def _instruction(task: str) -> str:
