@@ -206,11 +206,11 @@ def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
     folder = copy / "artifacts/datastore/nano-state"
     assert made.skip is not None
     row = made.skip.tasks["reach-v3"]
-    store = Datastore.open(folder, run.described)
+    store = Datastore.open(folder, run.description)
     assert row == task_levels(match(store, "reach-v3"), 1.9, 0.5)
     assert row.share > 0
     assert made.skip_levels("reach-v3", store.content) == (row.low, row.s_min, row.high)
-    assert load_calibration(run.path, run.described) == made
+    assert load_calibration(run.path, run.description) == made
     with pytest.raises(CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again"):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):

@@ -27,7 +27,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
-from kerv_cli.training.runs import determining
+from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -115,7 +115,7 @@ def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says
 
 
 def test_scores_with_and_without_success_are_of_different_runs() -> None:
-    alone, some, more = (determining(replace(TINY, closed_loop=episodes)) for episodes in (0, 1, 2))
+    alone, some, more = (run_settings(replace(TINY, closed_loop=episodes)) for episodes in (0, 1, 2))
     assert some == more != alone
     assert "closed_loop" not in alone  # as in runs from before it counted
 

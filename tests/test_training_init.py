@@ -99,8 +99,8 @@ def test_training_changes_the_new_target_and_not_the_old_one(results: Path) -> N
     assert run.samples.chunks.shape[1:] == (8, 4)
     assert run.samples.words[0].tolist() == WORDS.encode("pull the drawer open", 10)
     run.train(lambda step, metrics: None)
-    assert run.begun is not None
-    assert all(torch.equal(run.begun.state_dict()[k], v) for k, v in before.items())
+    assert run.init_target is not None
+    assert all(torch.equal(run.init_target.state_dict()[k], v) for k, v in before.items())
     after = load_file(run.folder / "model.safetensors")
     assert not torch.equal(before["head.weight"], after["head.weight"])
 
@@ -128,8 +128,8 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(results
 
 def test_a_run_without_it_is_the_same_run_as_before_there_was_init(results: Path) -> None:
     fresh = settings(results, "train.init=null").train
-    assert "init" not in runs.determining(fresh)
-    assert runs.determining(fresh) == runs.determining(settings(results).train)
+    assert "init" not in runs.run_settings(fresh)
+    assert runs.run_settings(fresh) == runs.run_settings(settings(results).train)
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,10 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.settings import TrainSettings, WorldSettings
 from kerv_cli.training.dagger import TargetActs
 from kerv_cli.training.demonstrations import open_demos
-from kerv_cli.training.imitation import balanced
+from kerv_cli.training.imitation import sample_weights
 from kerv_cli.training.loop import Job
 from kerv_cli.training.ranks import Ranks, join
-from kerv_cli.training.runs import determining
+from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -78,7 +78,7 @@ def test_balanced_tasks_are_drawn_alike() -> None:
 
     def share(balance: float) -> float:
         nothing = (lambda i, s: (torch.zeros(()), {}), lambda m: {}, lambda m, x: None)
-        job = Job(torch.nn.Linear(1, 1), 1000, *nothing, balanced(tasks, balance))
+        job = Job(torch.nn.Linear(1, 1), 1000, *nothing, sample_weights(tasks, balance))
         return float(tasks[job.batch(20_000, generator)].double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
@@ -87,8 +87,8 @@ def test_balanced_tasks_are_drawn_alike() -> None:
 
 
 def test_runs_from_before_balance_are_the_same_runs() -> None:
-    assert "balance" not in determining(TrainSettings())
-    assert determining(TrainSettings(balance=0.5))["balance"] == 0.5
+    assert "balance" not in run_settings(TrainSettings())
+    assert run_settings(TrainSettings(balance=0.5))["balance"] == 0.5
 
 
 def test_datasets_add_up(results: Path) -> None:

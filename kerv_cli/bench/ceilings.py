@@ -24,15 +24,11 @@ class MethodCeiling:
 
 
 def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
-    """Of every method of conf/method that decodes, at N = `tokens`."""
-    found = []
-    for name in groups()["method"]:
-        if name in (EXPERT, "ar"):
-            continue
-        ceiling = _ceiling(name, _settings(name), profile, tokens)
-        if ceiling is not None:
-            found.append(ceiling)
-    return found
+    """The ceilings of the methods in conf/method at N = `tokens`; AR, the expert and methods that execute every draft
+    unverified have none."""
+    names = [name for name in groups()["method"] if name not in (EXPERT, "ar")]
+    candidates = (_ceiling(name, _settings(name), profile, tokens) for name in names)
+    return [ceiling for ceiling in candidates if ceiling is not None]
 
 
 @functools.cache
@@ -43,10 +39,10 @@ def _settings(method: str) -> RolloutSettings:
 def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int) -> MethodCeiling | None:
     autoregressive, encode = profile.decode(tokens), profile.seconds("encode", 1)
     if settings.skip.kind == "always":
-        return None  # executed unverified: nothing of the target's trunk runs
+        return None  # drafts are executed unverified: the target's trunk does not run
     if settings.skip.kind == "parallel":
-        reached = autoregressive / (encode + profile.seconds("prefill", profile.prompt + tokens))
-        return MethodCeiling(name, "one forward", reached, reached)
+        speedup = autoregressive / (encode + profile.seconds("prefill", profile.prompt + tokens))
+        return MethodCeiling(name, "one forward", speedup, speedup)
     if settings.prefill_draft.kind != "none":
         least = encode + profile.seconds("prefill", profile.prompt + tokens - 1)
         return MethodCeiling(name, "in the prefill", autoregressive / least, autoregressive / least)
@@ -56,8 +52,8 @@ def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int
     if settings.proposer.kind not in ("drafter", "hybrid"):
         return MethodCeiling(name, "one verification", free, free)
     rounds, depth = _rounds(settings.proposer, tokens)
-    own = prefill + rounds * (profile.seconds("verify", 1 + depth) + profile.drafting(depth))
-    return MethodCeiling(name, f"{rounds} × {depth} drafted", free, autoregressive / own)
+    decode = prefill + rounds * (profile.seconds("verify", 1 + depth) + profile.drafting(depth))
+    return MethodCeiling(name, f"{rounds} × {depth} drafted", free, autoregressive / decode)
 
 
 def _rounds(proposer: Any, tokens: int) -> tuple[int, int]:

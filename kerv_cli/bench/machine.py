@@ -1,4 +1,4 @@
-"""What the device can do, measured: bytes read per second, multiply-adds per second; and the stopwatch of the bench."""
+"""Measured rates of the device, bytes read and multiply-adds per second; and the stopwatch of the bench."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def median_seconds(work: Callable[[], object], device: torch.device, repeats: in
 def measure_machine(device: torch.device, dtype: torch.dtype, repeats: int = 7) -> Machine:
     """The device's rates with this process's threads."""
     buffer = torch.ones(_BUFFER, device=device)
-    read = timed(buffer.sum, device, repeats).min()
+    seconds = timed(buffer.sum, device, repeats).min()
     del buffer
     x, weight = torch.ones(_ROWS, _WIDTH, dtype=dtype, device=device), torch.ones(_WIDTH, _WIDTH, device=device)
     if device.type == "cpu" and dtype == torch.bfloat16 and multiplies_bfloat16():
@@ -74,4 +74,4 @@ def measure_machine(device: torch.device, dtype: torch.dtype, repeats: int = 7) 
     else:
         plain = weight.to(dtype)
         product = timed(lambda: x @ plain, device, repeats)
-    return Machine(4.0 * _BUFFER / float(read), 2.0 * _ROWS * _WIDTH**2 / float(product.min()))
+    return Machine(4.0 * _BUFFER / float(seconds), 2.0 * _ROWS * _WIDTH**2 / float(product.min()))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.places import results_dir, shipped_dir
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.settings import (
     BenchSettings,
@@ -23,10 +24,11 @@ from kerv_cli.base.settings import (
 )
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
+from kerv_cli.bench.machine import median_seconds
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import Drafter
-from kerv_cli.targets.compact.packed import pack
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.packed import FastLinear, pack
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, BlockedLinear, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
 from kerv_cli.training.imitation import vocabulary
@@ -37,8 +39,8 @@ _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encode
 
 @dataclass(frozen=True)
 class Model:
-    """What is measured. name: as asked for. target: a ReadableTarget. drafter: EAGLE-style, of the target's width.
-    observation: any, of the target's environment. is_shape: its weights are random."""
+    """The model under measurement. name: of the policy or shape. target: a ReadableTarget. drafter: EAGLE-style, of the
+    target's width. observation: any of the target's environment. is_shape: the weights are random."""
 
     name: str
     target: Any
@@ -54,16 +56,17 @@ class Model:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the trunk's weights."""
-        found: torch.dtype = self.target.head.weight.dtype
-        return found
+        """Number format of the trunk's weights."""
+        dtype: torch.dtype = self.target.head.weight.dtype
+        return dtype
 
 
 class ShapeTarget(CompactTarget):
-    """A compact target with random weights, made layer by layer in its final form: 7 B of them are never there twice.
+    """A compact target with random weights, built layer by layer in its final number format, so that memory never holds
+    7 B weights twice.
 
-    On a CPU the prompt's encoder stays float32, where its packed weights are fastest. Layers after the first are the
-    first one's numbers shifted by a few rows: in other memory, which is what a measurement needs.
+    On a CPU the prompt's encoder stays float32, where its packed weights are fastest. Layers after the first hold the
+    first one's numbers, shifted by a few rows: a forward reads them from other memory, as in a trained target.
     """
 
     def __init__(self, settings: TargetSettings, device: torch.device, dtype: torch.dtype) -> None:
@@ -85,7 +88,7 @@ class ShapeTarget(CompactTarget):
             part.to(device=device, dtype=dtype)
 
     def encode(self, observation: Observation) -> Tensor:
-        """As `Target.encode`, in the trunk's number format."""
+        """The prompt (1, P, E) of an observation, in the trunk's number format."""
         return super().encode(observation).to(self.dtype)
 
 
@@ -96,13 +99,13 @@ def shifted_layers(settings: TargetSettings, device: torch.device, dtype: torch.
     for parameter in first.parameters():
         if parameter.dim() == 2:
             parameter.normal_(std=0.02)
-    for place in range(settings.layers):
+    for shift in range(settings.layers):
         with torch.device("meta"):
             layer = Layer(settings.width, settings.heads, settings.feed_forward)
         for name, part in first.named_children():
             weight: Any = part.weight
-            shifted = weight.roll(place, 0).to(device=device, dtype=dtype)
-            layer.get_submodule(name).register_parameter("weight", torch.nn.Parameter(shifted, False))
+            values = weight.roll(shift, 0).to(device=device, dtype=dtype)
+            layer.get_submodule(name).register_parameter("weight", torch.nn.Parameter(values, False))
         yield layer
 
 
@@ -131,13 +134,11 @@ def open_model(settings: BenchSettings) -> Model:
         if "/" not in settings.model and "is damaged" not in str(error):
             raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
         raise
-    beside = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target)
-    return Model(settings.model, target, beside, blank(target), False)
+    drafter = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target)
+    return Model(settings.model, target, drafter, blank(target), False)
 
 
 def _policies(results: str) -> list[str]:
-    from kerv_cli.base.places import results_dir, shipped_dir
-
     folders = (results_dir(results) / "artifacts" / "target", shipped_dir())
     return sorted(path.name for folder in folders for path in folder.glob("*") if path.is_dir())
 
@@ -182,10 +183,6 @@ def fastest(device: torch.device) -> torch.dtype:
         return torch.bfloat16
     if not multiplies_bfloat16():
         return torch.float32
-    from kerv_cli.bench.machine import median_seconds
-    from kerv_cli.targets.compact.kernels import FastLinear
-    from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear
-
     weight, row = torch.ones(8192, 4096), torch.ones(1, 4096)
     half, full = BlockedLinear(weight), FastLinear(weight)
     seconds = {

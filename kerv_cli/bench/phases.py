@@ -14,7 +14,7 @@ from kerv_cli.engine.transfer import read
 from kerv_cli.methods.eagle import DraftState, draft_chain, observe
 
 Seen = np.ndarray | torch.Tensor | None
-"""As `Target.forward` takes it."""
+"""The argument `seen` of `Target.forward`: which tokens of a draft each of its tokens attends to; None: a chain."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Phase:
 
     @property
     def share(self) -> float:
-        """Of what the device could do, in [0, 1] but for noise."""
+        """Floor over median: 1 where the phase takes no longer than the device needs; noise may exceed it."""
         return self.floor / self.seconds
 
     @property
     def name(self) -> str:
-        """As the tables call it."""
+        """The phase in words, for tables."""
         if self.kind == "verify":
             return "one token" if self.rows == 1 else f"verify {self.rows}"
         return self.kind if self.kind == "encode" else f"{self.kind} {self.rows}"
@@ -77,30 +77,42 @@ class Stage:
         self.prompt = self.target.encode(self.model.observation)
 
     def prefill(self, drafted: int = 0, seen: Seen = None) -> list[int]:
-        """The prompt and `drafted` tokens behind it -> argmax of the prompt's last row and of theirs. seen: of a
-        tree."""
+        """The prompt and `drafted` tokens behind it -> argmax of the prompt's last row and of the drafted rows. seen:
+        see `Seen`."""
         x = self.prompt
         if drafted:
             x = torch.cat([x, self.target.embed(self.tokens(drafted))], 1)
         self.cache.length = 0
         self.hidden = self.target.forward(x, torch.arange(x.shape[1], device=self.device), self.cache, seen)
-        found: list[int] = self.target.head(self.hidden[0, self.length - 1 :]).argmax(-1).tolist()
-        return found
+        argmax: list[int] = self.target.head(self.hidden[0, self.length - 1 :]).argmax(-1).tolist()
+        return argmax
 
     def verify(
-        self, drafted: int = 0, done: int = 1, seen: Seen = None, beside: torch.Tensor | None = None, reads: bool = True
+        self,
+        drafted: int = 0,
+        committed: int = 1,
+        seen: Seen = None,
+        beside: torch.Tensor | None = None,
+        reads: bool = True,
     ) -> list[int]:
-        """One token and `drafted` behind it, after `done` committed tokens -> argmax of every row. seen: of a tree;
-        default a chain. beside (m,): read together with them. reads: whether anything is; if not, an empty list."""
-        start = self.cache.length = self.length + done - 1
+        """The last of `committed` tokens and `drafted` tokens behind it -> argmax of every row.
+
+        Args:
+            drafted: tokens of the draft.
+            committed: tokens of the chunk that are committed before this forward.
+            seen: see `Seen`.
+            beside: (m,) numbers that reach the host in the same transfer as the argmax.
+            reads: whether the argmax reaches the host at all; without, the list is empty.
+        """
+        start = self.cache.length = self.length + committed - 1
         positions = torch.arange(start, start + 1 + drafted, device=self.device)
         x = self.target.embed(self.tokens(1 + drafted))
         self.hidden = self.target.forward(x, positions, self.cache, seen)
         argmax = self.target.head(self.hidden)[0].argmax(-1)
         if not reads:
             return []
-        found: list[int] = read(argmax)[0].tolist() if beside is None else read(argmax, beside)[0].tolist()
-        return found
+        tokens: list[int] = read(argmax)[0].tolist() if beside is None else read(argmax, beside)[0].tolist()
+        return tokens
 
     def feed(self, hidden: torch.Tensor, first: int) -> None:
         """The target's states hidden (1, T, E) at positions first … go into the drafter."""
@@ -109,8 +121,8 @@ class Stage:
 
     def draft(self, depth: int) -> list[int]:
         """A chain of `depth` tokens from the drafter."""
-        found: list[int] = draft_chain(self.model.drafter, self.target, self.draft_state, depth).tolist()
-        return found
+        chain: list[int] = draft_chain(self.model.drafter, self.target, self.draft_state, depth).tolist()
+        return chain
 
 
 def costs(model: Model, rows: int, cached: int) -> tuple[float, float]:
@@ -136,16 +148,20 @@ def _phase(kind: str, rows: int, seconds: np.ndarray, needs: tuple[float, float]
 def measure(
     model: Model, machine: Machine, tokens: Sequence[int], depth: int, repeats: int
 ) -> tuple[Machine, list[Phase]]:
-    """Every phase that a chunk of N tokens can have, for each N: one token, verify(1 + n), prefill(P + n), drafts. The
-    machine is measured again behind them -> its best rates, from which all floors are taken."""
+    """Times every phase that a chunk of N tokens can have, for each N: one token, verify(1 + n), prefill(P + n) and
+    drafts; then measures the machine again.
+
+    Returns:
+        The machine's best rates, and the phases with floors from these rates.
+    """
     stage = Stage(model, max(tokens) + 2)
     most = max(tokens)
     device, length = stage.device, stage.length
     counts = sorted({1, 2, 4, 8, *tokens, most})
-    done: list[Phase] = []
+    phases: list[Phase] = []
 
     def add(kind: str, rows: int, needs: tuple[float, float], work: Callable[[], object]) -> None:
-        done.append(_phase(kind, rows, timed(work, device, repeats), needs, machine))
+        phases.append(_phase(kind, rows, timed(work, device, repeats), needs, machine))
 
     add("encode", 1, (0.0, 0.0), stage.encode)
     for drafted in (0, *(n - 1 for n in counts if n > 2)):
@@ -162,7 +178,7 @@ def measure(
         add("eager", 1, costs(model, 1, length), eager.verify)  # what the captured graph saves
     _measure_drafter(model, stage, depth, add)
     machine = machine.best_of(measure_machine(device, model.dtype))
-    return machine, [replace(phase, floor=machine.floor(phase.read, phase.flops)) for phase in done]
+    return machine, [replace(phase, floor=machine.floor(phase.read, phase.flops)) for phase in phases]
 
 
 Add = Callable[[str, int, tuple[float, float], Callable[[], object]], None]
@@ -170,7 +186,7 @@ Add = Callable[[str, int, tuple[float, float], Callable[[], object]], None]
 
 
 def _measure_drafter(model: Model, stage: Stage, depth: int, add: Add) -> None:
-    """Feeding the drafter one state and the prompt's, and its chains. The stage's prefill has run."""
+    """Times feeding the drafter with one state and with the prompt's states, and its chains, after a prefill."""
     stage.feed(stage.hidden, 0)
     s = model.target.settings
     per_token = (layer_numbers(model) + 2 * s.width**2 + s.width * model.target.actions.tokens) * model.dtype.itemsize
@@ -200,13 +216,13 @@ def flipped(model: Model, chunks: int, tokens: int) -> tuple[int, int]:
     generator = torch.Generator().manual_seed(0)
     differ = 0
     for _ in range(chunks):
-        drawn = torch.randint(model.target.actions.tokens, (1, tokens), generator=generator).to(stage.device)
-        stage.tokens = lambda count, drawn=drawn: drawn[:, :count]  # type: ignore[misc,method-assign]
+        chunk = torch.randint(model.target.actions.tokens, (1, tokens), generator=generator).to(stage.device)
+        stage.tokens = lambda count, chunk=chunk: chunk[:, :count]  # type: ignore[misc,method-assign]
         stage.prefill()
         together = stage.verify(tokens - 1)
         stage.cache.length = stage.length
         for i in range(tokens):
             at = torch.tensor([stage.length + i], device=stage.device)
-            hidden = stage.target.forward(stage.target.embed(drawn[:, i : i + 1]), at, stage.cache, None)
+            hidden = stage.target.forward(stage.target.embed(chunk[:, i : i + 1]), at, stage.cache, None)
             differ += int(stage.target.head(hidden)[0, 0].argmax()) != together[i]
     return differ, chunks * tokens

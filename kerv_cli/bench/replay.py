@@ -25,10 +25,10 @@ class Player:
     """Plays decodes of recorded settings; `stage` holds the model's caches."""
 
     def __init__(self, model: Model, recorded: Sequence[Recorded]) -> None:
-        """Room is made for the largest draft of the settings."""
-        forwards = [f for own in recorded for s in own.sequences for f in s.forwards]
+        """Allocates caches that hold the largest draft of the settings."""
+        forwards = [f for setting in recorded for s in setting.sequences for f in s.forwards]
         most = max((f.start + f.drafted for f in forwards), default=1)
-        wide = max((_tree(own.proposer)[0] * _tree(own.proposer)[1] for own in recorded), default=0)
+        wide = max((_tree(setting.proposer)[0] * _tree(setting.proposer)[1] for setting in recorded), default=0)
         self.model, self.stage = model, Stage(model, most + wide + _SPARE)
 
     @torch.inference_mode()
@@ -39,10 +39,10 @@ class Player:
         synchronise(device)
         began = time.perf_counter()
         self.stage.encode()
-        for place, forward in enumerate(decode.forwards):
-            last = place + 1 == len(decode.forwards)
+        for number, forward in enumerate(decode.forwards):
+            last = number + 1 == len(decode.forwards)
             self._forward(forward, proposer, last)
-            if decode.drafts and place + 1 < len(decode.forwards):
+            if decode.drafts and number + 1 < len(decode.forwards):
                 self._feed(forward)
         synchronise(device)
         return time.perf_counter() - began + decode.host
@@ -65,10 +65,10 @@ class Player:
             stage.verify(count, forward.start, seen, beside, reads)
         if count:
             first = stage.length + forward.start - (forward.kind == "verify")
-            kept = forward.accepted + (forward.kind == "verify")
+            committed = forward.accepted + (forward.kind == "verify")
             if isinstance(drafted, TokenTree) or (drafted is not None and drafted.visible is not None):
-                stage.cache.compact(first, torch.arange(first, first + kept, device=stage.device))
-            stage.cache.length = first + kept
+                stage.cache.compact(first, torch.arange(first, first + committed, device=stage.device))
+            stage.cache.length = first + committed
 
     def _draft(self, forward: Forward, proposer: Mapping[str, Any]) -> TokenTree | Unread:
         depth, top_k = _tree(proposer)
@@ -81,8 +81,8 @@ class Player:
         if forward.kind == "prefill":
             self.stage.feed(self.stage.hidden[:, : self.stage.length], 0)
         else:
-            kept = self.stage.hidden[:, : forward.accepted + 1]
-            self.stage.feed(kept, self.stage.length + forward.start - 1)
+            states = self.stage.hidden[:, : forward.accepted + 1]
+            self.stage.feed(states, self.stage.length + forward.start - 1)
 
 
 def _tree(proposer: Mapping[str, Any]) -> tuple[int, int]:
@@ -93,13 +93,13 @@ def _tree(proposer: Mapping[str, Any]) -> tuple[int, int]:
 def play_all(player: Player, recorded: Sequence[Recorded]) -> np.ndarray:
     """(settings, decodes) seconds; the settings take turns decode by decode, each turn begins with another one.
     Settings with fewer decodes begin again."""
-    count = max(len(own.sequences) for own in recorded)
-    for own in recorded:
-        player.play(own.sequences[0], own.proposer)  # first calls choose kernels
+    count = max(len(setting.sequences) for setting in recorded)
+    for setting in recorded:
+        player.play(setting.sequences[0], setting.proposer)  # first calls choose kernels
     seconds = np.empty((len(recorded), count))
     for i in range(count):
         for turn in range(len(recorded)):
-            place = (turn + i) % len(recorded)
-            own = recorded[place]
-            seconds[place, i] = player.play(own.sequences[i % len(own.sequences)], own.proposer)
+            index = (turn + i) % len(recorded)
+            setting = recorded[index]
+            seconds[index, i] = player.play(setting.sequences[i % len(setting.sequences)], setting.proposer)
     return seconds

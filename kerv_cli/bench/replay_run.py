@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.table import Table
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, write_json
@@ -31,7 +32,7 @@ _PER_LAYER = 15e-6  # seconds per layer and forward below which projections do n
 
 @dataclass(frozen=True)
 class Row:
-    """One setting at one N. seconds: mean per decode, executed; host: recorded ones among them. low, high: 95 %
+    """One setting at one N. seconds: mean per decode, executed; host: the recorded part of them. low, high: 95 %
     bootstrap interval of the speedup. model: the speedup that the cost model predicts. projections: device -> predicted
     speedup there, from its published figures or from its own profile."""
 
@@ -64,7 +65,7 @@ class Replay:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What was executed where."""
+        """Study, target, device and versions."""
         device = str(self.model.target.device)
         return {
             "study": self.study,
@@ -77,19 +78,17 @@ class Replay:
             **stamp(device),
         }
 
-    def tables(self) -> list[Any]:
+    def tables(self) -> list[Table]:
         """One rich table per N."""
-        from rich.table import Table
-
-        found = []
+        tables = []
         for tokens in dict.fromkeys(row.tokens for row in self.rows):
-            own = [row for row in self.rows if row.tokens == tokens]
-            names = list(own[0].projections)
+            rows = [row for row in self.rows if row.tokens == tokens]
+            names = list(rows[0].projections)
             title = f"decodes of study={self.study}, executed on {self.model.name} ({self.dtype}): N = {tokens}"
-            told = "success and acceptance: the study's; times: executed here; model, projections: predicted"
+            caption = "success and acceptance: the study's; times: executed here; model, projections: predicted"
             columns = ("setting", "success %", "forwards", "ms / decode", "host ms", "speedup", "model", *names)
-            table = Table(*columns, title=title, caption=told)
-            for row in own:
+            table = Table(*columns, title=title, caption=caption)
+            for row in rows:
                 speedup = f"{row.speedup:.2f} ({row.low:.2f}–{row.high:.2f})"
                 cells = (
                     row.label,
@@ -100,8 +99,8 @@ class Replay:
                     speedup,
                 )
                 table.add_row(*cells, f"{row.model:.2f}", *(f"{row.projections[name]:.2f}" for name in names))
-            found.append(table)
-        return found
+            tables.append(table)
+        return tables
 
     def document(self) -> dict[str, Any]:
         """For JSON."""
@@ -163,35 +162,37 @@ def _rows(
         for name, (gb, tf) in settings.projections.items()
     }
     there |= measured
-    found = []
-    for place, own in enumerate(recorded):
-        low, high = _interval(seconds[0], seconds[place])
-        found.append(
+    rows = []
+    for index, setting in enumerate(recorded):
+        low, high = _interval(seconds[0], seconds[index])
+        rows.append(
             Row(
                 tokens=tokens,
-                label=own.label,
-                success=own.successes / own.episodes,
-                forwards=float(np.mean([len(s.forwards) for s in own.sequences])),
-                seconds=float(seconds[place].mean()),
-                host=float(np.mean([s.host for s in own.sequences])),
-                speedup=float(seconds[0].sum() / seconds[place].sum()),
+                label=setting.label,
+                success=setting.successes / setting.episodes,
+                forwards=float(np.mean([len(s.forwards) for s in setting.sequences])),
+                seconds=float(seconds[index].mean()),
+                host=float(np.mean([s.host for s in setting.sequences])),
+                speedup=float(seconds[0].sum() / seconds[index].sum()),
                 low=low,
                 high=high,
-                model=_predicted(recorded[0], own, here),
-                projections={name: _predicted(recorded[0], own, profile) for name, profile in there.items()},
+                model=_predicted_speedup(recorded[0], setting, here),
+                projections={
+                    name: _predicted_speedup(recorded[0], setting, profile) for name, profile in there.items()
+                },
             )
         )
-    return found
+    return rows
 
 
-def _predicted(baseline: Recorded, own: Recorded, profile: Profile) -> float:
-    means = [np.mean([predicted(s, profile) for s in r.sequences]) for r in (baseline, own)]
+def _predicted_speedup(baseline: Recorded, setting: Recorded, profile: Profile) -> float:
+    means = [np.mean([predicted(s, profile) for s in r.sequences]) for r in (baseline, setting)]
     return float(means[0] / means[1])
 
 
-def _interval(baseline: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+def _interval(baseline: np.ndarray, method: np.ndarray) -> tuple[float, float]:
     """95 % bootstrap interval of the ratio of mean times, resampling turns."""
-    drawn = np.random.default_rng(0).integers(0, len(own), (_RESAMPLES, len(own)))
-    ratios = baseline[drawn].sum(1) / own[drawn].sum(1)
+    turns = np.random.default_rng(0).integers(0, len(method), (_RESAMPLES, len(method)))
+    ratios = baseline[turns].sum(1) / method[turns].sum(1)
     low, high = np.percentile(ratios, [2.5, 97.5])
     return float(low), float(high)

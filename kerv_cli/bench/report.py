@@ -6,13 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from kerv_cli.base.files import atomic_path
 from kerv_cli.bench.ceilings import MethodCeiling
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.phases import Phase
 
 
 def card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
-    """What the target is and what the device can do, before anything of the target was measured."""
+    """Sizes of the target, rates of the device and the floors that follow, before the target is measured."""
     return [
         ("weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"),
         ("cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"),
@@ -40,11 +43,11 @@ def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
 PHASE_COLUMNS = ("phase", "median ms", "p95", "least", "GB/s", "GFLOP/s", "floor ms", "share %")
 
 
-def ceiling_rows(found: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str, ...]]:
+def ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str, ...]]:
     """One row per method, two columns per N."""
     by_method: dict[str, list[str]] = {}
-    for own in found.values():
-        for ceiling in own:
+    for ceilings in by_tokens.values():
+        for ceiling in ceilings:
             row = by_method.setdefault(ceiling.method, [])
             row += [ceiling.how, f"{ceiling.free:.2f}", f"{ceiling.drafted:.2f}"]
     return [(method, *row) for method, row in by_method.items()]
@@ -64,24 +67,22 @@ def comparison_rows(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[st
 def plot_roofline(path: Path, title: str, machine: Machine, phases: Sequence[Phase]) -> None:
     """GFLOP/s over operations per byte, both logarithmic: the device's roof and every phase below it."""
     import matplotlib as mpl
-    import numpy as np
 
-    from kerv_cli.base.files import atomic_path
     from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
 
-    shown = [phase for phase in phases if phase.floor > 0]
+    limited = [phase for phase in phases if phase.floor > 0]
     with mpl.rc_context(STYLE):
         figure = new_figure(7.0, 4.6)
         axes = figure.subplots()
-        intensity = [phase.flops / phase.read for phase in shown]
+        intensity = [phase.flops / phase.read for phase in limited]
         knee = machine.flops / machine.bandwidth
         x = np.geomspace(min([*intensity, knee]) / 2, max([*intensity, knee]) * 2, 64)
         axes.plot(x, np.minimum(machine.flops, x * machine.bandwidth) / 1e9, color=INK)
-        for place, kind in enumerate(dict.fromkeys(phase.kind for phase in shown)):
-            own = [phase for phase in shown if phase.kind == kind]
-            at = [phase.flops / phase.read for phase in own], [phase.flops / phase.seconds / 1e9 for phase in own]
-            axes.plot(*at, "o", color=colour(place), label=kind)
-            for phase, a, b in zip(own, *at, strict=True):
+        for number, kind in enumerate(dict.fromkeys(phase.kind for phase in limited)):
+            group = [phase for phase in limited if phase.kind == kind]
+            at = [phase.flops / phase.read for phase in group], [phase.flops / phase.seconds / 1e9 for phase in group]
+            axes.plot(*at, "o", color=colour(number), label=kind)
+            for phase, a, b in zip(group, *at, strict=True):
                 axes.annotate(str(phase.rows), (a, b), textcoords="offset points", xytext=(4, -10), fontsize=8)
         axes.set(xscale="log", yscale="log", xlabel="operations per byte", ylabel="GFLOP/s")
         axes.legend(title="phase, by rows")

@@ -23,8 +23,8 @@ FLIP_CHUNKS = 8
 
 @dataclass(frozen=True)
 class Bench:
-    """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N. ties: flipped
-    tokens, and compared ones."""
+    """The results of a bench. cold: seconds of opening the model and of its first decode. ceilings: by N. ties: numbers
+    of flipped and of compared tokens."""
 
     model: Model
     machine: Machine
@@ -41,7 +41,7 @@ class Bench:
 
     @property
     def title(self) -> str:
-        """What was measured where, in words."""
+        """Target, number format, device and threads, in words."""
         device = self.model.target.device
         return f"{self.model.name}, {self.dtype}, {stamp(str(device))['device_name']}, {torch.get_num_threads()} thread"
 
@@ -58,7 +58,7 @@ class Bench:
             "card": self.card,
             "cold_start": self.cold,
             "phases": [phase.as_dict() for phase in self.phases],
-            "ceilings": {str(n): [asdict(c) for c in found] for n, found in self.ceilings.items()},
+            "ceilings": {str(n): [asdict(c) for c in rows] for n, rows in self.ceilings.items()},
             "ties": {"flipped": self.ties[0], "compared": self.ties[1]},
             "profile": profile_of(int(self.card["prompt"]), self.phases).as_dict(),
         }
@@ -107,10 +107,10 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
     cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
     machine, phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
     profile = profile_of(stage.length, phases)
-    found = {n: ceilings(profile, n) for n in settings.tokens}
+    by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
     card = card_of(model, machine, max(settings.tokens))
     ties = flipped(model, FLIP_CHUNKS, max(settings.tokens))
-    return Bench(model, machine, card, cold, phases, found, ties)
+    return Bench(model, machine, card, cold, phases, by_tokens, ties)
 
 
 def place_of(results: str, model: str, dtype: str, kind: str) -> Path:

@@ -1,4 +1,4 @@
-"""Recorded decodes as sequences of forwards: which ran, and over how many tokens, as a study's cells say."""
+"""Recorded decodes of a study as sequences of forwards: the kind of each, and its number of tokens."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ def read_study(store: StudyStore, tokens: int, decodes: int) -> list[Recorded]:
         CheckpointError: a damaged plan or cell.
     """
     plan = store.read_plan()
-    found, _ = store.read_cells(plan.cells)
+    complete, _ = store.read_cells(plan.cells)
     by_label: dict[str, list[Cell]] = {}
     for cell in plan.cells:
-        if cell.id in found and cell.repeat == 0:
+        if cell.id in complete and cell.repeat == 0:
             by_label.setdefault(cell.label, []).append(cell)
     if plan.baseline not in by_label:
         raise UsageError(f"study '{store.name}' has no complete cell of its baseline '{plan.baseline}'")
     labels = sorted(by_label, key=lambda label: label != plan.baseline)
-    return [_setting(label, by_label[label], found, tokens, decodes) for label in labels]
+    return [_setting(label, by_label[label], complete, tokens, decodes) for label in labels]
 
 
-def _setting(label: str, cells: Sequence[Cell], found: Mapping[str, Any], tokens: int, decodes: int) -> Recorded:
-    stored = [found[cell.id] for cell in cells]
+def _setting(label: str, cells: Sequence[Cell], complete: Mapping[str, Any], tokens: int, decodes: int) -> Recorded:
+    stored = [complete[cell.id] for cell in cells]
     if (batch := batch_of(cells[0].settings)) > 1:
         raise UsageError(
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
@@ -61,9 +61,9 @@ def _setting(label: str, cells: Sequence[Cell], found: Mapping[str, Any], tokens
     size = max(sum(int(r["committed"]) for r in rounds) for rounds in rows["rounds"])
     if size < tokens:
         raise UsageError(f"setting '{label}' decodes chunks of {size} tokens: tokens={tokens} cannot be cut from them")
-    chosen = np.unique(np.linspace(0, len(rows) - 1, min(decodes, len(rows))).astype(int))
-    picked = rows.iloc[chosen].to_dict("records")
+    indices = np.unique(np.linspace(0, len(rows) - 1, min(decodes, len(rows))).astype(int))
+    samples = rows.iloc[indices].to_dict("records")
     episodes = sum(len(cell.episodes) for cell in stored)
     successes = sum(int(cell.episodes["success"].sum()) for cell in stored)
-    sequences = tuple(sequence_of(row, size, tokens) for row in picked)
+    sequences = tuple(sequence_of(row, size, tokens) for row in samples)
     return Recorded(label, sequences, cells[0].settings["proposer"], successes, episodes)

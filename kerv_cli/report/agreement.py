@@ -17,24 +17,25 @@ from kerv_cli.report.tables import is_number, rows_of, values_of
 CLOSE = 0.03
 """Two runs agree on a ratio where it differs by at most this share."""
 
-_KEPT = ("successes", "pairs", "speedup", "speedup_low", "speedup_high", "time_per_step_ms", "gauge_ms")
-_FROM = ("device_name", "run", "git_commit")
+_MEASURES = ("successes", "pairs", "speedup", "speedup_low", "speedup_high", "time_per_step_ms", "gauge_ms")
+_ORIGIN = ("device_name", "run", "git_commit")
 
 
-def agreement_table(own: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
-    """One row per averaging and setting that both `study_table`s have: the measures of both, with the suffix `_again`
-    for the other run's; ratio: other speedup over own; close: it differs by at most `CLOSE`; overlap: of the intervals.
+def agreement_table(table: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """One row per averaging and setting that the `study_table`s of two runs share: the measures of both, those of the
+    other run with the suffix `_again`; ratio: the other run's speedup over this one's; close: the ratio differs from 1
+    by at most `CLOSE`; overlap: whether the two intervals overlap.
 
     Raises:
-        UsageError: they have no setting in common, or another baseline, or are one run.
+        UsageError: no setting in common, different baselines, or two tables of one run.
     """
-    if set(own["baseline"]) != set(other["baseline"]):
-        raise UsageError(f"two runs with the baselines {own['baseline'].iloc[0]} and {other['baseline'].iloc[0]}")
-    if values_of(own, "run") & values_of(other, "run"):
-        raise UsageError(f"both hold episodes of run {own['run'].iloc[0]}: compare with another run's results folder")
+    if set(table["baseline"]) != set(other["baseline"]):
+        raise UsageError(f"two runs with the baselines {table['baseline'].iloc[0]} and {other['baseline'].iloc[0]}")
+    if values_of(table, "run") & values_of(other, "run"):
+        raise UsageError(f"both hold episodes of run {table['run'].iloc[0]}: compare with another run's results folder")
     keys = ["averaging", "label", "baseline"]
-    columns = [*keys, *_KEPT, *_FROM]
-    both = own[columns].merge(other[columns], on=keys, suffixes=("", "_again"))
+    columns = [*keys, *_MEASURES, *_ORIGIN]
+    both = table[columns].merge(other[columns], on=keys, suffixes=("", "_again"))
     both = both[both["label"] != both["baseline"]].drop(columns="baseline").reset_index(drop=True)
     if both.empty:
         raise UsageError("the two runs have no setting in common")
@@ -60,7 +61,7 @@ def agreement_summary(table: pd.DataFrame, averaging: str = MICRO) -> Table:
     for name in ("speedup", "again", "difference", "success", "again"):
         printed.add_column(name, justify="right")
     for row in rows_of(rows):
-        again = {name: row[f"{name}_again"] for name in _KEPT}
+        again = {name: row[f"{name}_again"] for name in _MEASURES}
         printed.add_row(
             str(row["label"]),
             _speedup(row),

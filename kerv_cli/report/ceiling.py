@@ -55,16 +55,16 @@ def ceiling(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, ch
         baseline: autoregressive decoding's, same columns.
         in_prefill: the method has an in-prefill draft.
         chunks: the method's control steps per chunk over the baseline's.
-        macro: take the parts within every difficulty group, then their unweighted means.
+        macro: compute the times within every difficulty group, then their unweighted means.
     """
     if not macro:
         return _parts(episodes, baseline, in_prefill, chunks)
-    groups = [
-        _parts(own, baseline[baseline["difficulty"] == name], in_prefill, chunks)
-        for name, own in episodes.groupby("difficulty", sort=True)
+    ceilings = [
+        _parts(group, baseline[baseline["difficulty"] == name], in_prefill, chunks)
+        for name, group in episodes.groupby("difficulty", sort=True)
     ]
-    known = [astuple(group) for group in groups if not math.isnan(group.value)]
-    return Ceiling(*(sum(values) / len(known) for values in zip(*known, strict=True))) if known else NONE
+    rows = [astuple(one) for one in ceilings if not math.isnan(one.value)]
+    return Ceiling(*(sum(column) / len(rows) for column in zip(*rows, strict=True))) if rows else NONE
 
 
 def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, chunks: float) -> Ceiling:
@@ -76,17 +76,17 @@ def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, chu
     one_by_one = float(baseline["forwards"].sum()) - decodes
     one_token = _seconds(baseline, "verify") / one_by_one if one_by_one else 0.0
     if in_prefill:
-        own = _seconds(episodes, "prefill") / prefills
+        verification = _seconds(episodes, "prefill") / prefills
     else:
         # `verify` also holds the forwards without a draft, e.g. over the last token of a chunk: one_token each
         undrafted = max(0.0, float(episodes["forwards"].sum()) - prefills - verifications)
-        own = (_seconds(episodes, "verify") - undrafted * one_token) / verifications
+        verification = (_seconds(episodes, "verify") - undrafted * one_token) / verifications
     return Ceiling(
         overhead=_seconds(baseline, "vision") / decodes,
         prefill=_seconds(baseline, "prefill") / decodes,
         one_token=one_token,
         tokens=float(baseline["forwards"].sum()) / decodes,
-        own=own if own > 0 else math.nan,
+        own=verification if verification > 0 else math.nan,
         in_prefill=float(in_prefill),
         chunks=chunks,
     )
@@ -114,7 +114,7 @@ def kind_of(settings: Mapping[str, Any], part: str) -> str:
 
 def chunk_ratio(settings: Mapping[str, Any], baseline: Mapping[str, Any]) -> float:
     """H over the baseline's H; NaN if only one of them is the target's default."""
-    own, other = settings.get("chunk") or 0, baseline.get("chunk") or 0
-    if own == other:
+    steps, baseline_steps = settings.get("chunk") or 0, baseline.get("chunk") or 0
+    if steps == baseline_steps:
         return 1.0
-    return own / other if own and other else math.nan
+    return steps / baseline_steps if steps and baseline_steps else math.nan

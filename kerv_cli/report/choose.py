@@ -24,14 +24,14 @@ _BOLD: dict[str, tuple[int, str]] = {
     "skip.s_min": (-1, "the smallest s_min"),
     "chunk": (1, "the longest chunk"),
 }
-"""Axis of a study -> the direction in which it saves more forwards, and how its boldest value is called."""
+"""Axis of a study -> the direction in which it saves more forwards, and the name of its boldest value."""
 
 
 @dataclass(frozen=True)
 class Choice:
     """The answer for a suite or a task. front: settings that no other one beats in both speed and success, the fastest
-    first. chosen: the boldest setting whose loss is below the bound; empty if none is shown to be. undecided: setting
-    -> about how many pairs would show it, where more could."""
+    first. chosen: the boldest setting whose loss of success is shown to be below the bound; empty if there is none.
+    undecided: setting -> about how many pairs would show it; without the settings that no number of pairs would."""
 
     where: str
     pairs: int
@@ -46,14 +46,13 @@ def choices(study: pd.DataFrame, per_task: pd.DataFrame, axis: str, loss: float)
     """The suite's choice, then each task's.
 
     Args:
-        study, per_task: as `tables.study_table` and `tables.per_task_table`.
-        axis: the study's; boldness is its direction, without a known one speed.
+        study, per_task: the tables of `tables.study_table` and `tables.per_task_table`.
+        axis: the study's; on an axis without an entry in `_BOLD` the fastest setting is the boldest.
         loss: bound on the loss of success, points.
     """
     suite = rows_of(study, MICRO)
-    found = [_choice("all tasks", suite, axis, loss)]
-    tasks = sorted(set(per_task["task"]))
-    return found + [_choice(str(task), rows_of(per_task[per_task["task"] == task]), axis, loss) for task in tasks]
+    tasks = {str(task): rows_of(rows) for task, rows in per_task.groupby("task", sort=True)}
+    return [_choice(where, rows, axis, loss) for where, rows in {"all tasks": suite, **tasks}.items()]
 
 
 def _choice(where: str, rows: Sequence[dict[str, Any]], axis: str, loss: float) -> Choice:
@@ -77,9 +76,9 @@ def _loss_at_most(row: Mapping[str, Any]) -> float:
 
 
 def _needed(row: Mapping[str, Any], loss: float) -> float:
-    """About how many pairs would show it if the four outcomes' rates stayed as they are; infinite where the difference
-    itself lies at the bound or below. From the same interval as the judgement, unlike `pairs_to_settle`, whose normal
-    interval is too narrow for few discordant pairs."""
+    """About how many pairs would show that the loss is below the bound, if the rates of the four outcomes stayed as
+    they are; infinite where the difference itself lies at the bound or below. Computed from the interval of the choice,
+    not from the normal interval of `pairs_to_settle`, which is too narrow for few discordant pairs."""
     counts = [int(row[name]) for name in stats.PairedCounts._fields]
     pairs = sum(counts)
     if POINTS * (counts[2] - counts[1]) / pairs <= -loss:
@@ -92,14 +91,14 @@ def _needed(row: Mapping[str, Any], loss: float) -> float:
 
 
 def boldness(row: Mapping[str, Any], axis: str) -> tuple[float, float]:
-    """What a choice maximises: the place on the axis where it has a known direction, then the speedup."""
+    """What a choice maximises: the position on the axis, where `_BOLD` gives it a direction, then the speedup."""
     value = row.get(axis)
-    place = math.inf
+    position = math.inf
     if axis in _BOLD:
         numeric = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        place = _BOLD[axis][0] * float(value) if numeric else -math.inf  # type: ignore[arg-type]
+        position = _BOLD[axis][0] * float(value) if numeric else -math.inf  # type: ignore[arg-type]
     speed = float(row["speedup"]) if is_number(row["speedup"]) else -math.inf
-    return (place, speed)
+    return (position, speed)
 
 
 def pareto(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -118,7 +117,7 @@ def _beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
 
 
 def boldest(axis: str) -> str:
-    """How the choice on this axis is called."""
+    """Name of the choice on this axis, e.g. `the largest r`."""
     return _BOLD.get(axis, (0, "the fastest setting"))[1]
 
 
@@ -146,10 +145,10 @@ def _missing(choice: Choice) -> str:
     return f"about {more} more would show it for {label} at the present rates"
 
 
-def choices_frame(found: Sequence[Choice]) -> pd.DataFrame:
+def choices_frame(answers: Sequence[Choice]) -> pd.DataFrame:
     """The choices as a table, for CSV and JSON."""
     rows = []
-    for choice in found:
+    for choice in answers:
         row = asdict(choice)
         row["front"] = ";".join(choice.front)
         row["undecided"] = ";".join(f"{label}: {pairs:.0f} pairs" for label, pairs in choice.undecided.items())

@@ -11,12 +11,12 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
 from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
-from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.plan import Cell, seeds_text
 from kerv_cli.report.measures import MICRO, measure
 from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
 
 _MEASURES = ("AL", "forwards_per_step", "time_per_step_ms", "skip_rate", "unverified_share")
-_OF_STATUS = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
+_STATUS_KEYS = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Difference:
-    """Something that the two sides do not share. `None`: that side does not have it."""
+    """A setting, weight, machine or version in which the two sides differ. `None`: that side lacks it."""
 
     key: str
     first: Any
@@ -39,8 +39,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """first, second: names. settings: what differs between them. results: measure -> value of the first, value of the
-    second, difference or ratio, and its 95 % interval where there is one."""
+    """The comparison of two sides. first, second: their names. settings: their differences. results: a row per measure
+    with both values, their difference or ratio, and its 95 % interval where there is one."""
 
     first: str
     second: str
@@ -49,7 +49,7 @@ class Comparison:
 
 
 def sides(results: str, name: str) -> list[Side]:
-    """`ID` as every setting of a run, `ID:LABEL` as one of them.
+    """The sides that a name stands for: `ID` is every setting of a run, `ID:LABEL` one of them.
 
     Raises:
         UsageError, UnknownName: no such run or setting.
@@ -64,14 +64,16 @@ def sides(results: str, name: str) -> list[Side]:
     if label and label not in labels:
         raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(labels)}")
     many = len(labels) > 1
-    return [Side(f"{run.id}:{own}" if many else run.id, run, own) for own in labels if label in ("", own)]
+    settings = [label] if label else labels
+    return [Side(f"{run.id}:{setting}" if many else run.id, run, setting) for setting in settings]
 
 
 def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, Side]]:
-    """Settings that both runs have, setting by setting; else the first's only or first one with each of the second's.
+    """Pairs of the settings that both runs have; if they share none, the first run's first setting with each of the
+    second run's.
 
     Raises:
-        UsageError: as `sides`, or a training beside episodes.
+        UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes.
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
@@ -89,25 +91,27 @@ def compare(first: Side, second: Side) -> Comparison:
         UsageError: a run without complete cells. CheckpointError: a damaged one.
     """
     if not first.run.has_episodes:
-        rows = _trained_results(first.run, second.run)
+        rows = _training_results(first.run, second.run)
     else:
-        rows = _measured(load_study(store_of(first.run)), first.label, load_study(store_of(second.run)), second.label)
+        rows = _episode_results(
+            load_study(store_of(first.run)), first.label, load_study(store_of(second.run)), second.label
+        )
     return Comparison(first.name, second.name, differences(first, second), rows)
 
 
 def differences(first: Side, second: Side) -> list[Difference]:
     """Settings, weights, machine and versions in which two sides differ."""
-    ours, theirs = _described(first), _described(second)
+    ours, theirs = _settings_of(first), _settings_of(second)
     keys = dict.fromkeys([*ours, *theirs])
     return [Difference(k, ours.get(k), theirs.get(k)) for k in keys if ours.get(k) != theirs.get(k)]
 
 
-def _described(side: Side) -> dict[str, Any]:
+def _settings_of(side: Side) -> dict[str, Any]:
     if not side.run.has_episodes:
-        made = description_of(side.run)
-        described: dict[str, Any] = dict(made.get("settings", {}))
-        described.update((key, made[key]) for key in ("git_commit", "versions", "demos") if key in made)
-        return flatten(described)
+        description = description_of(side.run)
+        settings: dict[str, Any] = dict(description.get("settings", {}))
+        settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
+        return flatten(settings)
     store = store_of(side.run)
     cells = [cell for cell in store.read_plan().cells if cell.label == side.label]
     cell = cells[0]
@@ -117,20 +121,18 @@ def _described(side: Side) -> dict[str, Any]:
 
 
 def _tasks_and_seeds(cells: list[Cell]) -> dict[str, Any]:
-    from kerv_cli.lab.plan import seeds_text
-
     tasks = ";".join(sorted({cell.task for cell in cells}))
     return {"tasks": tasks, "seeds": seeds_text(seed for cell in cells for seed in cell.seeds)}
 
 
 def _circumstances(side: Side, cells: list[Cell]) -> dict[str, Any]:
     store = store_of(side.run)
-    found, _ = store.read_cells(cells)
-    statuses = [stored.status for stored in found.values()]
-    return {key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _OF_STATUS}
+    stored, _ = store.read_cells(cells)
+    statuses = [cell.status for cell in stored.values()]
+    return {key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS}
 
 
-def _measured(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[dict[str, Any]]:
+def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[dict[str, Any]]:
     baseline = first.episodes[first.episodes["label"] == ours]
     episodes = second.episodes[second.episodes["label"] == theirs]
     if baseline.empty or episodes.empty:
@@ -155,7 +157,7 @@ def _row(name: str, first: float, second: float, measured: dict[str, Any], colum
             "what": what}  # fmt: skip
 
 
-def _trained_results(first: RunEntry, second: RunEntry) -> list[dict[str, Any]]:
+def _training_results(first: RunEntry, second: RunEntry) -> list[dict[str, Any]]:
     names = [name for name in first.figures if name in second.figures]
     return [
         {"measure": name, "first": first.figures[name], "second": second.figures[name],
@@ -178,9 +180,9 @@ def same_tokens(first: RunEntry, second: RunEntry) -> tuple[int, int]:
 def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
     store = store_of(run)
     cells = store.read_plan().cells
-    found, _ = store.read_cells(cells)
+    complete, _ = store.read_cells(cells)
     tokens: dict[tuple[str, str, int, int], list[list[int]]] = {}
-    for cell in (cell for cell in cells if cell.id in found):
+    for cell in (cell for cell in cells if cell.id in complete):
         decodes = pd.read_parquet(store.cells / cell.id / "decodes.parquet", columns=["seed", "tokens"])
         for seed, group in decodes.groupby("seed"):
             tokens[cell.label, cell.task, int(str(seed)), cell.repeat] = [list(row) for row in group["tokens"]]

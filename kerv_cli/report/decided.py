@@ -41,8 +41,8 @@ def confidence_of_a_look(looks: int) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a setting's episodes say at a look. low, high: of its success minus the baseline's, at the look's
-    confidence."""
+    """The answer for a setting at a look. difference: its success minus the baseline's; low, high: the interval at the
+    look's confidence."""
 
     label: str
     verdict: str  # SMALLER, LARGER or OPEN
@@ -55,21 +55,21 @@ class Verdict:
 
 def verdict_of(label: str, counts: stats.PairedCounts, margin: float, look: int, looks: int) -> Verdict:
     """Judges a setting. margin: the bound on the loss, a share of episodes."""
-    found = stats.paired_difference(counts, confidence_of_a_look(looks))
-    answer = SMALLER if found.low > -margin else LARGER if found.high < -margin else OPEN
-    return Verdict(label, answer, sum(counts), look, found.value, found.low, found.high)
+    difference = stats.paired_difference(counts, confidence_of_a_look(looks))
+    answer = SMALLER if difference.low > -margin else LARGER if difference.high < -margin else OPEN
+    return Verdict(label, answer, sum(counts), look, difference.value, difference.low, difference.high)
 
 
 def verdicts(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Verdict]:
     """Judges the settings of these labels by all their pairs with the baseline."""
     episodes = data.episodes[data.episodes["repeat"] == 0]
     baseline = episodes[episodes["label"] == data.plan.baseline]
-    found = []
+    answers = []
     for label in labels:
         pairs = paired(episodes[episodes["label"] == label], baseline)
         counts = stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
-        found.append(verdict_of(label, counts, margin, look, looks))
-    return found
+        answers.append(verdict_of(label, counts, margin, look, looks))
+    return answers
 
 
 def looks_of(cells: Sequence[Cell], block: int) -> list[list[Cell]]:
@@ -81,13 +81,13 @@ def looks_of(cells: Sequence[Cell], block: int) -> list[list[Cell]]:
     return [groups[number] for number in sorted(groups)]
 
 
-def write_verdicts(folder: Path, found: Mapping[str, Verdict], loss: float, looks: int) -> None:
-    """Writes decided.json into the study's folder.
+def write_verdicts(folder: Path, answers: Mapping[str, Verdict], loss: float, looks: int) -> None:
+    """Writes decided.json into the study's folder. answers: label -> its verdict at its last look.
 
     Raises:
         StorageError: the disk refused.
     """
-    rows = [{k: None if v != v else v for k, v in asdict(verdict).items()} for verdict in found.values()]
+    rows = [{k: None if v != v else v for k, v in asdict(verdict).items()} for verdict in answers.values()]
     head = {"loss_points": loss, "looks": looks, "confidence_of_a_look": confidence_of_a_look(looks)}
     write_json(folder / "decided.json", {**head, "settings": rows})
 
@@ -112,8 +112,8 @@ def rule(loss: float, looks: int) -> str:
     )
 
 
-def summary(found: Sequence[Verdict]) -> str:
+def summary(answers: Sequence[Verdict]) -> str:
     """Verdicts in one line, for progress."""
-    told = [f"{v.label}: {v.verdict} after {v.pairs} pairs" for v in found if v.verdict != OPEN]
-    waiting = sum(v.verdict == OPEN for v in found)
-    return "; ".join([*told, f"{waiting} open"])
+    clauses = [f"{v.label}: {v.verdict} after {v.pairs} pairs" for v in answers if v.verdict != OPEN]
+    waiting = sum(v.verdict == OPEN for v in answers)
+    return "; ".join([*clauses, f"{waiting} open"])

@@ -18,7 +18,7 @@ from kerv_cli.base.files import atomic_path
 from kerv_cli.base.registry import parts
 
 INK, MUTED, GRID = "#1f2933", "#6b7785", "#e3e8ee"
-COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # told apart when colour-blind
+COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
 STYLE: Any = {
     "figure.constrained_layout.use": True,
     "font.size": 10,
@@ -59,29 +59,29 @@ def entitle(figure: Figure, title: str, about: str) -> None:
     figure.text(0.012, 1.0 - 0.54 * inch, about, fontsize=9, color=MUTED, va="center")
 
 
-def colour(place: int) -> str:
+def colour(number: int) -> str:
     """Colour of the n-th series. The palette repeats after seven; use `DASHES` too where there can be more."""
-    return COLOURS[place % len(COLOURS)]
+    return COLOURS[number % len(COLOURS)]
 
 
-_COLOURED = {"policy.kind": "policy", "prefill_draft.kind": "proposer", "proposer.kind": "proposer"}
+_COLOUR_COLUMNS = {"policy.kind": "policy", "prefill_draft.kind": "proposer", "proposer.kind": "proposer"}
 """Columns whose parts give a setting its colour -> the kind of those parts."""
 
 
 def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
     """A colour per setting, from its row of a study's table: ink for the baseline; for another the first free colour of
     its parts, else of the palette."""
-    taken: list[str] = []
+    colours: list[str] = []
     for row in rows:
         if row["label"] == row["baseline"]:
-            taken.append(INK)
+            colours.append(INK)
             continue
-        names = {column: str(row.get(column)) for column in _COLOURED}
-        known = [parts(_COLOURED[column]).get(name) for column, name in names.items() if name != "none"]
-        own = [f"#{part.colour:06x}" for part in known if part is not None and part.colour is not None]
-        free = [shade for shade in (*own, *COLOURS) if shade not in taken]
-        taken.append(free[0] if free else colour(len(taken)))
-    return taken
+        names = {column: str(row.get(column)) for column in _COLOUR_COLUMNS}
+        entries = [parts(_COLOUR_COLUMNS[column]).get(name) for column, name in names.items() if name != "none"]
+        preferred = [f"#{part.colour:06x}" for part in entries if part is not None and part.colour is not None]
+        free = [shade for shade in (*preferred, *COLOURS) if shade not in colours]
+        colours.append(free[0] if free else colour(len(colours)))
+    return colours
 
 
 SVG_LIMIT = 100_000  # bytes; figures of many points become larger and are stored as PNG only

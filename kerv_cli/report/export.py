@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +23,8 @@ PROJECT = "kerv"
 
 @dataclass(frozen=True)
 class Tracked:
-    """What a tracker shows as one run. config: settings. history: (step, numbers): an episode of a sweep or rollout, a
-    validation of a training. summary: numbers of the whole."""
+    """What a tracker shows as one run. config: settings. history: (step, numbers), one entry per episode of a sweep or
+    rollout, or per validation of a training. summary: the numbers of the whole run."""
 
     name: str
     group: str
@@ -33,10 +34,10 @@ class Tracked:
 
 
 def export(run: RunEntry, to: str, folder: Path) -> list[str]:
-    """Hands a run to a tracker, or writes it as CSV -> names of what was written. folder: where the tracker stores it.
+    """Hands a run to a tracker, or writes it as CSV -> names of the tracked runs or files. folder: of its data.
 
     Raises:
-        UnknownName: no such tracker. UsageError: its package is not installed; the message says how to.
+        UnknownName: no such tracker. UsageError: its package is not installed; the message says how to install it.
     """
     if to not in TRACKERS:
         raise UnknownName("tracker", to, TRACKERS)
@@ -54,9 +55,9 @@ def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
         return
     data = load_study(store_of(run))
     for row in rows_of(study_table(data), MICRO):
-        own = data.episodes[data.episodes["label"] == row["label"]]
+        episodes = data.episodes[data.episodes["label"] == row["label"]]
         history = []
-        for number, episode in enumerate(rows_of(own)):
+        for number, episode in enumerate(rows_of(episodes)):
             values = {name: float(episode[name]) for name in ("success", "steps", "forwards", "decodes", "seconds")}
             values["ms_per_step"] = 1000 * values["seconds"] / values["steps"]
             history.append((number, values))
@@ -86,8 +87,6 @@ def _to_csv(tracked: Tracked, folder: Path) -> str:
 
 
 def _to_trackio(tracked: Tracked, folder: Path) -> str:
-    import os
-
     os.environ.setdefault("TRACKIO_DIR", str(folder))  # read when trackio is imported
     import trackio
 

@@ -29,11 +29,11 @@ _NARROWEST = 0.12  # natural logarithm of two ticks' ratio, below which their la
 
 
 def latency_table(data: StudyData) -> pd.DataFrame | None:
-    """One row per setting whose world goes on, pooled over tasks: its latency, its success, and the difference from AR
-    with the same `rollout.*` in the same episodes; `ar_latency_ms` is what AR's decodes took there. None where no world
-    goes on, or AR is not among the settings."""
+    """One row per setting whose world goes on during a decode, pooled over tasks: its latency, its success, and the
+    difference from AR with the same `rollout.*` in the same episodes. `ar_latency_ms`: mean latency of AR's decodes in
+    those episodes. None where every world waits, or no setting is AR."""
     settings = {cell.label: cell.settings for cell in reversed(data.plan.cells)}
-    episodes = {str(label): own for label, own in data.episodes.groupby("label", sort=False)}
+    episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
     real = [label for label in data.plan.labels if label in episodes and _timing(settings[label])["clock"] == REAL]
     references = {_key(settings[label]): label for label in reversed(real) if is_autoregressive(settings[label])}
     rows = []
@@ -41,19 +41,19 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
         reference = references.get(_key(settings[label]))
         if reference is None:
             continue
-        found = measure(episodes[label], episodes[reference], MICRO)
+        values = measure(episodes[label], episodes[reference], MICRO)
         ar = episodes[reference]
         head = {"study": data.plan.name, "label": label, "method": settings[label]["method"], "ar": reference}
         timing = {f"rollout.{name}": value for name, value in _timing(settings[label]).items()}
         latency = {"ar_latency_ms": 1000.0 * float(ar["delay_seconds"].sum() / ar["delay_decodes"].sum())}
-        measures = {name: found[name] for name in (*_FELT, *_SUCCESS, *_DIFFERENCE)}
+        measures = {name: values[name] for name in (*_FELT, *_SUCCESS, *_DIFFERENCE)}
         parts = {f"{part}.kind": settings[label][part]["kind"] for part in ("prefill_draft", "proposer")}
         rows.append({**head, **timing, **latency, "episodes": len(episodes[label]), **measures, **parts})
     return pd.DataFrame(rows) if rows else None
 
 
 def _timing(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """`rollout.*` of stored settings; the defaults where they are older than it."""
+    """`rollout.*` of stored settings; the defaults where settings lack it, because they are older."""
     return {**dataclasses.asdict(TimingSettings()), **settings.get("rollout", {})}
 
 
@@ -86,7 +86,7 @@ def _points(row: Mapping[str, Any], name: str) -> str:
 
 def latency_figure(table: pd.DataFrame, title: str, about: str) -> Figure:
     """Success over the time that AR's decode takes, a line per method with 95 % intervals; a panel per compensation of
-    the delay. table: as `latency_table`."""
+    the delay. table: `latency_table`'s."""
     kinds = list(dict.fromkeys(table["rollout.delay_compensation"]))
     methods = list(dict.fromkeys(table["method"]))
     shades = dict(zip(methods, _shades(table, methods), strict=True))
@@ -95,13 +95,13 @@ def latency_figure(table: pd.DataFrame, title: str, about: str) -> Figure:
         figure = new_figure(width, 5.0)
         panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         for panel, kind in zip(panels, kinds, strict=True):
-            own = table[table["rollout.delay_compensation"] == kind]
-            for place, method in enumerate(methods):
-                rows = own[own["method"] == method].sort_values("ar_latency_ms")
-                _draw(panel, rows, method, shades[method], place, len(methods))
+            part = table[table["rollout.delay_compensation"] == kind]
+            for number, method in enumerate(methods):
+                rows = part[part["method"] == method].sort_values("ar_latency_ms")
+                _draw(panel, rows, method, shades[method], number, len(methods))
             panel.set(title=f"delay compensation: {kind}", xlabel="an autoregressive decode takes, ms")
             panel.set_ylim(success_floor(table), 102)
-            _name_latencies(panel, own)
+            _name_latencies(panel, part)
         panels[0].set_ylabel("success, % of episodes and 95 % interval")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(6, len(labels), int(width / 2.0)))
@@ -115,32 +115,32 @@ def _shades(table: pd.DataFrame, methods: Sequence[str]) -> list[str]:
     return setting_colours([{**row, "baseline": row["ar"]} for row in first])
 
 
-def _draw(panel: Axes, rows: pd.DataFrame, method: str, shade: str, place: int, count: int) -> None:
+def _draw(panel: Axes, rows: pd.DataFrame, method: str, shade: str, number: int, count: int) -> None:
     """One method: points joined by a line, and their intervals, a little apart from those of the others."""
-    spread = 1.0 + 2.5 * _DODGE * (place - (count - 1) / 2)
+    spread = 1.0 + 2.5 * _DODGE * (number - (count - 1) / 2)
     x = rows["ar_latency_ms"].to_numpy(float) * spread
     values = {name: 100.0 * rows[name].to_numpy(float) for name in ("success", "success_low", "success_high")}
-    line = "-" if place == 0 else DASHES[(place - 1) % len(DASHES)]
+    line = "-" if number == 0 else DASHES[(number - 1) % len(DASHES)]
     panel.plot(x, values["success"], color=shade, linestyle=line, marker="o", markersize=5, linewidth=1.7, label=method)
     panel.vlines(x, values["success_low"], values["success_high"], color=shade, linewidth=1.8, alpha=0.4)
 
 
 def _name_latencies(panel: Axes, rows: pd.DataFrame) -> None:
-    """A logarithmic axis with a tick at every latency, but for neighbours whose labels would touch; those that no
-    factor made are marked."""
+    """Makes x logarithmic, with a tick at every latency whose label does not touch its neighbour's. A dotted line marks
+    AR's latency without `rollout.ar_ms`, where other settings scale it."""
     scaled = rows["rollout.ar_ms"] > 0
-    own = rows[~scaled]["ar_latency_ms"]
+    unscaled = rows[~scaled]["ar_latency_ms"]
     ticks: dict[float, str] = {}
-    for x in [*sorted(rows[scaled]["ar_latency_ms"]), *sorted(own)]:
+    for x in [*sorted(rows[scaled]["ar_latency_ms"]), *sorted(unscaled)]:
         if is_number(x) and x > 0 and all(abs(math.log(x / other)) > _NARROWEST for other in ticks):
             ticks[float(f"{x:.3g}")] = f"{x:.3g}"
     panel.set_xscale("log")
     panel.set_xticks([], minor=True)
     panel.set_xticks(sorted(ticks), [ticks[x] for x in sorted(ticks)])
-    if len(own) and math.isfinite(own.iloc[0]) and scaled.any():
-        panel.axvline(own.iloc[0], color=MUTED, linewidth=1.0, linestyle=":")
+    if len(unscaled) and math.isfinite(unscaled.iloc[0]) and scaled.any():
+        panel.axvline(unscaled.iloc[0], color=MUTED, linewidth=1.0, linestyle=":")
         panel.annotate(
-            *(f"its own, {own.iloc[0]:.3g}", (own.iloc[0], 0.0), (3, 4)),
+            *(f"its own, {unscaled.iloc[0]:.3g}", (unscaled.iloc[0], 0.0), (3, 4)),
             xycoords=("data", "axes fraction"),
             textcoords="offset points",
             fontsize=8,

@@ -44,9 +44,9 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
 
     success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
     (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs, where no
-    target decodes and where an episode of either side was not timed. They are of the pairs whose sides took turns in
-    one block; with apart=True of all pairs. mcnemar_p is NaN without pairs. same_run: all pairs were measured in one
-    run. same_block: share of the pairs that were measured in one block.
+    target decodes and where an episode of either side was not timed. They count only the pairs that were measured in
+    turn in one block; with apart=True all pairs. mcnemar_p is NaN without pairs. same_run: all pairs were measured in
+    one run. same_block: share of the pairs that were measured in one block.
 
     MACRO takes each measure within every difficulty group and then the unweighted mean of the groups; the speedup is
     the ratio of the two macro means. Paired counts and p are those of all pairs in either case.
@@ -60,13 +60,13 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
     counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
     once = episodes[episodes["repeat"] == 0]
-    clocked = pairs if apart else pairs[pairs["in_turn"]]
-    timed = _decodes(episodes) and is_timed(clocked, "time_method") and is_timed(clocked, "time_baseline")
+    timed = pairs if apart else pairs[pairs["in_turn"]]
+    has_times = _decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
         **_columns("success", _success(once, macro)),
-        **_columns("speedup", _speedup(clocked, "time", macro) if timed else stats.NO_ESTIMATE),
-        **_columns("episode_speedup", _speedup(clocked, "seconds", macro) if timed else stats.NO_ESTIMATE),
+        **_columns("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
+        **_columns("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
         **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
@@ -81,30 +81,30 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
 
 
 def _acceptance_interval(episodes: pd.DataFrame, macro: bool) -> stats.Interval:
-    """Of AL; in the macro average from the groups' errors, which are independent."""
+    """95 % interval of AL; for the macro average from the errors of the groups, which are independent."""
     groups = [group for _, group in episodes.groupby("difficulty", sort=True)] if macro else [episodes]
-    known = [group for group in groups if group["verifications"].sum()]
-    found = [stats.ratio(group["committed"].to_numpy(), group["verifications"].to_numpy()) for group in known]
-    if not found:
+    groups = [group for group in groups if group["verifications"].sum()]
+    if not groups:
         return stats.Interval(math.nan, math.nan)
-    mean = sum(ratio.value for ratio in found) / len(found)
-    reach = math.sqrt(sum((ratio.high - ratio.value) ** 2 for ratio in found)) / len(found)
+    lengths = [stats.ratio(group["committed"].to_numpy(), group["verifications"].to_numpy()) for group in groups]
+    mean = sum(length.value for length in lengths) / len(lengths)
+    reach = math.sqrt(sum((length.high - length.value) ** 2 for length in lengths)) / len(lengths)
     return stats.Interval(mean - reach, mean + reach)
 
 
 def _risk_interval(episodes: pd.DataFrame) -> stats.Interval:
-    """Of the realised risk, pooled over all audits; 0 to 1 where a single episode holds them all."""
+    """95 % interval of the realised risk, pooled over all audits; 0 to 1 where a single episode holds them all."""
     if not episodes["audits"].sum():
         return stats.Interval(math.nan, math.nan)
-    found = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
-    if math.isnan(found.low):
+    risk = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
+    if math.isnan(risk.low):
         return stats.Interval(0.0, 1.0)
-    return stats.Interval(max(0.0, found.low), min(1.0, found.high))
+    return stats.Interval(max(0.0, risk.low), min(1.0, risk.high))
 
 
 def paired_columns(counts: stats.PairedCounts) -> dict[str, Any]:
-    """What paired episodes say about success: their number and counts, McNemar's p (NaN without pairs), the difference
-    with its interval, and whether it is above minus the margin."""
+    """Columns on the success of paired episodes: their number and counts, McNemar's p (NaN without pairs), the
+    difference with its interval, and whether the interval lies above minus the margin."""
     difference = stats.paired_difference(counts)
     return {
         "pairs": sum(counts),

@@ -55,9 +55,9 @@ def render(
     """The page.
 
     Args:
-        whole, per_task: as `study_table` and `per_task_table`.
+        whole, per_task: the study's `study_table` and `per_task_table`.
         figures: HTML elements.
-        files: the tables and plots that were written, to be linked.
+        files: the study's tables and plots; the page links the tables.
     """
     template = Environment(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
@@ -91,26 +91,26 @@ def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str
         return stressed.verdict(whole)
     if not any(row["pairs"] and row["label"] != row["baseline"] for row in rows_of(whole, MICRO)):
         rows = rows_of(whole, MICRO)
-        told = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
-        return f"Success: {told}."
-    found = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
-    text = sentence(found, data.plan.axis, LOSS, data.plan.baseline)
+        rates = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
+        return f"Success: {rates}."
+    choice = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
+    text = sentence(choice, data.plan.axis, LOSS, data.plan.baseline)
     return text[:1].upper() + text[1:] + "."
 
 
 def caution(whole: pd.DataFrame) -> str:
-    """What a reader must know before the numbers; empty where there is nothing."""
+    """Warnings that stand before the numbers, in one line; empty where there is none."""
     rows = rows_of(whole, MICRO)
     privileged = sorted({str(row["target"]) for row in rows if "privileged" in str(row["observation"])})
-    told = []
+    clauses = []
     if privileged:
-        told.append(f"{', '.join(privileged)}: privileged, it is given object and goal positions")
+        clauses.append(f"{', '.join(privileged)}: privileged, it is given object and goal positions")
     unverified = [
         str(row["label"]) for row in rows if is_number(row["unverified_share"]) and row["unverified_share"] == 1
     ]
     if unverified:
-        told.append(f"{', '.join(unverified)}: nothing is verified")
-    return "; ".join(told)
+        clauses.append(f"{', '.join(unverified)}: nothing is verified")
+    return "; ".join(clauses)
 
 
 def policies(whole: pd.DataFrame) -> str:
@@ -158,19 +158,19 @@ def _number(value: float) -> str:
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """A row per task, a column per setting: successes and the speedup. Stress makes many settings: with it the other
-    way round."""
+    """A row per task, a column per setting: successes and the speedup. A study of stress has many settings: they are
+    the rows there, and the tasks the columns."""
     labels = list(dict.fromkeys(per_task["label"]))
     if stressed.is_stressed(per_task):
-        found = {(row["label"], row["task"]): row for row in rows_of(per_task)}
+        cells = {(row["label"], row["task"]): row for row in rows_of(per_task)}
         tasks = sorted(set(per_task["task"]))
         return pd.DataFrame(
-            {"setting": label, **{task: _cell(found.get((label, task))) for task in tasks}} for label in labels
+            {"setting": label, **{task: _cell(cells.get((label, task))) for task in tasks}} for label in labels
         )
     rows = []
     for task in sorted(set(per_task["task"])):
-        own = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}
-        rows.append({"task": task, **{label: _cell(own.get(label)) for label in labels}})
+        settings = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}
+        rows.append({"task": task, **{label: _cell(settings.get(label)) for label in labels}})
     return pd.DataFrame(rows)
 
 

@@ -76,12 +76,12 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
     A row without a number on the axis is a series of its own. The baseline is only included where it is a point of
     another series.
     """
-    own = rows[~_is_baseline(rows)]
-    varying = _varying(own, axis)
-    numbers = axis_numbers(own, axis)
+    methods = rows[~_is_baseline(rows)]
+    varying = _varying(methods, axis)
+    numbers = axis_numbers(methods, axis)
     series: dict[str, pd.DataFrame] = {}
-    keys = [own[name].map(str) for name in varying] + [own["label"].where(numbers.isna(), "")]
-    for _, group in own.groupby(keys, sort=False):
+    keys = [methods[name].map(str) for name in varying] + [methods["label"].where(numbers.isna(), "")]
+    for _, group in methods.groupby(keys, sort=False):
         stems = {_stem(str(label), axis) for label in group["label"]}
         name = str(group["label"].iloc[0]) if len(group) == 1 else stems.pop()
         if len(group) > 1 and (stems or name in series):
@@ -93,10 +93,10 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
     return series
 
 
-def _varying(own: pd.DataFrame, axis: str) -> list[str]:
-    first, last = list(own.columns).index("overrides") + 1, list(own.columns).index("horizon")
-    candidates = ["method", *own.columns[first:last]]
-    return [name for name in candidates if name != axis and own[name].map(str).nunique() > 1]
+def _varying(rows: pd.DataFrame, axis: str) -> list[str]:
+    first, last = list(rows.columns).index("overrides") + 1, list(rows.columns).index("horizon")
+    candidates = ["method", *rows.columns[first:last]]
+    return [name for name in candidates if name != axis and rows[name].map(str).nunique() > 1]
 
 
 def axis_numbers(rows: pd.DataFrame, axis: str) -> pd.Series:
@@ -119,39 +119,38 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
     figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns) + min(1.6, 0.075 * longest))
     axes = figure.subplots(1, len(_PANELS))
     ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
-    beside = _places_beside(ticks, [label for label, group in series.items() if len(group) == 1])
+    beside = _positions_beside(ticks, [label for label, group in series.items() if len(group) == 1])
     others = [group[~_is_baseline(group)].iloc[0] for group in series.values()]
     shades = setting_colours(rows_of(pd.DataFrame(others)))
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
-        for place, (label, group) in enumerate(series.items()):
+        for number, (label, group) in enumerate(series.items()):
             if len(group) > 1:
-                _draw_series(panel, group, measure, scale, shades[place], label)
+                _draw_series(panel, group, measure, scale, shades[number], label)
             else:
-                _draw_beside(panel, beside[label], rows_of(group)[0], measure, scale, shades[place])
+                _draw_beside(panel, beside[label], rows_of(group)[0], measure, scale, shades[number])
         _draw_baseline(panel, rows, measure, scale)
         panel.set(title=name, ylabel=unit, xlabel=axis)
-        _name_places(panel, ticks, beside)
+        _name_ticks(panel, ticks, beside)
         _limit(panel, measure, rows)
-    shown = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in shown}
+    entries = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in entries}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
     return figure
 
 
-def _places_beside(ticks: Sequence[float], names: Sequence[str]) -> dict[str, float]:
-    """Where settings without a number on the axis stand: to the right of its last tick, one after the other."""
+def _positions_beside(ticks: Sequence[float], names: Sequence[str]) -> dict[str, float]:
+    """Setting without a number on the axis -> its x: to the right of the last tick, one after the other."""
     span = (ticks[-1] - ticks[0]) or 1.0
     gap = max(span / max(2, len(ticks) - 1), 0.09 * span)
-    return {name: ticks[-1] + gap * (0.8 + 0.55 * place) for place, name in enumerate(names)}
+    return {name: ticks[-1] + gap * (0.8 + 0.55 * number) for number, name in enumerate(names)}
 
 
-def _name_places(panel: Axes, ticks: Sequence[float], beside: Mapping[str, float]) -> None:
+def _name_ticks(panel: Axes, ticks: Sequence[float], beside: Mapping[str, float]) -> None:
     """Ticks of the numbers, and upright names of the settings beside them, behind a thin line."""
     numbers = list(ticks) if len(ticks) <= 9 else list(ticks[:: math.ceil(len(ticks) / 9)])
     panel.set_xticks([*numbers, *beside.values()], [*(f"{value:g}" for value in numbers), *beside])
-    for label, place in zip(panel.get_xticklabels(), [*numbers, *beside.values()], strict=True):
-        if place in beside.values():
-            label.set(rotation=90, fontsize=8, color=INK)
+    for label in panel.get_xticklabels()[len(numbers) :]:
+        label.set(rotation=90, fontsize=8, color=INK)
     if beside:
         panel.axvline((ticks[-1] + min(beside.values())) / 2, color=MUTED, linewidth=0.8, alpha=0.5)
 
@@ -164,20 +163,20 @@ def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, s
         panel.fill_between(x, low, high, color=shade, alpha=0.15, linewidth=0)
 
 
-def _draw_beside(panel: Axes, place: float, row: dict[str, Any], measure: str, scale: float, shade: str) -> None:
+def _draw_beside(panel: Axes, x: float, row: dict[str, Any], measure: str, scale: float, shade: str) -> None:
     if not is_number(row[measure]):
         return
     low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
     if is_number(low):
-        panel.plot([place, place], [low * scale, high * scale], color=shade, linewidth=2.2, alpha=0.45)
-    panel.plot(place, row[measure] * scale, "D", color=shade, markersize=6)
+        panel.plot([x, x], [low * scale, high * scale], color=shade, linewidth=2.2, alpha=0.45)
+    panel.plot(x, row[measure] * scale, "D", color=shade, markersize=6)
 
 
 def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) -> None:
-    own = rows[_is_baseline(rows)]
-    if not len(own):
+    reference = rows[_is_baseline(rows)]
+    if not len(reference):
         return
-    row = own.iloc[0]
+    row = reference.iloc[0]
     value = 1.0 / scale if measure in ("speedup", "AL") else row[measure]  # AR commits one token per forward
     panel.axhline(value * scale, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
     if measure == "success":
@@ -196,8 +195,8 @@ def _by_setting(rows: pd.DataFrame) -> Figure:
     figure = new_figure(12.0, 2.0 + 0.38 * len(rows))
     axes = figure.subplots(1, len(_PANELS), sharey=True)
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
-        for place, row in enumerate(rows_of(rows)):
-            _draw_dot(panel, place, row, measure, scale)
+        for number, row in enumerate(rows_of(rows)):
+            _draw_dot(panel, number, row, measure, scale)
         reference = rows[_is_baseline(rows)]
         if len(reference) and measure != "AL":
             level = 1.0 if measure == "speedup" else reference.iloc[0][measure] * scale
@@ -229,9 +228,9 @@ def _grouped_names(rows: pd.DataFrame) -> pd.Series:
 def _separate(panel: Axes, rows: pd.DataFrame) -> None:
     """A thin line above every setting that begins a group, where some setting continues another."""
     names = list(_grouped_names(rows))
-    starts = [place for place, name in enumerate(names) if not name.startswith(_CONTINUES)]
-    for place in starts[1:] if len(starts) < len(names) else ():
-        panel.axhline(place - 0.5, color=MUTED, linewidth=0.7, alpha=0.5)
+    starts = [y for y, name in enumerate(names) if not name.startswith(_CONTINUES)]
+    for y in starts[1:] if len(starts) < len(names) else ():
+        panel.axhline(y - 0.5, color=MUTED, linewidth=0.7, alpha=0.5)
 
 
 def _name_rows(panel: Axes, names: pd.Series) -> None:
@@ -242,25 +241,25 @@ def _name_rows(panel: Axes, names: pd.Series) -> None:
 
 
 def _draw_ceilings(panel: Axes, rows: pd.DataFrame) -> None:
-    known = rows["ceiling"].notna()
-    if known.any():
-        panel.plot(rows.loc[known, "ceiling"], rows.index[known], "|", color=MUTED, markersize=13, markeredgewidth=1.6)
+    ceilings = rows["ceiling"].dropna()
+    if len(ceilings):
+        panel.plot(ceilings, ceilings.index, "|", color=MUTED, markersize=13, markeredgewidth=1.6)
         panel.set_xlabel(f"{panel.get_xlabel()}; | ceiling")
 
 
-def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale: float) -> None:
+def _draw_dot(panel: Axes, y: int, row: dict[str, Any], measure: str, scale: float) -> None:
     if not is_number(row[measure]):
         return
     colour = INK if row["label"] == row["baseline"] else COLOURS[0]
     value = row[measure] * scale
     low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
     if is_number(low):
-        panel.plot([low * scale, high * scale], [place, place], color=colour, linewidth=2.2, alpha=0.45)
-    panel.plot(value, place, "o", color=colour, markersize=7)
+        panel.plot([low * scale, high * scale], [y, y], color=colour, linewidth=2.2, alpha=0.45)
+    panel.plot(value, y, "o", color=colour, markersize=7)
     text = f"{value:.1f}".removesuffix(".0") if measure == "success" else f"{value:.2f}"
     panel.annotate(
         text,
-        (value, place),
+        (value, y),
         xytext=(0, 8),
         textcoords="offset points",
         ha="center",
@@ -272,15 +271,15 @@ def _draw_dot(panel: Axes, place: int, row: dict[str, Any], measure: str, scale:
 def _phases(rows: pd.DataFrame) -> Figure:
     figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
     panel = figure.subplots()
-    places, left = np.arange(len(rows)), np.zeros(len(rows))
+    y, left = np.arange(len(rows)), np.zeros(len(rows))
     for phase, shade in zip(PHASES, _PHASE_COLOURS, strict=True):
         widths = rows[f"ms.{phase}"].fillna(0.0).to_numpy()
         if widths.any():
-            panel.barh(places, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
+            panel.barh(y, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
         left = left + widths
-    for place, total in enumerate(rows["time_per_step_ms"]):
-        told = f"  {total:.3g}" if is_number(total) else "  not timed"
-        panel.text(total if is_number(total) else 0.0, place, told, va="center", fontsize=9)
+    for number, total in enumerate(rows["time_per_step_ms"]):
+        text = f"  {total:.3g}" if is_number(total) else "  not timed"
+        panel.text(total if is_number(total) else 0.0, number, text, va="center", fontsize=9)
     _name_rows(panel, rows["label"])
     panel.set(title="Inference time by phase", xlabel="ms per control step")
     panel.margins(x=0.08)

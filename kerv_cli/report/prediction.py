@@ -41,8 +41,8 @@ class Predictions:
 
 
 def read_predictions(results: Path, target: str) -> Predictions | None:
-    """The errors in a target's calibration; None without such a target or calibration. They are those of the
-    demonstrations, so the target's weights may have changed since.
+    """The errors in a target's calibration; None without such a target or calibration. The errors depend on the
+    demonstrations alone, so they hold for later weights of the target too.
 
     Raises:
         CheckpointError: the calibration is damaged or of another format.
@@ -59,8 +59,8 @@ def read_predictions(results: Path, target: str) -> Predictions | None:
 
 def calibrated_targets(results: Path) -> list[str]:
     """Names of the targets that have a calibration in this results folder."""
-    places = [*results.glob("artifacts/calibration/*/calibration.json"), *results.glob("pretrained/*/calibration.json")]
-    return sorted({path.parent.name for path in places})
+    paths = [*results.glob("artifacts/calibration/*/calibration.json"), *results.glob("pretrained/*/calibration.json")]
+    return sorted({path.parent.name for path in paths})
 
 
 def predicting_targets(settings: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -69,9 +69,9 @@ def predicting_targets(settings: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def _predicts(settings: Mapping[str, Any]) -> bool:
-    drafting = [settings.get(kind, {"kind": "none"}) for kind in ("prefill_draft", "proposer")]
-    named = {name for part in drafting for name in (part["kind"], *part.get("sources", ()), *part.get("fallback", ()))}
-    return bool(named & set(PREDICTORS) or settings["rectifier"]["kind"] == "compensate")
+    drafts = [settings.get(kind, {"kind": "none"}) for kind in ("prefill_draft", "proposer")]
+    names = {name for part in drafts for name in (part["kind"], *part.get("sources", ()), *part.get("fallback", ()))}
+    return bool(names & set(PREDICTORS) or settings["rectifier"]["kind"] == "compensate")
 
 
 def prediction_table(predictions: Predictions) -> pd.DataFrame:
@@ -118,8 +118,8 @@ def predicted_dofs(table: pd.DataFrame) -> list[str]:
 
 def predicted_means(table: pd.DataFrame) -> pd.DataFrame:
     """Mean error over `predicted_dofs`: columns predictor, task, steps_ahead, error."""
-    own = table[table["dof"].isin(predicted_dofs(table))]
-    return own.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
+    rows = table[table["dof"].isin(predicted_dofs(table))]
+    return rows.groupby(["predictor", "task", "steps_ahead"], sort=False)["error"].mean().reset_index()
 
 
 def prediction_summary(table: pd.DataFrame) -> pd.DataFrame:
@@ -169,12 +169,12 @@ def _draw_ahead(panel: Axes, means: pd.DataFrame, colours: Mapping[str, str]) ->
 
 
 def _draw_tasks(panel: Axes, first: pd.DataFrame, tasks: list[str], colours: Mapping[str, str]) -> None:
-    places, thickness = np.arange(len(tasks)), 0.84 / len(colours)
+    y, thickness = np.arange(len(tasks)), 0.84 / len(colours)
     for i, (name, shade) in enumerate(colours.items()):
         errors = first[first["predictor"] == name].set_index("task")["error"].reindex(tasks)
         offset = (i - (len(colours) - 1) / 2) * thickness
-        panel.barh(places + offset, errors, 0.9 * thickness, color=shade, linewidth=0)
-    panel.set_yticks(places, tasks, color=INK)
+        panel.barh(y + offset, errors, 0.9 * thickness, color=shade, linewidth=0)
+    panel.set_yticks(y, tasks, color=INK)
     panel.set_ylim(len(tasks) - 0.5, -0.5)
     panel.grid(axis="y", visible=False)
     panel.set(title="One step ahead, by task", xlabel="mean abs error, normalised action units")

@@ -1,5 +1,4 @@
-"""What may be published: a ratio whose two sides were measured in turn, in one run, by one committed state of the code,
-on one machine."""
+"""Conditions for publishing a ratio: its two sides were measured in turn, in one run, by one commit, on one machine."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from kerv_cli.report.tables import StudyData, values_of
 
 
 class Unpublishable(KervError):
-    """A study whose table does not hold what a published one must."""
+    """A study whose table does not meet the conditions for publishing."""
 
 
 def refusals(table: pd.DataFrame) -> list[str]:
@@ -18,30 +17,30 @@ def refusals(table: pd.DataFrame) -> list[str]:
 
     table: `study_table`, with labels in `label` and several values of a column joined by semicolons.
     """
-    found = []
+    clauses = []
     commits = values_of(table, "git_commit")
     if any(commit.endswith("+changes") or commit in ("none", "nan", "") for commit in commits):
-        found.append("some cells were computed by code that is not committed")
+        clauses.append("some cells were computed by code that is not committed")
     if len(commits) > 1:
-        found.append(f"its cells are of {len(commits)} commits")
+        clauses.append(f"its cells are of {len(commits)} commits")
     for column, what in (("host", "machines"), ("device_name", "devices"), ("engine", "engines")):
         names = values_of(table, column)
         if len(names) > 1:
-            found.append(f"its cells are of {len(names)} {what}")
+            clauses.append(f"its cells are of {len(names)} {what}")
     compared = table[(table["label"] != table["baseline"]) & (table["pairs"] > 0)]
-    for column, wanted, what in (("same_run", True, "in one run with"), ("same_block", 1.0, "in turn with")):
-        apart = list(dict.fromkeys(compared.loc[compared[column] != wanted, "label"]))
+    for column, value, what in (("same_run", True, "in one run with"), ("same_block", 1.0, "in turn with")):
+        apart = list(dict.fromkeys(compared.loc[compared[column] != value, "label"]))
         if apart:
-            found.append(f"not measured {what} the baseline: {', '.join(map(str, apart))}")
-    return found
+            clauses.append(f"not measured {what} the baseline: {', '.join(map(str, apart))}")
+    return clauses
 
 
 def check_publishable(data: StudyData, table: pd.DataFrame) -> None:
-    """Raises Unpublishable: cells are missing, or `refusals` finds something; the line says all of it."""
-    found = [f"{len(data.absent)} of its cells are missing"] if data.absent else []
-    found += refusals(table)
-    if found:
+    """Raises Unpublishable: cells are missing, or there are `refusals`; its line lists them all."""
+    clauses = [f"{len(data.absent)} of its cells are missing"] if data.absent else []
+    clauses += refusals(table)
+    if clauses:
         raise Unpublishable(
-            f"study {data.plan.name} may not be published: {'; '.join(found)}. Commit, then run 'kerv sweep "
+            f"study {data.plan.name} may not be published: {'; '.join(clauses)}. Commit, then run 'kerv sweep "
             f"study={data.plan.name}' into a fresh results folder on one machine"
         )

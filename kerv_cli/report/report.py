@@ -26,7 +26,8 @@ from kerv_cli.report.task_map import has_task_map, task_map
 
 @dataclass(frozen=True)
 class Report:
-    """files: those written, in order. tables: study -> its `study_table`. agreement: with another run of the study."""
+    """What `report` wrote. files: paths, in order. tables: study -> its `study_table`. agreement: `agreement_table`
+    with another run of the study."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
@@ -90,15 +91,15 @@ class _Reporter:
         figures = study_figures(whole, data.plan.axis, title)
         if has_task_map(per_task):
             figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, "successes of each task"))
-        drawn = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
+        plots = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
         sections = [self.latency_section(data), self.stress_section(whole, name)]
         sections += [self.prediction_section(target) for target in prediction.predicting_targets(settings)]
         page = store.root / "report.html"
-        written = self.report.files[before:]
+        files = self.report.files[before:]
         with atomic_path(page) as temporary:
-            shown = [section for section in sections if section is not None]
-            temporary.write_text(render(store, data, whole, per_task, drawn, shown, written), encoding="utf-8")
+            present = [section for section in sections if section is not None]
+            temporary.write_text(render(store, data, whole, per_task, plots, present, files), encoding="utf-8")
         self.report.files.append(page)
 
     def agreement(self, name: str, against: Path) -> pd.DataFrame:
@@ -114,18 +115,18 @@ class _Reporter:
     def prediction_section(self, target: str) -> Section | None:
         """Writes a target's prediction errors; None where it was not calibrated."""
         if target not in self._sections:
-            found = prediction.read_predictions(self.results, target)
-            self._sections[target] = None if found is None else self._predictions(found)
+            predictions = prediction.read_predictions(self.results, target)
+            self._sections[target] = None if predictions is None else self._predictions(predictions)
         return self._sections[target]
 
-    def _predictions(self, found: prediction.Predictions) -> Section:
-        table = prediction.prediction_table(found)
-        self._save_table(table, found.name)
-        title = f"Prediction of the next actions, {found.target}"
+    def _predictions(self, predictions: prediction.Predictions) -> Section:
+        table = prediction.prediction_table(predictions)
+        self._save_table(table, predictions.name)
+        title = f"Prediction of the next actions, {predictions.target}"
         return Section(
             title=title,
-            note=_prediction_note(found, table),
-            figure=self._save_plot(prediction.prediction_figure(title, table), found.name),
+            note=_prediction_note(predictions, table),
+            figure=self._save_plot(prediction.prediction_figure(title, table), predictions.name),
             table=prediction.prediction_summary(table),
         )
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
@@ -90,13 +90,13 @@ def place_labels(
     Greedy, the most crowded point first: candidate places around the point are tried from near to far; the first that
     covers nothing is taken, else the one that covers least. A thin line joins a distant label to its point.
     """
-    renderer = _settled(figure)
+    renderer = _renderer(figure)
     scale = figure.dpi / _POINT  # pixels per point
     spots = [panel.transData.transform((x, y)) for x, y, _ in labels]
-    taken = [Bbox.from_extents(x - _MARKER, y - _MARKER, x + _MARKER, y + _MARKER).padded(scale) for x, y in spots]
-    taken += [text.get_window_extent(renderer) for text in panel.texts]
+    obstacles = [Bbox.from_extents(x - _MARKER, y - _MARKER, x + _MARKER, y + _MARKER).padded(scale) for x, y in spots]
+    obstacles += [text.get_window_extent(renderer) for text in panel.texts]
     frame = panel.get_window_extent(renderer)
-    written: list[Annotation] = []
+    notes: list[Annotation] = []
     for number in _crowded_first(spots):
         x, y, text = labels[number]
         note = panel.annotate(
@@ -113,14 +113,14 @@ def place_labels(
         )
         note.set_in_layout(False)
         size = Annotation.get_window_extent(note, renderer).padded(_CLEAR * scale)
-        offset = _best_offset(spots[number], size.width, size.height, scale, taken, frame)
+        offset = _best_offset(spots[number], size.width, size.height, scale, obstacles, frame)
         note.set_position((offset[0] / scale, offset[1] / scale))
-        taken.append(_box(spots[number] + offset, size.width, size.height))
-        written.append(note)
-    return written
+        obstacles.append(_box(spots[number] + offset, size.width, size.height))
+        notes.append(note)
+    return notes
 
 
-def _settled(figure: Figure) -> Any:
+def _renderer(figure: Figure) -> RendererAgg:
     """The renderer, after the layout has placed every panel."""
     figure.draw_without_rendering()
     canvas = figure.canvas
@@ -131,20 +131,20 @@ def _settled(figure: Figure) -> Any:
 def _crowded_first(spots: Sequence[np.ndarray]) -> list[int]:
     if len(spots) < 2:
         return list(range(len(spots)))
-    places = np.array(spots)
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    points = np.array(spots)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1)
     near = np.sort(apart, axis=1)[:, 1 : 1 + min(3, len(spots) - 1)].mean(1)
     return [int(i) for i in np.argsort(near, kind="stable")]
 
 
 def _best_offset(
-    spot: np.ndarray, width: float, height: float, scale: float, taken: Sequence[Bbox], frame: Bbox
+    spot: np.ndarray, width: float, height: float, scale: float, obstacles: Sequence[Bbox], frame: Bbox
 ) -> np.ndarray:
     """Pixels from the point to the label's centre."""
     best, least = np.zeros(2), math.inf
     for offset in _offsets(width, height, scale):
         box = _box(spot + offset, width, height)
-        cost = sum(_shared(box, other) for other in taken) + 4 * (width * height - _shared(box, frame))
+        cost = sum(_shared(box, other) for other in obstacles) + 4 * (width * height - _shared(box, frame))
         if cost < least - 1e-9:
             best, least = offset, cost
         if cost <= 0:

@@ -183,17 +183,18 @@ def speedup(
     weights = _weights(a.size, groups)
     mean_a, mean_b = weights @ times
     value = float(mean_a / mean_b)
-    members = _numbered(strata)
-    if np.bincount(members).min() < 2:
+    stratum_numbers = _numbers_of(strata)
+    if np.bincount(stratum_numbers).min() < 2:
         return Estimate(value, math.nan, math.nan)
-    blocked = np.arange(a.size) if blocks is None else _numbered(blocks)
-    order = np.lexsort((blocked, members))  # by stratum, then block; stable, so pairs of a block keep their order
-    sizes = _block_sizes(members[order], blocked[order])
+    block_numbers = np.arange(a.size) if blocks is None else _numbers_of(blocks)
+    # by stratum, then block; stable, so pairs of a block keep their order
+    order = np.lexsort((block_numbers, stratum_numbers))
+    sizes = _block_sizes(stratum_numbers[order], block_numbers[order])
     means, first = np.zeros((resamples, 2)), 0
     for counts, drawn in _draws(sizes, resamples, seed):
         rows = order[first : first + counts.shape[1]]
         # a stratum lies within one group, so its pairs have equal weights
-        means += _summed(counts, times[rows]) * (weights[rows].sum() / drawn[:, None])
+        means += _weighted_sums(counts, times[rows]) * (weights[rows].sum() / drawn[:, None])
         first += len(rows)
     low, high = np.quantile(means[:, 0] / means[:, 1], [0.025, 0.975])
     return Estimate(value, float(low), float(high))
@@ -212,34 +213,35 @@ def _draws(sizes: tuple[tuple[int, ...], ...], resamples: int, seed: int) -> tup
     (resamples,): by block, then within the block. They depend on the sizes of the blocks alone, so that the settings of
     a study, which share their tasks and seeds, share them."""
     generator = np.random.default_rng(seed)
-    return tuple(_drawn(np.array(stratum), resamples, generator) for stratum in sizes)
+    return tuple(_stratum_draws(np.array(stratum), resamples, generator) for stratum in sizes)
 
 
-def _drawn(sizes: np.ndarray, resamples: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """As `_draws`, of one stratum with blocks of these sizes."""
+def _stratum_draws(sizes: np.ndarray, resamples: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """How often every resample draws each pair of one stratum (resamples, pairs), and how many pairs it draws
+    (resamples,). sizes (blocks,): the number of pairs in each block."""
     first, pairs = np.cumsum(sizes) - sizes, int(sizes.sum())
-    drawn = generator.integers(0, sizes.size, size=(resamples, sizes.size))
+    choices = generator.integers(0, sizes.size, size=(resamples, sizes.size))
     counts = np.empty((resamples, pairs), np.uint16)
     rows = max(1, _AT_ONCE // (sizes.size * int(sizes.max())))
     for begin in range(0, resamples, rows):
-        blocks = drawn[begin : begin + rows]
+        blocks = choices[begin : begin + rows]
         within = generator.random((*blocks.shape, int(sizes.max())))
-        drawn_sizes = sizes[blocks][..., None]
-        places = first[blocks][..., None] + (within * drawn_sizes).astype(np.int64)
-        places += pairs * np.arange(len(blocks))[:, None, None]
-        used = np.arange(sizes.max()) < drawn_sizes  # as many pairs as the block has
-        found = np.bincount(places[used], minlength=len(blocks) * pairs)
-        counts[begin : begin + rows] = found.reshape(-1, pairs)
-    return counts, sizes[drawn].sum(axis=1)
+        lengths = sizes[blocks][..., None]
+        indices = first[blocks][..., None] + (within * lengths).astype(np.int64)
+        indices += pairs * np.arange(len(blocks))[:, None, None]
+        used = np.arange(sizes.max()) < lengths  # as many pairs as the block has
+        tallies = np.bincount(indices[used], minlength=len(blocks) * pairs)
+        counts[begin : begin + rows] = tallies.reshape(-1, pairs)
+    return counts, sizes[choices].sum(axis=1)
 
 
-def _summed(counts: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Sums (resamples, 2) of times (pairs, 2), each as often as counted (resamples, pairs)."""
+def _weighted_sums(counts: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Sums (resamples, 2) of the times (pairs, 2), weighted by the counts (resamples, pairs)."""
     rows = max(1, _AT_ONCE // counts.shape[1])
     return np.concatenate([counts[i : i + rows].astype(np.float64) @ times for i in range(0, len(counts), rows)])
 
 
-def _numbered(names: Sequence[str]) -> np.ndarray:
+def _numbers_of(names: Sequence[str]) -> np.ndarray:
     """(n,) numbers 0, 1, … of the distinct names."""
     numbers: np.ndarray = np.unique(np.asarray(names, dtype=object).astype(str), return_inverse=True)[1]
     return numbers

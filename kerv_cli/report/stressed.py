@@ -19,7 +19,7 @@ from kerv_cli.report.scatter import success_floor
 from kerv_cli.report.tables import is_number, rows_of
 
 BEHIND = 0.10
-"""Success below the baseline's, under the same stress, from which a method is said to fall behind."""
+"""A method falls behind where its success is lower than the baseline's, under the same stress, by this or more."""
 NONE = "none"
 
 _COLUMNS = 4  # panels beside one another
@@ -40,16 +40,16 @@ def by_kind(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, dict[str, 
     """Kind -> method -> rows of the table along the level, beginning with the method's unstressed row."""
     rows = rows_of(table, averaging)
     plain = {stem(str(row["label"])): row for row in rows if row["stress"] == NONE}
-    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    kinds: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in rows:
         if row["stress"] != NONE:
-            found.setdefault(str(row["stress"]), {}).setdefault(stem(str(row["label"])), []).append(row)
+            kinds.setdefault(str(row["stress"]), {}).setdefault(stem(str(row["label"])), []).append(row)
     return {
         kind: {
-            name: sorted([*([plain[name]] if name in plain else []), *own], key=lambda row: int(row["stress_level"]))
-            for name, own in methods.items()
+            name: sorted([*([plain[name]] if name in plain else []), *group], key=lambda row: int(row["stress_level"]))
+            for name, group in methods.items()
         }
-        for kind, methods in found.items()
+        for kind, methods in kinds.items()
     }
 
 
@@ -57,7 +57,7 @@ def stress_figure(table: pd.DataFrame, title: str, about: str, averaging: str = 
     """One panel per kind: success over the level, one line per method, bars for the 95 % intervals."""
     kinds = by_kind(table, averaging)
     names = list(dict.fromkeys(name for methods in kinds.values() for name in methods))
-    first = {name: row for methods in kinds.values() for name, own in methods.items() for row in own[:1]}
+    first = {name: row for methods in kinds.values() for name, group in methods.items() for row in group[:1]}
     shades = dict(zip(names, setting_colours(first[name] for name in names), strict=True))
     across = min(_COLUMNS, len(kinds))
     down = -(-len(kinds) // across)
@@ -65,13 +65,13 @@ def stress_figure(table: pd.DataFrame, title: str, about: str, averaging: str = 
     with mpl.rc_context(STYLE):
         figure = new_figure(max(8.0, 3.1 * across), 1.4 + 2.7 * down)
         panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
-        for place, (panel, (kind, methods)) in enumerate(zip(panels, kinds.items(), strict=False)):
+        for index, (panel, (kind, methods)) in enumerate(zip(panels, kinds.items(), strict=False)):
             for number, name in enumerate(names):
                 shift = _DODGE * (number - (len(names) - 1) / 2)
                 _draw(panel, methods.get(name, []), shades[name], _dashes(number), name, shift)
-            levels = sorted({int(row["stress_level"]) for own in methods.values() for row in own})
+            levels = sorted({int(row["stress_level"]) for group in methods.values() for row in group})
             panel.set(title=kind, xlabel="level", xticks=levels, ylim=(floor, 103))
-            if place % across == 0:
+            if index % across == 0:
                 panel.set_ylabel("success, % of episodes")
         for panel in panels[len(kinds) :]:
             panel.set_visible(False)
@@ -88,12 +88,12 @@ def _dashes(number: int) -> Any:
 
 
 def _draw(panel: Axes, rows: list[dict[str, Any]], shade: str, dashes: Any, name: str, shift: float) -> None:
-    known = [row for row in rows if is_number(row["success"])]
-    if not known:
+    rows = [row for row in rows if is_number(row["success"])]
+    if not rows:
         return
-    x = [int(row["stress_level"]) + shift for row in known]
-    y = [100 * row["success"] for row in known]
-    for at, row in zip(x, known, strict=True):
+    x = [int(row["stress_level"]) + shift for row in rows]
+    y = [100 * row["success"] for row in rows]
+    for at, row in zip(x, rows, strict=True):
         panel.plot(
             [at, at], [100 * row["success_low"], 100 * row["success_high"]], color=shade, linewidth=1.4, alpha=0.4
         )
@@ -120,9 +120,9 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
     groups |= {f"level {level}": [row for row in rows if int(row["stress_level"]) == level] for level in levels}
     groups["all"] = rows
     return pd.DataFrame(
-        _sum([row for row in own if stem(str(row["label"])) == method], method, name, reference)
-        for name, own in groups.items()
-        for method in _stems(own)
+        _sum([row for row in group if stem(str(row["label"])) == method], method, name, reference)
+        for name, group in groups.items()
+        for method in _stems(group)
     )
 
 
@@ -153,16 +153,18 @@ def verdict(table: pd.DataFrame) -> str:
     bound = f"{100 * BEHIND:.0f} points of success or more behind {reference} under the same stress"
     if not behind:
         return f"No method falls {bound}."
-    told = [f"{name}: {_places(row for row in behind if stem(str(row['label'])) == name)}" for name in _stems(behind)]
-    return f"{bound} (* with 95 % confidence behind it): {'; '.join(told)}."
+    methods = {name: [row for row in behind if stem(str(row["label"])) == name] for name in _stems(behind)}
+    clauses = [f"{name}: {_levels_text(rows)}" for name, rows in methods.items()]
+    return f"{bound} (* with 95 % confidence behind it): {'; '.join(clauses)}."
 
 
 def _stems(rows: Iterable[dict[str, Any]]) -> list[str]:
     return list(dict.fromkeys(stem(str(row["label"])) for row in rows))
 
 
-def _places(rows: Iterable[dict[str, Any]]) -> str:
-    """`camera 3/4*, light 4`; a star where the interval of the difference lies below 0."""
+def _levels_text(rows: Iterable[dict[str, Any]]) -> str:
+    """The levels of each kind as text, `camera 3/4*, light 4`; a star where the interval of the difference lies below
+    0."""
     levels: dict[str, list[str]] = {}
     for row in rows:
         if row["stress"] == NONE:
@@ -170,4 +172,4 @@ def _places(rows: Iterable[dict[str, Any]]) -> str:
         else:
             sure = "*" if row["difference_high"] < 0 else ""
             levels.setdefault(str(row["stress"]), []).append(f"{row['stress_level']}{sure}")
-    return ", ".join(" ".join([kind, "/".join(found)]).strip() for kind, found in levels.items())
+    return ", ".join(" ".join([kind, "/".join(numbers)]).strip() for kind, numbers in levels.items())

@@ -38,13 +38,13 @@ from kerv_cli.report.ceiling import (
 from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, measure
 from kerv_cli.worlds import specs
 
-_PLACE = ("executor", "workers", "device_name", "host")
+_MACHINE = ("executor", "workers", "device_name", "host")
 _CODE = ("git_commit", "engine", "code", "run")
-_STATUS_COLUMNS = (*_PLACE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
+_STATUS_COLUMNS = (*_MACHINE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
 
 
 _OLDER = {"engine": 1}
-"""What a status that lacks the entry means."""
+"""Values of the entries that the status of an older cell lacks."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ class StudyData:
     @functools.cached_property
     def complete(self) -> dict[str, list[Cell]]:
         """Label -> its complete cells, in the plan's order."""
-        found: dict[str, list[Cell]] = {}
+        cells: dict[str, list[Cell]] = {}
         for cell in self.plan.cells:
             if cell.id in self.cells:
-                found.setdefault(cell.label, []).append(cell)
-        return found
+                cells.setdefault(cell.label, []).append(cell)
+        return cells
 
 
 def _stress(cell: Cell) -> tuple[str, int]:
@@ -106,15 +106,16 @@ def load_study(store: StudyStore, cells: Sequence[Cell] | None = None) -> StudyD
     plan = store.read_plan()
     if cells is not None:
         plan = replace(plan, cells=tuple(cells))
-    found, absent = store.read_cells(plan.cells)
-    return StudyData(plan, found, _labelled([cell for cell in plan.cells if cell.id in found], found), absent)
+    complete, absent = store.read_cells(plan.cells)
+    episodes = _labelled_episodes([cell for cell in plan.cells if cell.id in complete], complete)
+    return StudyData(plan, complete, episodes, absent)
 
 
-def _labelled(cells: Sequence[Cell], found: Mapping[str, StoredCell]) -> pd.DataFrame:
-    """The episodes of the cells in order, and what the tables need to know of each one's cell."""
-    stored = [found[cell.id] for cell in cells]
-    own = [one.of(cell) for one, cell in zip(stored, cells, strict=True)]
-    episodes = pd.concat(own, ignore_index=True)
+def _labelled_episodes(cells: Sequence[Cell], complete: Mapping[str, StoredCell]) -> pd.DataFrame:
+    """The episodes of the cells in order, with the columns of their cells that the tables need. complete: by id."""
+    stored = [complete[cell.id] for cell in cells]
+    frames = [one.of(cell) for one, cell in zip(stored, cells, strict=True)]
+    episodes = pd.concat(frames, ignore_index=True)
     groups = {task: difficulty_of(task) for task in {cell.task for cell in cells}}
     columns: dict[str, list[Any]] = {
         "label": [cell.label for cell in cells],
@@ -126,7 +127,7 @@ def _labelled(cells: Sequence[Cell], found: Mapping[str, StoredCell]) -> pd.Data
         "dtype": [cell.settings["runtime"]["dtype"] for cell in cells],
         "threads": [cell.settings["runtime"]["threads"] for cell in cells],
     }
-    lengths = [len(part) for part in own]
+    lengths = [len(part) for part in frames]
     spread = {
         name: np.repeat(np.array(values, dtype=object if isinstance(values[0], str) else None), lengths)
         for name, values in columns.items()
@@ -154,7 +155,7 @@ def study_table(data: StudyData) -> pd.DataFrame:
 
 
 Sections = list[dict[str, Any]]
-"""One row of a table as sections of columns; settings with different parts share the columns before each section."""
+"""One row of a table as sections of columns. A column that only some settings have stays within its section."""
 
 
 def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
@@ -167,10 +168,10 @@ def _frame(rows: Sequence[Sections]) -> pd.DataFrame:
 def _rows(data: StudyData, episodes: pd.DataFrame, averaging: str) -> Iterator[Sections]:
     """One row per label that has episodes here."""
     for label in data.plan.labels:
-        own = episodes[episodes["label"] == label]
-        if len(own):
+        group = episodes[episodes["label"] == label]
+        if len(group):
             baseline = episodes[episodes["label"] == data.references[label]]
-            yield _row(data, label, own, baseline, averaging)
+            yield _row(data, label, group, baseline, averaging)
 
 
 def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str) -> Sections:
@@ -199,13 +200,13 @@ def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str
     if is_autoregressive(cell.settings):
         return NONE
     target = cell.identity.get("target")
-    found = [other for other in data.autoregressive if other.identity.get("target") == target]
-    if not found:
+    candidates = [other for other in data.autoregressive if other.identity.get("target") == target]
+    if not candidates:
         return NONE
-    reference = data.episodes[data.episodes["label"] == found[0].label]
+    reference = data.episodes[data.episodes["label"] == candidates[0].label]
     for name in ("task", *COMPARABLE):
         reference = reference[reference[name].isin(set(episodes[name]))]
-    chunks = chunk_ratio(cell.settings, found[0].settings)
+    chunks = chunk_ratio(cell.settings, candidates[0].settings)
     return ceiling(episodes, reference, verifies_in_prefill(cell.settings), chunks, averaging == MACRO)
 
 

@@ -33,7 +33,7 @@ def task_map(per_task: pd.DataFrame, title: str, about: str) -> Figure:
     with mpl.rc_context(STYLE):
         figure = new_figure(3.4 + 0.95 * len(labels), 2.2 + 0.27 * len(tasks))
         panel = figure.subplots()
-        shown = panel.imshow(
+        image = panel.imshow(
             points, cmap=mpl.colormaps["RdBu"].with_extremes(bad=UNKNOWN), vmin=-FAR, vmax=FAR, aspect="auto"
         )
         for row, task in enumerate(tasks):
@@ -49,7 +49,7 @@ def task_map(per_task: pd.DataFrame, title: str, about: str) -> Figure:
         panel.tick_params(length=0)
         panel.grid(visible=False)
         panel.spines[:].set_visible(False)
-        bar = figure.colorbar(shown, ax=panel, shrink=0.8, pad=0.02, label="points, against the baseline")
+        bar = figure.colorbar(image, ax=panel, shrink=0.8, pad=0.02, label="points, against the baseline")
         bar.outline.set_visible(False)
         entitle(figure, title, about)
     return figure

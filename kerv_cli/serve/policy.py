@@ -18,7 +18,7 @@ WARM_UP = 4  # decodes
 
 
 def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
-    """The policy's interface and its decoder; everything that may be wrong is found before the first client.
+    """The policy's interface and its decoder, after a warm-up: errors are raised before the first client connects.
 
     Raises:
         UsageError: numbers out of range, parts that do not belong together. CheckpointError: no such policy, or an
@@ -28,21 +28,21 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
         raise UnknownName("gripper", settings.gripper, GRIPPERS)
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
-    described, method = artifacts.description, settings.parts()
-    check(method, settings.chunk, described.chunk)
+    description, method = artifacts.description, settings.parts()
+    check(method, settings.chunk, description.chunk)
     artifacts.check(needs(method))
     decoder = compose(method, artifacts.target, artifacts.load, settings.task_name, settings.chunk)
     interface = Interface(
         name=settings.policy.target,
         method=settings.method,
-        actions=described.actions,
-        observation=described.observation,
-        cameras=tuple(described.cameras),
-        size=int(described.settings.get("image_size", 0)) if described.cameras else 0,
-        privileged=not described.cameras and described.observation.state > 0,
+        actions=description.actions,
+        observation=description.observation,
+        cameras=tuple(description.cameras),
+        size=int(description.settings.get("image_size", 0)) if description.cameras else 0,
+        privileged=not description.cameras and description.observation.state > 0,
         gripper=settings.gripper,
         task=settings.task_name,
-        images_alone=bool(find("target", described.family).traits.get("images_alone")),
+        images_alone=bool(find("target", description.family).traits.get("images_alone")),
     )
     warm_up(interface, decoder)
     return interface, decoder

@@ -22,14 +22,14 @@ GRIPPERS: Mapping[str, Gripper] = {
     "signed_inverted": lambda values: np.where(values > 0.5, -1.0, 1.0),
 }
 """How the strict DoFs (a gripper: 0 closed to 1 open) are sent: as they are, or −1 closed and 1 open, or the reverse,
-which LIBERO's simulator wants."""
+which LIBERO's simulator expects."""
 
 
 @dataclass(frozen=True)
 class Interface:
-    """What a policy takes and gives. size: pixels of its images, 0 where it sees none. privileged: it reads the whole
-    state; images_alone: none of it, so that it may be left out. gripper: one of GRIPPERS. task: name for parts whose
-    levels differ between tasks."""
+    """The inputs and outputs of a policy. size: pixels of its images, 0 where it sees none. privileged: it reads the
+    whole state. images_alone: it reads no state, so that a message may lack it. gripper: one of GRIPPERS. task: name
+    for parts whose levels differ between tasks."""
 
     name: str
     method: str
@@ -77,25 +77,25 @@ class Interface:
         key = next((key for key in keys if key in message), None)
         if key is None:
             raise UsageError(f"no image: {' or '.join(keys)} is wanted, the message has {_keys(message)}")
-        image, wanted = message[key], frame_shape(camera, self.size)
-        if not isinstance(image, np.ndarray) or image.shape != wanted or image.dtype != np.uint8:
+        image, shape = message[key], frame_shape(camera, self.size)
+        if not isinstance(image, np.ndarray) or image.shape != shape or image.dtype != np.uint8:
             what = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise UsageError(f"{key} is {what}, {wanted} uint8 is wanted")
+            raise UsageError(f"{key} is {what}, {shape} uint8 is wanted")
         return image
 
     def _numbers(self, message: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Proprioception (p,) and state (s,); what a policy that sees images does not read is zero."""
+        """Proprioception (p,) and state (s,); numbers that the policy does not read are zero."""
         few, many = len(self.observation.proprioception), self.observation.state
         if not many:
             return np.zeros(0), np.zeros(0)
-        given = message.get(STATE)
-        if given is None and self.images_alone:
+        values = message.get(STATE)
+        if values is None and self.images_alone:
             return np.zeros(few), np.zeros(many)
         sizes = [many] if self.privileged else [few, many]
-        if not isinstance(given, np.ndarray | list):
+        if not isinstance(values, np.ndarray | list):
             raise UsageError(f"no {STATE}: {sizes[0]} numbers are wanted, the message has {_keys(message)}")
         try:
-            numbers = np.asarray(given, dtype=np.float64)
+            numbers = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise UsageError(f"{STATE} does not hold numbers") from error
         if numbers.ndim != 1 or len(numbers) not in sizes:
@@ -104,12 +104,12 @@ class Interface:
             raise UsageError(f"{STATE} holds numbers that are not finite, at {np.flatnonzero(~np.isfinite(numbers))}")
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
-    def sent(self, actions: np.ndarray) -> np.ndarray:
-        """actions (H, D) in environment units, the strict DoFs by the convention."""
-        made = actions.astype(np.float64)
+    def converted(self, actions: np.ndarray) -> np.ndarray:
+        """actions (H, D), environment units -> float64 with the strict DoFs in the client's convention."""
+        values = actions.astype(np.float64)
         strict = self.actions.is_strict
-        made[:, strict] = GRIPPERS[self.gripper](made[:, strict])
-        return made
+        values[:, strict] = GRIPPERS[self.gripper](values[:, strict])
+        return values
 
 
 def _keys(message: Mapping[str, Any]) -> str:
@@ -118,7 +118,8 @@ def _keys(message: Mapping[str, Any]) -> str:
 
 @dataclass
 class Session:
-    """One connection. last: the actions of the last decode (H, D), environment units; at: the end effector then."""
+    """One connection. last: the actions (H, D) of the last decode, environment units. at: the end effector's position
+    (3,) at that decode, metres."""
 
     interface: Interface
     decoder: Decoder
@@ -128,7 +129,7 @@ class Session:
     decodes: int = 0
 
     def answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        """Decodes the observation in a message -> `actions` (H, D) and what it took.
+        """Decodes the observation in a message -> `actions` (H, D), its time and its forwards.
 
         Raises:
             UsageError: as `Interface.observation_of`, or a wrong `executed`.
@@ -147,13 +148,13 @@ class Session:
         self.last, self.at = record.actions, hand
         self.decodes += 1
         return {
-            "actions": self.interface.sent(record.actions),
+            "actions": self.interface.converted(record.actions),
             "policy_timing": {"infer_ms": 1000 * record.seconds},
             "decode": {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode},
         }
 
     def _executed(self, message: Mapping[str, Any]) -> np.ndarray:
-        """The actions that were executed since the last answer: all of it, or as many as `executed` says."""
+        """The actions of the last answer that were executed since: all of them, or the first `executed` ones."""
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):
             raise UsageError(f"{EXECUTED}={str(count)[:40]}: 0 to {len(self.last)} control steps of the last answer")

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.boundary import BoundaryRanges
 from kerv_cli.methods.build import compose
@@ -37,12 +38,10 @@ from kerv_cli.training.predictor_fit import (
     prediction_errors,
     read_windows,
 )
+from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
-
-if TYPE_CHECKING:
-    from kerv_cli.engine.decoder import Decoder
-    from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
@@ -52,7 +51,7 @@ def reference_level(levels: Sequence[float], least: float) -> float:
     """K_S: the median K of pre-sampled decodes, at least `least` so that it can divide.
 
     Raises:
-        ValueError: no decode compared anything.
+        ValueError: `levels` is empty.
     """
     if not levels:
         raise ValueError("no decode compared a draft with a target token")
@@ -64,17 +63,17 @@ def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, d
 
     The decoder sees every executed action in between, so that methods with a history have one.
     """
-    instruction, felt = instruction_of(episode.task), len(space.proprioception)
+    instruction, width = instruction_of(episode.task), len(space.proprioception)
     chosen = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
-    levels, seen = [], 0
+    levels, first = [], 0
     decoder.reset(episode.task, episode.seed, episode.end_effector[0])
     for index in chosen:
         step = int(episode.frame_steps[index])
-        for t in range(seen, step):
+        for t in range(first, step):
             decoder.observe(episode.executed[t], episode.end_effector[t + 1])
-        seen, state = step, episode.states[step]
+        first, state = step, episode.states[step]
         images = dict.fromkeys(decoder.cameras, episode.frames[index])
-        record = decoder.decode(Observation(state[:felt], state, instruction, images))
+        record = decoder.decode(Observation(state[:width], state, instruction, images))
         if record.variability is not None:
             levels.append(record.variability)
     return levels
@@ -87,17 +86,17 @@ class PathReader(DemoDataset):
     paths: dict[int, np.ndarray] = field(default_factory=dict)  # index -> (T, 3) float32, metres
 
     def load(self, index: int) -> DemoEpisode:
-        """As `DemoDataset.load`; stores the episode's path."""
+        """Reads an episode and stores its path; errors as `DemoDataset.load`."""
         episode = super().load(index)
         self.paths[index] = episode.end_effector.copy()
         return episode
 
 
 class CalibrationRun:
-    """`kerv calibrate`: call `load`, then `presample`, `boundary` and `skip` as wanted, then `finish`, which writes.
+    """`kerv calibrate`: call `load`, then any of `presample`, `boundary` and `skip`, then `finish`, which writes.
 
     Attributes:
-        notes: lines for the user: sections that were not computed now, and whether an earlier run's were kept.
+        notes: lines for the user, one per section that was not computed: why, and whether an earlier one stays.
 
     Raises:
         UsageError: a number out of range, an unknown task. CheckpointError: no such target or demonstrations,
@@ -109,16 +108,17 @@ class CalibrationRun:
         self.dataset = open_demos(settings.results, settings.demos)
         self.tasks = resolve_tasks(settings.task)
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
-        self.described = self.artifacts.description
-        self.described.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
-        if settings.fit_steps > self.described.chunk:
+        self.description = self.artifacts.description
+        self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
+        if settings.fit_steps > self.description.chunk:
+            longest = self.description.chunk
             raise UsageError(
-                f"fit_steps={settings.fit_steps}: at most the target's chunk of {self.described.chunk}, 0 for all of it"
+                f"fit_steps={settings.fit_steps}: at most the target's chunk of {longest}, 0 for all of it"
             )
         self.path = self.artifacts.place("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
-        check_shown(self.dataset, self.described)
+        check_shown(self.dataset, self.description)
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
         self.datastore = self.artifacts.place("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()
@@ -129,7 +129,7 @@ class CalibrationRun:
         self.notes: list[str] = []
 
     def plan(self) -> str:
-        """One line for --plan: what would be fitted, on what, and where it is written."""
+        """One line for --plan: demonstrations, decodes, boundary windows, skip levels and the file."""
         held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
         skip = f"skip levels from {self.datastore}" if self.stored else f"no skip levels: no datastore {self.datastore}"
         return (
@@ -143,7 +143,7 @@ class CalibrationRun:
         s = self.settings
         reader = PathReader(self.dataset.path, self.dataset.manifest, self.dataset.episodes)
         self.windows = read_windows(
-            reader, self.chosen, self.described.actions, s.history, s.window, self.described.chunk, progress
+            reader, self.chosen, self.description.actions, s.history, s.window, self.description.chunk, progress
         )
         self.paths = [reader.paths[index] for index, held_out in self.chosen.items() if not held_out]
 
@@ -153,21 +153,19 @@ class CalibrationRun:
         Raises:
             CheckpointError: no path bends, or none moves.
         """
-        windows, found = self.settings.boundary_windows, {}
+        windows, ranges = self.settings.boundary_windows, {}
 
-        def read(before: int) -> Iterator[np.ndarray]:
+        def paths(before: int) -> Iterator[np.ndarray]:
             for done, path in enumerate(self.paths, before + 1):
                 yield path
                 progress(done, len(self.paths) * len(windows))
 
         for number, window in enumerate(windows):
-            found[str(window)] = BoundaryRanges.fit(read(number * len(self.paths)), window)
-        return BoundarySection(len(self.paths), found)
+            ranges[str(window)] = BoundaryRanges.fit(paths(number * len(self.paths)), window)
+        return BoundarySection(len(self.paths), ranges)
 
     def skip(self, progress: Progress) -> SkipSection | None:
         """Skip levels of the tasks, from the target's datastore; None without a datastore."""
-        from kerv_cli.training.skip_levels import skip_section
-
         if not self.stored:
             return None
         store = self.artifacts.load("datastore")
@@ -183,17 +181,17 @@ class CalibrationRun:
         if not self.settings.decodes:
             return {}
         decoder, space = self.decoder(), self.dataset.manifest.observation
-        pixels = self.described.settings.get("image_size", 0)
+        pixels = self.description.settings.get("image_size", 0)
         share = math.ceil(self.settings.decodes / PRESAMPLED)
         # the smallest K above 0: one token of a chunk is off by one bin
-        actions = self.described.actions
-        least = 2.0 / actions.tokens / (self.described.chunk * int((~actions.is_strict).sum()))
-        found: dict[str, Variability] = {}
+        actions = self.description.actions
+        least = 2.0 / actions.tokens / (self.description.chunk * int((~actions.is_strict).sum()))
+        variability: dict[str, Variability] = {}
         for number, name in enumerate(self.tasks):
             levels: list[float] = []
-            for index in self._training(name):
+            for index in self._training_episodes(name):
                 episode = self.dataset.load(index)
-                if decoder.cameras and self.described.family == "compact":  # others resize their images
+                if decoder.cameras and self.description.family == "compact":  # others resize their images
                     check_frames(episode, pixels)
                 budget = min(share, self.settings.decodes - len(levels))
                 levels += presample(decoder, episode, space, budget)
@@ -201,11 +199,11 @@ class CalibrationRun:
                     break
             if not levels:
                 raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K for K_S")
-            found[name] = spread(levels, least)
+            variability[name] = spread(levels, least)
             progress(number + 1, len(self.tasks))
-        return found
+        return variability
 
-    def _training(self, name: str) -> list[int]:
+    def _training_episodes(self, name: str) -> list[int]:
         return [i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name]
 
     def decoder(self) -> Decoder:
@@ -217,38 +215,38 @@ class CalibrationRun:
     def finish(
         self, variability: dict[str, Variability], boundary: BoundarySection | None, skip: SkipSection | None
     ) -> Calibration:
-        """Fits the filters, measures the errors and writes the calibration. A section that is empty now keeps what the
-        file holds for the same target.
+        """Fits the filters, measures the errors and writes the calibration. An empty section is taken from an earlier
+        calibration of the same target.
 
         Raises:
             StorageError: writing failed.
         """
         assert self.windows is not None
-        space, chunk = self.described.actions, self.described.chunk
+        space, chunk = self.description.actions, self.description.chunk
         noise = fit_filters(self.windows, self.settings.fit_steps or chunk, space.is_strict)
-        made = {
+        origin = {
             "command": "kerv calibrate",
             "settings": as_plain(self.settings),
             **provenance(self.settings.runtime.device),
         }
-        sections, origins = self._kept({"variability": variability, "boundary": boundary, "skip": skip})
+        sections, earlier = self._fill_empty({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target=MadeFor(self.described.sha256, space, chunk),
+            target=MadeFor(self.description.sha256, space, chunk),
             demos=Demonstrations(self.dataset.sha256, self.windows.episodes),
             window=self.settings.window,
             noise=noise,
             errors=prediction_errors(self.windows, noise, space),
             **sections,
-            provenance={**made, "kept": origins} if origins else made,
+            provenance={**origin, "kept": earlier} if earlier else origin,
         )
         save_calibration(self.path, calibration)
         return calibration
 
-    def _kept(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _fill_empty(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Replaces empty sections by those of an earlier calibration of the same target -> (sections, provenance of the
         replaced ones)."""
         try:
-            earlier = load_calibration(self.path, self.described)
+            earlier = load_calibration(self.path, self.description)
         except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew
             earlier = None
         reasons = {
@@ -256,14 +254,14 @@ class CalibrationRun:
             "skip": f"skip levels: no datastore of these tasks in {self.datastore} (kerv build datastore)",
         }
         origins = {}
-        for name in [name for name, section in sections.items() if not section]:
-            kept = getattr(earlier, name) if earlier else None
-            if earlier and kept:
-                sections[name] = kept
-                made = {key: value for key, value in earlier.provenance.items() if key != "kept"}
+        for name in [name for name, value in sections.items() if not value]:
+            section = getattr(earlier, name) if earlier else None
+            if earlier and section:
+                sections[name] = section
+                origin = {key: value for key, value in earlier.provenance.items() if key != "kept"}
                 before = earlier.provenance.get("kept")
-                origins[name] = before.get(name, made) if isinstance(before, dict) else made
-            self.notes.append(f"{reasons.get(name, name)}; {'kept from the earlier run' if kept else 'left empty'}")
+                origins[name] = before.get(name, origin) if isinstance(before, dict) else origin
+            self.notes.append(f"{reasons.get(name, name)}; {'kept from the earlier run' if section else 'left empty'}")
         return sections, origins
 
 

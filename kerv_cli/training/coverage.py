@@ -1,4 +1,4 @@
-"""Demonstrations of a part of what the target knows: some of its tasks, or one side of the initial range."""
+"""Demonstrations of some of the target's tasks, or of one side of the initial range."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 ALL, HALF = "all", "half"
 
 
-def covered(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> DemoDataset:
+def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> DemoDataset:
     """The dataset with only the episodes of `tasks` (tasks and suites; none: all), and with starts=half only those that
     begin on one side.
 
@@ -23,18 +23,19 @@ def covered(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> De
     """
     if not tasks and starts == ALL:
         return dataset
-    wanted = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
-    missing = [task for task in wanted if task not in dataset.manifest.tasks]
+    names = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
+    missing = [task for task in names if task not in dataset.manifest.tasks]
     if missing:
         raise CheckpointError(f"the demonstrations in {dataset.path} hold no episode of {missing[0]}")
-    chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in wanted]
+    chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in names]
     if starts == HALF:
         chosen = _one_side(dataset, chosen)
     return replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
 
 
 def _one_side(dataset: DemoDataset, chosen: Sequence[int]) -> list[int]:
-    """Of every task the episodes whose first place, as a rule the object, begins at or below the task's median x."""
+    """The episodes in which the observation's first place, as a rule the object, begins at or below its median x over
+    the chosen episodes of the task."""
     places = dataset.manifest.observation.places
     if not places:
         raise UsageError("starts=half: these demonstrations name no place that begins on one side")

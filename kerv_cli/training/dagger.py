@@ -6,7 +6,6 @@ import functools
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import find_target
 from kerv_cli.base.settings import WorldSettings
+from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.build import own_decoder
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.worlds.demos.recording import DemoConfig
@@ -23,12 +23,13 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 class TargetActor:
     """A target decodes chunks autoregressively (a parallel one in its one pass) and executes them whole. For a share of
-    the chunks, drawn by task and seed, the expert acts instead; then the target decodes anew."""
+    the chunks, drawn by task and seed, the expert acts instead; then the target decodes anew. actions: those of the
+    current chunk that are not executed yet."""
 
-    def __init__(self, target: Any, expert_share: float) -> None:
+    def __init__(self, target: Target, expert_share: float) -> None:
         self.decoder = own_decoder(target)
         self.chunk, self.share = target.chunk, expert_share
-        self.in_hand: deque[NDArray[np.float64]] = deque()
+        self.actions: deque[NDArray[np.float64]] = deque()
         self.expert_steps = 0
         self.executed: NDArray[np.float32] | None = None
 
@@ -36,7 +37,7 @@ class TargetActor:
         """See `Actor.reset`."""
         self.world = world
         self.random = np.random.default_rng([seed, *world.task.encode()])
-        self.in_hand.clear()
+        self.actions.clear()
         self.expert_steps, self.executed = 0, None
         self.decoder.reset(world.task, seed, world.end_effector)
 
@@ -44,13 +45,13 @@ class TargetActor:
         """See `Actor.act`."""
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)
-        if not self.in_hand and not self.expert_steps:
+        if not self.actions and not self.expert_steps:
             self._decide()
         if self.expert_steps:
             self.expert_steps -= 1
             action = label
         else:
-            action = self.in_hand.popleft()
+            action = self.actions.popleft()
         self.executed = np.asarray(action, dtype=np.float32)
         return np.asarray(action, dtype=np.float64)
 
@@ -58,14 +59,15 @@ class TargetActor:
         if self.random.random() < self.share:
             self.expert_steps = self.chunk
         else:
-            self.in_hand = deque(self.decoder.decode(self.world.observe(self.decoder.cameras)).actions)
+            self.actions = deque(self.decoder.decode(self.world.observe(self.decoder.cameras)).actions)
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded(folder: Path, sha256: str) -> Any:
+def _target_in(folder: Path, sha256: str) -> Target:
     torch.set_num_threads(1)
-    target, described = load_target(folder)
-    if described.sha256 != sha256:
+    target: Target
+    target, description = load_target(folder)
+    if description.sha256 != sha256:
         raise CheckpointError(
             f"the target in {folder} has changed since the recording began: record under another name="
         )
@@ -88,16 +90,17 @@ class TargetActs:
                 or as `check_world`.
         """
         folder = find_target(results, name)
-        described = read_target(folder)
-        described.check_world(name, spec.name, spec.actions, world.camera.size)
-        sees, shown = [spec.camera_name(camera) for camera in described.cameras], spec.camera_name(world.camera.name)
-        if sees and shown not in sees:
+        description = read_target(folder)
+        description.check_world(name, spec.name, spec.actions, world.camera.size)
+        views = [spec.camera_name(view) for view in description.cameras]
+        camera = spec.camera_name(world.camera.name)
+        if views and camera not in views:
             raise UsageError(
-                f"policy.target={name} sees {sees[0]}, the recording would show {shown}: set "
-                f"world.camera.name={sees[0]}"
+                f"policy.target={name} sees {views[0]}, the recording would show {camera}: set "
+                f"world.camera.name={views[0]}"
             )
-        return cls(folder, described.sha256)
+        return cls(folder, description.sha256)
 
     def __call__(self, config: DemoConfig) -> TargetActor:
         """The actor, in the process that records."""
-        return TargetActor(_loaded(self.folder, self.sha256), config.expert_share)
+        return TargetActor(_target_in(self.folder, self.sha256), config.expert_share)

@@ -32,7 +32,7 @@ from kerv_cli.methods.datastore import (
     prompt_key,
 )
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.coverage import covered
+from kerv_cli.training.coverage import subset
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_shown, read_chunks, read_observations
@@ -60,20 +60,22 @@ class Entries:
 def entries_of(
     target: Any, episode: DemoEpisode, segments: Sequence[str], stride: int = 1, space: ObservationSpace | None = None
 ) -> Entries:
-    """Every `stride`-th of the episode's observations as key, and behind each the expert's next H clean actions.
-    space: the demonstrations' observations, where they are not the target's.
+    """Every `stride`-th observation of the episode as a key, with the expert's next H clean actions as its tokens.
+    space: of the demonstrations' observations, where it is not the target's.
 
     Raises:
         CheckpointError: too few labels, or frames of another size than the target takes.
     """
     if not isinstance(target, CompactTarget):
         return _recorded_entries(target, episode, segments, stride, space)
-    seen = read_observations(episode, target.settings, target.observation, target.words, slice(None, None, stride))
-    steps = seen.steps.numpy()
+    observations = read_observations(
+        episode, target.settings, target.observation, target.words, slice(None, None, stride)
+    )
+    steps = observations.steps.numpy()
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
     keys = []
     for rows in np.array_split(np.arange(len(steps)), -(-len(steps) // BATCH)):
-        prompt, _ = target.encode_batch(seen.inputs(torch.from_numpy(rows), target.device))
+        prompt, _ = target.encode_batch(observations.inputs(torch.from_numpy(rows), target.device))
         keys.append(prompt_key(prompt, target, segments))
     return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
 
@@ -81,7 +83,8 @@ def entries_of(
 def _recorded_entries(
     target: Any, episode: DemoEpisode, segments: Sequence[str], stride: int, space: ObservationSpace | None
 ) -> Entries:
-    """As `entries_of`, one observation at a time, for a target of any family."""
+    """The entries of an episode for a target of any family, which encodes one observation at a time; arguments and
+    errors as in `entries_of`."""
     steps = steps_of(target, episode)[::stride]
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
     prompts = prompts_of(target, episode, space or target.observation, steps)
@@ -92,8 +95,8 @@ def _recorded_entries(
 def directions(keys: np.ndarray, count: int) -> np.ndarray:
     """keys (n, d) -> (d, count) float32: the orthonormal directions that hold most of their squared length."""
     values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
-    found: np.ndarray = vectors[:, np.argsort(-values)[:count]].astype(np.float32)
-    return found
+    leading: np.ndarray = vectors[:, np.argsort(-values)[:count]].astype(np.float32)
+    return leading
 
 
 class DatastoreBuild:
@@ -108,21 +111,21 @@ class DatastoreBuild:
     def __init__(self, settings: BuildDatastoreSettings) -> None:
         self.settings = settings
         dataset = open_demos(settings.results, settings.demos)
-        self.dataset = covered(dataset, (), settings.starts)
+        self.dataset = subset(dataset, (), settings.starts)
         tasks = sorted(resolve_tasks(settings.task))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
         if not settings.key:
             raise UsageError(f"key=[]: name at least one part of the prompt: {', '.join(KEYS)}")
-        known = [name for name in KEYS if name != "vision" or self.artifacts.description.cameras]
+        parts = [name for name in KEYS if name != "vision" or self.artifacts.description.cameras]
         for name in settings.key:
-            if name not in known:
-                raise UnknownName("key", name, known)
+            if name not in parts:
+                raise UnknownName("key", name, parts)
         self.folder = self.artifacts.place("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
-        described = self.artifacts.description
-        check_shown(self.dataset, described)
+        description = self.artifacts.description
+        check_shown(self.dataset, description)
         self.chosen = {name: self._episodes_of(name) for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
         _refuse_foreign(self.folder)
@@ -130,10 +133,10 @@ class DatastoreBuild:
     def _episodes_of(self, name: str) -> list[int]:
         """Indices of the task's episodes in the dataset, by seed."""
         entries = self.dataset.episodes
-        found = sorted((i for i, e in enumerate(entries) if e.task == name), key=lambda i: entries[i].seed)
-        if not found:
+        indices = sorted((i for i, e in enumerate(entries) if e.task == name), key=lambda i: entries[i].seed)
+        if not indices:
             raise CheckpointError(f"the demonstrations in {self.dataset.path} hold no episode of {name}")
-        return found[: self.settings.episodes or None]
+        return indices[: self.settings.episodes or None]
 
     @property
     def seeds(self) -> dict[str, list[int]]:
@@ -206,7 +209,7 @@ class DatastoreBuild:
                 np.save(buffer, content)
             (folder / name).write_bytes(buffer.getbuffer())
         target = self.artifacts.description
-        made = {"command": "kerv build datastore", "settings": asdict(self.settings), **provenance(self.device)}
+        origin = {"command": "kerv build datastore", "settings": asdict(self.settings), **provenance(self.device)}
         manifest = Manifest(
             format=2,
             kind="datastore",
@@ -219,7 +222,7 @@ class DatastoreBuild:
             demos=self.dataset.sha256,
             files={name: sha256_of(folder / name) for name in files},
             tasks=shards,
-            provenance=made,
+            provenance=origin,
         )
         write_json(folder / "manifest.json", asdict(manifest))
 
@@ -257,6 +260,6 @@ def _refuse_foreign(folder: Path) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     manifest = folder / "manifest.json"
-    described = read_json(manifest) if manifest.is_file() else None
-    if not isinstance(described, dict) or described.get("kind") != "datastore":
+    content = read_json(manifest) if manifest.is_file() else None
+    if not isinstance(content, dict) or content.get("kind") != "datastore":
         raise UsageError(f"{folder} exists and is no datastore: give the new one another name")

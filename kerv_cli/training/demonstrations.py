@@ -14,5 +14,5 @@ def open_demos(results: str, names: str) -> DemoDataset:
         UsageError: no folder name. CheckpointError: one is missing, unfinished or damaged, or they do not add up.
     """
     whole = artifact(results, "demos", names)
-    found = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
-    return DemoDataset.joined([DemoDataset.open(folder) for folder in found])
+    folders = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
+    return DemoDataset.joined([DemoDataset.open(folder) for folder in folders])

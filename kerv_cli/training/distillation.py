@@ -55,16 +55,16 @@ class StatesByLength:
 
     def parts(self, indices: Tensor) -> list[TeacherStates]:
         """The rows at `indices` (B,), in batches of one prompt length."""
-        found, first = [], 0
+        batches, first = [], 0
         for group in self.groups:
-            own = indices[(indices >= first) & (indices < first + len(group))] - first
-            if len(own):
-                found.append(group.where(own))
+            rows = indices[(indices >= first) & (indices < first + len(group))] - first
+            if len(rows):
+                batches.append(group.where(rows))
             first += len(group)
-        return found
+        return batches
 
     def prompts(self, count: int) -> list[Tensor]:
-        """As `TeacherStates.prompts`, from every group as many as its share."""
+        """About `count` prompts (1, P, E): from every group in proportion to its rows, evenly spread."""
         return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
 
 
@@ -123,16 +123,16 @@ class Distillation:
         return torch.stack(losses).sum(), metrics
 
     def unrolled(self, states: TeacherStates, step: int) -> tuple[Tensor, Metrics]:
-        """As `loss`, for states of one prompt length."""
+        """Mean loss over the unrolled passes for states of one prompt length, and the token loss of each pass."""
         prompt, hidden = states.prompt.to(self.device).float(), states.hidden.to(self.device).float()
         tokens = states.tokens.to(self.device)
         total, metrics = hidden.new_zeros(()), {}
         inputs = self.noisy(hidden[:, :-1], step)
-        for unrolled in range(self.settings.unroll):
+        for number in range(self.settings.unroll):
             predicted = self.predict(prompt, inputs, tokens)
             state_loss, token_loss = self.compare(predicted, hidden, prompt.shape[1])
             total = total + self.settings.state_weight * state_loss + self.settings.token_weight * token_loss
-            metrics[f"token_loss_{unrolled}"] = float(token_loss.detach())
+            metrics[f"token_loss_{number}"] = float(token_loss.detach())
             # next pass: behind the first drafted position the drafter sees its own predictions, as in drafting
             start = prompt.shape[1]
             inputs = torch.cat([inputs[:, :start], predicted[:, start - 1 : -1]], 1)
@@ -177,5 +177,5 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
     proposer = DrafterProposer(drafter, target, depth=5, top_k=1, nodes=5)
     decoder = Decoder(target, Parts(acceptance, Fixed(r), proposer=proposer))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
-    verified = [r for c in chunks for r in c.rounds if r.tree_size]
-    return sum(r.committed for r in verified) / max(1, len(verified))
+    rounds = [r for c in chunks for r in c.rounds if r.tree_size]
+    return sum(r.committed for r in rounds) / max(1, len(rounds))

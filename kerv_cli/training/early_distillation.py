@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.settings import DrafterSettings, TrainSettings
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.early import EarlyDrafter, choose, padded
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
@@ -53,7 +53,7 @@ class EarlyObservations(Observations):
 
 @torch.inference_mode()
 def teach_early(
-    target: Any,
+    target: ReadableTarget,
     dataset: DemoDataset,
     settings: DrafterSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -68,32 +68,33 @@ def teach_early(
     stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1
     share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
     parts: list[EarlySamples] = []
-    waiting: list[EarlyObservations] = []
+    batch: list[EarlyObservations] = []
     for index in range(len(dataset.episodes)):
-        waiting.append(observations(target, dataset.load(index), index, share, settings.history))
-        if sum(map(len, waiting)) >= BATCH or index + 1 == len(dataset.episodes):
-            parts.append(decode(target, EarlyObservations.joined(waiting)))
-            waiting = []
+        batch.append(observations(target, dataset.load(index), index, share, settings.history))
+        if sum(map(len, batch)) >= BATCH or index + 1 == len(dataset.episodes):
+            parts.append(decode(target, EarlyObservations.joined(batch)))
+            batch = []
         on_progress(index + 1, len(dataset.episodes))
     return EarlySamples.joined(parts)
 
 
 def _teach_recorded(
-    target: Any, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
+    target: ReadableTarget, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
 ) -> EarlySamples:
-    """As `teach_early`, one observation at a time, for a target of any family that has `pooled`."""
+    """The decodes of a target of any family that has `pooled`, one observation at a time; arguments as in
+    `teach_early`."""
     parts, count, space = [], len(dataset.episodes), dataset.manifest.observation
     for index in range(count):
         episode = dataset.load(index)
         chosen = spread_steps(target, episode, -(-settings.samples // count))
         executed = target.actions.normalise(episode.executed)
-        shown = [padded(executed[:t], settings.history, target.actions.dofs) for t in chosen.tolist()]
-        history, known = (torch.from_numpy(np.stack(x)) for x in zip(*shown, strict=True))
+        histories = [padded(executed[:t], settings.history, target.actions.dofs) for t in chosen.tolist()]
+        history, known = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
         prompts = list(prompts_of(target, episode, space, chosen))
         features = torch.cat([target.pooled(prompt) for prompt in prompts]).half().cpu()
         tokens = torch.cat([greedy(target, prompt)[0] for prompt in prompts]).cpu()
-        of_all = (torch.full((len(chosen),), value) for value in (index, episode.perturbed))
-        parts.append(EarlySamples(features, history, known, tokens, *of_all))
+        columns = (torch.full((len(chosen),), value) for value in (index, episode.perturbed))
+        parts.append(EarlySamples(features, history, known, tokens, *columns))
         on_progress(index + 1, count)
     return EarlySamples.joined(parts)
 
@@ -104,22 +105,29 @@ def observations(
     """An evenly spread share of the episode's observations; the first is always one of them."""
     order = np.arange(len(observed_steps(episode, target.settings)))
     chosen = np.flatnonzero(np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9))
-    seen = read_observations(episode, target.settings, target.observation, target.words, chosen)
+    rows = read_observations(episode, target.settings, target.observation, target.words, chosen)
     executed = target.actions.normalise(episode.executed)
-    shown = [padded(executed[:t], history, target.actions.dofs) for t in seen.steps.tolist()]
-    actions, known = (torch.from_numpy(np.stack(x)) for x in zip(*shown, strict=True))
-    episodes, perturbed = (torch.full((len(seen),), of_all) for of_all in (index, episode.perturbed))
-    return EarlyObservations(**vars(seen), history=actions, known=known, episodes=episodes, perturbed=perturbed)
+    histories = [padded(executed[:t], history, target.actions.dofs) for t in rows.steps.tolist()]
+    actions, known = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
+    episodes, perturbed = (torch.full((len(rows),), value) for value in (index, episode.perturbed))
+    return EarlyObservations(**vars(rows), history=actions, known=known, episodes=episodes, perturbed=perturbed)
 
 
-def decode(target: CompactTarget, seen: EarlyObservations) -> EarlySamples:
+def decode(target: CompactTarget, observations: EarlyObservations) -> EarlySamples:
     """The target's greedy decodes of some observations."""
     features, tokens = [], []
-    for indices in torch.arange(len(seen)).split(BATCH):
-        prompt, _ = target.encode_batch(seen.inputs(indices, target.device))
+    for indices in torch.arange(len(observations)).split(BATCH):
+        prompt, _ = target.encode_batch(observations.inputs(indices, target.device))
         features.append(target.pooled(prompt).half().cpu())
         tokens.append(greedy(target, prompt)[0].cpu())
-    return EarlySamples(torch.cat(features), seen.history, seen.known, torch.cat(tokens), seen.episodes, seen.perturbed)
+    return EarlySamples(
+        torch.cat(features),
+        observations.history,
+        observations.known,
+        torch.cat(tokens),
+        observations.episodes,
+        observations.perturbed,
+    )
 
 
 class EarlyDistillation:
@@ -134,8 +142,8 @@ class EarlyDistillation:
 
     def logits(self, early: EarlyDrafter, samples: EarlySamples, indices: Tensor) -> Tensor:
         """The drafter's logits (B, N, V) for the samples at `indices` (B,)."""
-        given = (samples.features, samples.history, samples.known)
-        return early(*(x[indices].to(self.device).float() for x in given))
+        inputs = (samples.features, samples.history, samples.known)
+        return early(*(x[indices].to(self.device).float() for x in inputs))
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Cross-entropy with the softened tokens of the target at `indices` (B,), and logged numbers."""

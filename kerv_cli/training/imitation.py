@@ -30,7 +30,7 @@ from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 WITHIN = 9
-"""Bins; the share of tokens this close is reported (the relaxed radius of Spec-VLA)."""
+"""Bins; validation reports the share of tokens that are off by at most this many (the relaxed radius of Spec-VLA)."""
 
 
 @dataclass(frozen=True)
@@ -61,18 +61,18 @@ def load_samples(
     parts = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
-        seen = read_observations(episode, settings, dataset.manifest.observation, words)
-        chunks = torch.from_numpy(read_chunks(episode, seen.steps.numpy(), settings.chunk)).float()
-        episodes = torch.full((len(seen),), number)
+        observations = read_observations(episode, settings, dataset.manifest.observation, words)
+        chunks = torch.from_numpy(read_chunks(episode, observations.steps.numpy(), settings.chunk)).float()
+        episodes = torch.full((len(observations),), number)
         tasks = torch.full_like(episodes, task_names.index(episode.task))
-        parts.append(Samples(**vars(seen), chunks=chunks, episodes=episodes, tasks=tasks))
+        parts.append(Samples(**vars(observations), chunks=chunks, episodes=episodes, tasks=tasks))
         on_episode(number + 1, len(chosen))
     return Samples.joined(parts)
 
 
-def balanced(tasks: Tensor, balance: float) -> Tensor | None:
+def sample_weights(tasks: Tensor, balance: float) -> Tensor | None:
     """(n,) float64: weight of each sample, by the index of its task (n,). A task of share p among the samples is drawn
-    in proportion to p^(1 − balance); None where that changes nothing."""
+    in proportion to p^(1 − balance); None for balance 0, where all weights are equal."""
     if balance == 0:
         return None
     shares = torch.bincount(tasks).double() / len(tasks)
@@ -189,11 +189,12 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
     Raises:
         UsageError: the first shape that differs.
     """
-    for name, wanted in asdict(settings).items():
-        there = description.settings.get(name)
-        if name not in ("size", "chunk", "parallel") and there != wanted:
+    for name, value in asdict(settings).items():
+        original = description.settings.get(name)
+        if name not in ("size", "chunk", "parallel") and original != value:
             raise UsageError(
-                f"train.init: the target in {folder} has {name}={there}, the run target.{name}={wanted}: set both alike"
+                f"train.init: the target in {folder} has {name}={original}, the run target.{name}={value}: "
+                "set both alike"
             )
     trained = description.cameras[0] if description.cameras else ""
     if settings.observation == "vision" and not f"{camera}+".startswith(f"{trained}+"):
@@ -209,16 +210,16 @@ def continued_target(settings: TargetSettings, init: CompactTarget, camera: str)
     estimated positions do not depend on it yet."""
     target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
     fresh = {k: v for k, v in target.state_dict().items() if k == "queries"}
-    begun = {**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}}
+    weights = {**fresh, **{k: v for k, v in init.state_dict().items() if k in target.state_dict()}}
     if target.cameras:
         for view in range(len(init.encoders) - 1, len(target.encoders) - 1):
-            begun |= {f"further_views.{view}.{k}": v for k, v in init.vision.state_dict().items()}
+            weights |= {f"further_views.{view}.{k}": v for k, v in init.vision.state_dict().items()}
         points = 2 * settings.keypoints * len(init.encoders)
         added = 2 * settings.keypoints * len(target.encoders) - points
-        weight = begun["locate.0.weight"]
+        weight = weights["locate.0.weight"]
         columns = [weight[:, :points], weight.new_zeros(len(weight), added), weight[:, points:]]
-        begun["locate.0.weight"] = torch.cat(columns, 1)
-    target.load_state_dict(begun)
+        weights["locate.0.weight"] = torch.cat(columns, 1)
+    target.load_state_dict(weights)
     return target
 
 
@@ -242,5 +243,5 @@ def imitation_job(
             metrics["score"] += 10 * metrics["closed_loop_success"]
         return metrics
 
-    weights = balanced(run.training.tasks, run.settings.balance)
+    weights = sample_weights(run.training.tasks, run.settings.balance)
     return Job(run.target, len(run.training), run.loss, validate, save, weights)

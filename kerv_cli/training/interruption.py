@@ -1,5 +1,4 @@
-"""Ctrl-C, or the end of a job's time, while training: the step that runs is finished, so that the state that is stored
-is a whole one."""
+"""Ctrl-C, or the end of a job's time, while training: the current step is finished before the state is stored."""
 
 from __future__ import annotations
 
@@ -26,17 +25,17 @@ class Stop:
 def until_interrupted() -> Iterator[Stop]:
     """Yields a Stop that the first SIGINT or SIGTERM sets (schedulers and `timeout` send the latter); a second one of
     the same kind raises KeyboardInterrupt at once. One that follows within seconds is the same request: torchrun and
-    schedulers pass on what the process heard already. Outside the main thread it stays unset, and a signal that is
-    ignored stays so."""
+    schedulers pass on a signal that the process has received already. Outside the main thread no signal sets it, and a
+    signal that is ignored stays ignored."""
     stop = Stop()
-    came: dict[int, float] = {}
+    first_times: dict[int, float] = {}
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
 
-    def caught(number: int, frame: FrameType | None) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
-        if now - came.setdefault(number, now) > SAME_REQUEST:
+        if now - first_times.setdefault(number, now) > SAME_REQUEST:
             raise KeyboardInterrupt
         if stop.requested:
             return
@@ -45,8 +44,8 @@ def until_interrupted() -> Iterator[Stop]:
         print(f"stopping after this step; {again} stops at once and keeps the last saved state", file=sys.stderr)
 
     # a job in the background of a shell, or behind nohup, ignores SIGINT
-    heard = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, caught) for number in heard}
+    signals = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in signals}
     try:
         yield stop
     finally:

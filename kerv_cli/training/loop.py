@@ -69,7 +69,7 @@ class Progress:
 
 class Loop:
     """Runs a `Job`. folder: holds `resume.safetensors` and `log.csv`. identity: hash of everything that determines the
-    run; another run is never resumed. ranks: this process's place among those that train together."""
+    run; another run is never resumed. ranks: the rank of this process among those that train together."""
 
     def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str, ranks: Ranks = ALONE) -> None:
         self.job, self.settings, self.folder, self.identity, self.ranks = job, settings, folder, identity, ranks
@@ -82,11 +82,11 @@ class Loop:
         self.ema = {k: v.detach().clone() for k, v in job.module.state_dict().items()}
 
     def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
-        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint; of no other
-        rank than the first.
+        """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint; empty on ranks
+        other than the first.
 
         Raises:
-            CheckpointError: as `restore`; no step is left and none was ever validated. KervError: training diverged.
+            CheckpointError: as `restore`, or no step is left and no validation was made. KervError: training diverged.
             StorageError: writing failed. Interrupted: Ctrl-C; the step that ran was finished and the run's state is
             stored.
         """
@@ -100,8 +100,8 @@ class Loop:
                 if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
                     self.check(metrics)
                     on_step(self.step, self.history[-1])
-                asked = stopping if self.ranks.size > 1 else stop.requested  # ranks agree on it one step later
-                if asked and self.step < settings.steps:
+                interrupted = stopping if self.ranks.size > 1 else stop.requested  # ranks agree on it one step later
+                if interrupted and self.step < settings.steps:
                     if self.ranks.first:
                         self.store()
                     self.ranks.wait()  # a rank that ends makes torchrun end the others
@@ -240,12 +240,12 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
 
 def digest(tensors: Mapping[str, Tensor], text: str) -> str:
     """Hex SHA-256 over names, types, shapes and bytes of tensors, and a text."""
-    found = hashlib.sha256(text.encode())
+    hasher = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
-        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return found.hexdigest()
+        hasher.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        hasher.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return hasher.hexdigest()
 
 
 def schedule(step: int, settings: TrainSettings) -> float:

@@ -1,4 +1,5 @@
-"""Reads demonstrations as a policy takes them: the one reader of training, distillation, datastore and calibration."""
+"""Reads demonstrations as the observations of a policy: the one reader of training, distillation, datastore and
+calibration."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ from kerv_cli.worlds.demos.frames import EncodedFrames
 
 @dataclass(frozen=True)
 class Rows:
-    """Base of dataclasses of tensors that have one row per sample; an optional one may be None, frames may be left
+    """Base of dataclasses whose tensors have one row per sample. An optional tensor may be None, and frames may stay
     encoded."""
 
     def __len__(self) -> int:
@@ -87,12 +88,12 @@ def read_observations(
     steps, frames = observed_steps(episode, settings)[chosen], None
     if settings.observation == "vision":
         check_frames(episode, settings.image_size)
-        kept = episode.frames[chosen]
-        frames = kept if isinstance(kept, EncodedFrames) else torch.from_numpy(kept)
+        pictures = episode.frames[chosen]
+        frames = pictures if isinstance(pictures, EncodedFrames) else torch.from_numpy(pictures)
     states = torch.from_numpy(episode.states[steps]).float()
     ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
-    felt = states[:, : len(space.proprioception)]
-    return Observations(frames, felt, states, ids.repeat(len(steps), 1), torch.from_numpy(steps))
+    proprioception = states[:, : len(space.proprioception)]
+    return Observations(frames, proprioception, states, ids.repeat(len(steps), 1), torch.from_numpy(steps))
 
 
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
@@ -128,9 +129,9 @@ def check_frames(episode: DemoEpisode, size: int) -> None:
     """
     height, width = episode.frames.shape[1:3]
     if height != size or width % size:
-        shown = f"{height}" if height == width else f"{height} x {width}"
+        pixels = f"{height}" if height == width else f"{height} x {width}"
         raise CheckpointError(
-            f"the demonstrations' frames have {shown} pixels, the policy takes {size}: "
+            f"the demonstrations' frames have {pixels} pixels, the policy takes {size}: "
             "set target.image_size or record again with world.camera.size"
         )
 
@@ -147,17 +148,17 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
 
 
-def check_shown(dataset: DemoDataset, described: TargetDescription) -> None:
+def check_shown(dataset: DemoDataset, description: TargetDescription) -> None:
     """Refuses demonstrations of another environment than a target's, or, for a compact one that sees, of other views.
 
     Raises:
         CheckpointError: other actions, observations or views.
     """
-    check_spaces(dataset, described.actions, described.observation, "the target")
-    if described.family != "compact" or not described.cameras:
+    check_spaces(dataset, description.actions, description.observation, "the target")
+    if description.family != "compact" or not description.cameras:
         return
-    sees = specs()[dataset.manifest.environment].camera_name(described.cameras[0])
-    check_camera(dataset, sees, "the target sees", f"record them with world.camera.name={sees}")
+    camera = specs()[dataset.manifest.environment].camera_name(description.cameras[0])
+    check_camera(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
 
 
 def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> None:
@@ -191,5 +192,5 @@ def split(samples: S, share: float) -> tuple[S, S]:
     if count < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
     every = min(max(2, round(1 / share)), count)
-    held = episodes % every == every - 1
-    return samples.where(~held), samples.where(held)
+    held_out = episodes % every == every - 1
+    return samples.where(~held_out), samples.where(held_out)

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +14,8 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.methods.calibration_file import Errors
 from kerv_cli.methods.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
 from kerv_cli.training.observations import check_tail
-
-if TYPE_CHECKING:
-    from kerv_cli.worlds.demos.dataset import DemoDataset
-    from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 RATIOS = np.logspace(-3, 3, 49)  # q / r that are tried, r = 1
 DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)  # tried by the damped filter
@@ -81,20 +78,20 @@ def read_windows(
     """
     tasks = tuple(dict.fromkeys(dataset.episodes[i].task for i in chosen))
     counts = {task: {"training": 0, "held_out": 0} for task in tasks}
-    parts, labels, held = [], [], []
+    parts, labels, masks = [], [], []
     for done, (index, held_out) in enumerate(chosen.items(), 1):
         episode = dataset.load(index)
         past, future = episode_windows(episode, actions, history, window, horizon)
         parts.append((past.astype(np.float32), future.astype(np.float32)))
         labels.append(np.full(len(past), tasks.index(episode.task)))
-        held.append(np.full(len(past), held_out))
+        masks.append(np.full(len(past), held_out))
         counts[episode.task]["held_out" if held_out else "training"] += bool(len(past))
         on_progress(done, len(chosen))
     short = [task for task, count in counts.items() if not all(count.values())]
     if short:
         raise KervError(f"{', '.join(short)}: no training or no held-out episode is longer than a window of {window}")
     past, future = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Windows(past, future, np.concatenate(labels), np.concatenate(held), tasks, counts)
+    return Windows(past, future, np.concatenate(labels), np.concatenate(masks), tasks, counts)
 
 
 def choose_episodes(dataset: DemoDataset, tasks: Iterable[str], limit: int, share: float) -> dict[int, bool]:
@@ -115,7 +112,7 @@ def choose_episodes(dataset: DemoDataset, tasks: Iterable[str], limit: int, shar
         for perturbed in (False, True):
             kind = [i for i in of_task if dataset.episodes[i].perturbed == perturbed]
             every = min(max(2, round(1 / share)), max(2, len(kind)))
-            chosen |= {index: place % every == every - 1 for place, index in enumerate(kind)}
+            chosen |= {index: number % every == every - 1 for number, index in enumerate(kind)}
     return chosen
 
 
@@ -137,15 +134,15 @@ def fit_filters(windows: Windows, steps: int, held: np.ndarray) -> dict[str, Noi
     """Kind of filter -> its noise per DoF, fitted on the training episodes to the next `steps` actions. held (D,) bool:
     DoFs that are not fitted, because they are held."""
     past, future = windows.where(~windows.held_out)
-    fitted = {}
+    noise = {}
     for kind, model in FILTERS.items():
         dampings = DAMPINGS if kind == "damped" else (1.0,)
-        found = [
+        fits = [
             (0.0, 1.0) if held[dof] else fit_noise(past[..., dof], future[:, :steps, dof], model.order, dampings)
             for dof in range(past.shape[2])
         ]
-        fitted[kind] = Noise(tuple(q for q, _ in found), (1.0,) * len(found), tuple(d for _, d in found))
-    return fitted
+        noise[kind] = Noise(tuple(q for q, _ in fits), (1.0,) * len(fits), tuple(d for _, d in fits))
+    return noise
 
 
 def prediction_errors(windows: Windows, noise: Mapping[str, Noise], space: ActionSpace) -> Errors:

@@ -17,7 +17,7 @@ from kerv_cli.targets.checkpoint import FORMAT
 
 
 def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:
-    """Writes the drafter's folder -> it, and figures for the user.
+    """Writes the drafter's folder -> the folder, and figures for the user.
 
     Raises:
         UsageError: no checkpoint. UnknownName: no such convention. CheckpointError: no such target, an incomplete,

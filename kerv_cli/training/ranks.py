@@ -23,7 +23,7 @@ PATIENCE = timedelta(hours=3)
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process's place among `size` processes."""
+    """The rank of this process among `size` processes."""
 
     rank: int = 0
     size: int = 1
@@ -64,12 +64,12 @@ ALONE = Ranks()
 
 
 def this_rank() -> Ranks:
-    """The place that torchrun gave this process, from its environment; a process of its own without torchrun."""
+    """The rank that torchrun gave this process, from its environment; without torchrun there is one process."""
     return Ranks(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
 
 
 def join(device: str, batch: int) -> tuple[str, Ranks]:
-    """Joins the other ranks -> (this rank's device, its place). device: cpu or cuda; batch: samples of a step.
+    """Joins the other ranks -> (the device of this rank, the ranks). device: cpu or cuda; batch: samples of a step.
 
     Raises:
         UsageError: the batch cannot be divided, or a numbered device for several ranks.

@@ -1,8 +1,8 @@
 """Recorded observations for any target: the one interface between demonstrations and what is trained from them.
 
-A demonstration holds frames, states and a task; `observation_at` makes of one of its control steps exactly what a
-target is given in an episode, and `Target.encode` does the rest. The compact target has a faster way of its own, in
-batches (`observations.py`).
+A demonstration holds frames, states and a task. `observation_at` turns one of its control steps into the observation
+that a target gets in an episode, and `Target.encode` does the rest. The compact target has a faster reader, in batches
+(`observations.py`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 
 def steps_of(target: Target, episode: DemoEpisode) -> np.ndarray:
-    """Control steps (n,) whose observation is recorded: those with a frame, for a target without cameras all."""
+    """Control steps (n,) whose observation is recorded: those with a frame; without cameras all."""
     return episode.frame_steps if target.cameras else np.arange(episode.steps)
 
 
@@ -37,18 +37,18 @@ def spread_steps(target: Target, episode: DemoEpisode, count: int) -> np.ndarray
 def observation_at(
     episode: DemoEpisode, step: int, space: ObservationSpace, cameras: Sequence[str], instruction: str
 ) -> Observation:
-    """What a target was shown at a control step of a demonstration. space: the demonstrations'. cameras: names under
-    which the recorded frame is handed over.
+    """The observation at a control step of a demonstration. space: the demonstrations'. cameras: names that the target
+    gives to the recorded frame.
 
     Raises:
         CheckpointError: cameras, but no frame of that step.
     """
     images = {}
     if cameras:
-        found = np.flatnonzero(episode.frame_steps == step)
-        if not len(found):
+        rows = np.flatnonzero(episode.frame_steps == step)
+        if not len(rows):
             raise CheckpointError(f"step {step} of {episode.task} {episode.seed} has no frame: record every step")
-        images = dict.fromkeys(cameras, episode.frames[found[0]])
+        images = dict.fromkeys(cameras, episode.frames[rows[0]])
     state = episode.states[step].astype(np.float64)
     return Observation(state[: len(space.proprioception)], state, instruction, images)
 

@@ -1,6 +1,6 @@
 """Records drafts, their scores and their losses in closed loop, on selection seeds (docs/methods.md §4.6).
 
-Training observations would flatter a draft: a drafter or a datastore is at home on what it was made from.
+Training observations would flatter a draft: a drafter or a datastore was made from them.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ Progress = Callable[[int, int], None]
 
 
 class Recorder(Skip):
-    """Compares every source's draft with the target, by a forward of its own, and executes the first source's in a
-    random share of the decodes; the others are verified. Not for timing.
+    """Compares every source's draft with the target in an additional forward, and executes the draft of the first
+    source unverified in a random share of the decodes. Its times mean nothing.
 
-    rows: of this episode, a row of the recording per decode and source. features: its pooled prompts (F,), one per
-    draft of the first source, where wanted.
+    rows: the rows of the current episode, one per decode and source. features: its pooled prompts (F,), one per draft
+    of the first source, if the settings ask for them.
     """
 
     def __init__(
@@ -62,13 +62,13 @@ class Recorder(Skip):
         self.decodes = 0
 
     def begin(self, task: str, seed: int) -> None:
-        """As `Skip.begin`: the rows are those of this episode."""
+        """Begins the rows of an episode; see `Skip.begin`."""
         self.random = episode_numbers("risk", task, seed)
         self.episode, self.decodes = {"task": task, "seed": seed}, 0
         self.rows, self.features = [], []
 
     def take(self, chunk: Chunk) -> bool:
-        """As `Skip.take`."""
+        """Records every source's draft, and executes the first one or not; see `Skip.take`."""
         chains = [self._record(chunk, source) for source in self.sources]
         if chains[0] and self.settings.features:
             self.features.append(self.target.pooled(chunk.prompt)[0].half().cpu().numpy())
@@ -92,8 +92,8 @@ class Recorder(Skip):
 
 
 class RiskRun:
-    """`kerv calibrate risk`: call `record`, then `finish`, which writes. Every episode is kept on disk as soon as it
-    has ended, so that the same command goes on behind an interruption; `finish` removes what was kept.
+    """`kerv calibrate risk`: call `record`, then `finish`, which writes. Every episode is written to disk as soon as it
+    has ended, so that the same command continues after an interruption; `finish` removes these files.
 
     Raises:
         UsageError: no such task, source or score; seeds that are not for selection. CheckpointError: no such target, or
@@ -136,11 +136,11 @@ class RiskRun:
 
     def plan(self) -> str:
         """One line for --plan."""
-        s, episodes = self.settings, len(self.tasks) * len(self.seeds)
+        s, seeds, episodes = self.settings, self.seeds, len(self.tasks) * len(self.seeds)
         left = sum(len(self.records.missing(task, self.seeds)) for task in self.tasks)
-        kept = f", {episodes - left} of them are recorded" if left < episodes else ""
+        recorded = f", {episodes - left} of them are recorded" if left < episodes else ""
         return (
-            f"{self.folder}: {episodes} episodes on selection seeds {self.seeds.start} to {self.seeds.stop - 1}{kept}, "
+            f"{self.folder}: {episodes} episodes on selection seeds {seeds.start} to {seeds.stop - 1}{recorded}, "
             f"about {left * 1.5 / 60:.0f} min (a guess); drafts of {', '.join(s.sources)}, scores {', '.join(s.scores)}"
         )
 
@@ -168,20 +168,22 @@ class RiskRun:
         """A decoder that drafts from the first source, verifies and decodes on, and its recorder."""
         target: Any = self.artifacts.target
         context = Context(target, self.artifacts.load, task)
-        built: list[Any] = [find("proposer", n).built(_own(n), context) for n in self.settings.sources]
+        sources: list[DraftsChunks] = [
+            find("proposer", n).built(_default_settings(n), context) for n in self.settings.sources
+        ]
         scores = {}
-        for source in built:
+        for source in sources:
             beside = Context(target, self.artifacts.load, task, {"prefill_draft": source})
-            wanted = self.settings.scores
-            scores[source.name] = {n: find("score", n).built(NoSettings(n), beside) for n in wanted}
-        recorder = Recorder(target, built, scores, self.settings)
+            names = self.settings.scores
+            scores[source.name] = {n: find("score", n).built(NoSettings(n), beside) for n in names}
+        recorder = Recorder(target, sources, scores, self.settings)
         method = RolloutSettings(acceptance=part_of("acceptance", "relaxed").settings()).parts()
-        method["prefill_draft"] = _own(self.settings.sources[0])
+        method["prefill_draft"] = _default_settings(self.settings.sources[0])
         decoder = compose(method, target, self.artifacts.load, task)
         return Decoder(target, replace(decoder.parts, skip=recorder)), recorder
 
     def finish(self, draw: Draw | None = None) -> RiskRecording:
-        """Writes the recording in one step -> what was written. draw: adds pictures to its folder.
+        """Writes the recording in one step -> the recording. draw: adds pictures to its folder.
 
         Raises:
             StorageError: writing failed. KervError: an episode is not on disk any more.
@@ -190,25 +192,25 @@ class RiskRun:
         features: list[np.ndarray] = []
         for task in self.tasks:
             for seed in self.seeds:
-                found = self.records.read(task, seed)
-                if found is None:
+                record = self.records.read(task, seed)
+                if record is None:
                     raise KervError(f"the record of {task}, seed {seed}, is gone from {self.records.folder}: run again")
-                rows += found[0]
-                features += found[1]
-        described = self.artifacts.description
-        made = {
+                rows += record[0]
+                features += record[1]
+        target = self.artifacts.description
+        origin = {
             "command": "kerv calibrate risk",
             "settings": as_plain(self.settings),
             **provenance(self.settings.runtime.device),
         }
         manifest = RiskManifest(
-            target=MadeFor(described.sha256, described.actions, described.chunk),
+            target=MadeFor(target.sha256, target.actions, target.chunk),
             sources={name: self._drafts_from(name) for name in self.settings.sources},
             scale=self.settings.scale,
             tasks={task: list(self.seeds) for task in self.tasks},
             scores=list(self.settings.scores),
             files={},
-            provenance=made,
+            provenance=origin,
             made_from={kind: digest for kind, digest in self.hashes.items() if kind != "target"},
         )
         return save_risk(self.folder, manifest, rows, np.array(features) if features else None, draw)
@@ -218,6 +220,6 @@ class RiskRun:
         return next((self.hashes[kind] for kind in find("proposer", source).needs(None)), "")
 
 
-def _own(name: str) -> Any:
+def _default_settings(name: str) -> Any:
     """Default settings of a proposer."""
     return find("proposer", name).settings(kind=name)

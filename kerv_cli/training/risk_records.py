@@ -1,4 +1,4 @@
-"""What `kerv calibrate risk` has recorded so far: a file per episode, from which an interrupted run goes on."""
+"""The episodes that `kerv calibrate risk` has recorded: a file each, so that an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from kerv_cli.base.files import atomic_path
 
@@ -21,8 +23,9 @@ _PLAIN = ("source", "index", "loss")
 class RiskRecords:
     """The recorded episodes of one run.
 
-    folder: of the recording. identity: everything that determines an episode's rows besides its task and seed; what
-    another run recorded stays apart. sources, scores: what drafts, and what is scored.
+    folder: of the recording. identity: everything that determines an episode's rows besides its task and seed; the
+    episodes of another identity lie in another folder. sources, scores: names of the sources of drafts and of the
+    scores.
     """
 
     def __init__(
@@ -33,13 +36,11 @@ class RiskRecords:
         self.sources, self.scores = list(sources), list(scores)
 
     def write(self, task: str, seed: int, rows: Sequence[Row], features: Sequence[np.ndarray]) -> None:
-        """Writes an episode atomically. rows: as in the recording. features: (F,) float16 each.
+        """Writes an episode atomically. rows: of the recording. features: (F,) float16 each.
 
         Raises:
             StorageError: writing failed.
         """
-        from safetensors.numpy import save
-
         tensors: dict[str, np.ndarray] = {
             "source": np.array([self.sources.index(row["source"]) for row in rows], dtype=np.int64),
             "index": np.array([row["index"] for row in rows], dtype=np.int64),
@@ -52,8 +53,6 @@ class RiskRecords:
 
     def read(self, task: str, seed: int) -> tuple[list[Row], list[np.ndarray]] | None:
         """Rows and features of an episode; None where it was not recorded, or its file is damaged."""
-        from safetensors import SafetensorError, safe_open
-
         try:
             with safe_open(self._path(task, seed), "numpy") as file:
                 tensors = {name: file.get_tensor(name) for name in (*_PLAIN, *self._columns(), "features")}
@@ -70,7 +69,7 @@ class RiskRecords:
         return rows, list(tensors["features"])
 
     def missing(self, task: str, seeds: Sequence[int]) -> list[int]:
-        """Those of the seeds that are still to be recorded."""
+        """The seeds among `seeds` whose episode is not recorded."""
         return [seed for seed in seeds if self.read(task, seed) is None]
 
     def _columns(self) -> list[str]:

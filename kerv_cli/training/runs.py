@@ -24,7 +24,7 @@ from kerv_cli.methods.early import EarlyDrafter, save_early
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.coverage import covered
+from kerv_cli.training.coverage import subset
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.distillation import Distillation, StatesByLength, TeacherStates, teach
 from kerv_cli.training.early_distillation import EarlyDistillation, teach_early
@@ -48,14 +48,14 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 Progress = Callable[[int, int], None]
 
 
-def determining(train: TrainSettings) -> dict[str, Any]:
-    """The optimisation settings that identify a run. Steps and validation intervals may change on resuming; `init` is
-    identified by its weights' hash instead of its name."""
+def run_settings(train: TrainSettings) -> dict[str, Any]:
+    """The optimisation settings that identify a run. Steps and the interval of validations may change on resuming, and
+    `init` is identified by the hash of its weights instead of its name."""
     free = ("steps", "validate_every", "init", "stored")
-    later = {"balance": 0.0, "closed_loop": False}  # what older runs did not record, with what they did
-    found = {k: v for k, v in asdict(train).items() if k not in free}
-    found["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
-    return {k: v for k, v in found.items() if k not in later or v != later[k]}
+    later = {"balance": 0.0, "closed_loop": False}  # settings that older runs lack -> the values that they ran with
+    settings = {k: v for k, v in asdict(train).items() if k not in free}
+    settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
+    return {k: v for k, v in settings.items() if k not in later or v != later[k]}
 
 
 def identity_of(**parts: Any) -> str:
@@ -83,8 +83,8 @@ class Run(ABC):
         """What determines the run besides the optimisation settings and the demonstrations."""
 
     @abstractmethod
-    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
-        """Writes the weights and their description; made: provenance."""
+    def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
+        """Writes the weights and their description. origin: the provenance that the description holds."""
 
     def train(self, on_step: Callable[[int, Metrics], None]) -> Metrics:
         """Trains, resuming what the folder holds -> metrics of the best checkpoint. on_step(step, metrics).
@@ -93,7 +93,7 @@ class Run(ABC):
             CheckpointError: the folder holds another run. KervError: training diverged. StorageError: writing failed.
         """
         train, job = self.settings.train, self.job()
-        identity = identity_of(train=determining(train), demos=self.dataset.sha256, **self.identity())
+        identity = identity_of(train=run_settings(train), demos=self.dataset.sha256, **self.identity())
         job.module.train()
         return Loop(job, train, self.folder, identity, self.ranks).run(on_step)
 
@@ -108,7 +108,7 @@ class Run(ABC):
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Writes the weights with their provenance; metrics: of their validation."""
-        made = {
+        origin = {
             "command": f"kerv train {self.kind}",
             "settings": asdict(self.settings),
             "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
@@ -116,7 +116,7 @@ class Run(ABC):
             "parameters": sum(p.numel() for p in module.parameters()),
             **provenance(self.device),
         }
-        self.write(module, made)
+        self.write(module, origin)
 
 
 def freeze(target: CompactTarget, names: list[str]) -> None:
@@ -125,11 +125,11 @@ def freeze(target: CompactTarget, names: list[str]) -> None:
     Raises:
         UsageError: it has no such module.
     """
-    known = dict(target.named_children())
+    modules = dict(target.named_children())
     for name in names:
-        if name not in known:
-            raise UnknownName("train.freeze", name, known)
-        known[name].requires_grad_(False)
+        if name not in modules:
+            raise UnknownName("train.freeze", name, modules)
+        modules[name].requires_grad_(False)
 
 
 class TargetRun(Run):
@@ -158,8 +158,8 @@ class TargetRun(Run):
         self.dataset = open_demos(settings.results, settings.demos)
         self.check_demos()
         self.samples: Samples | None = None
-        self.begun: CompactTarget | None = None
-        self.origin: dict[str, str] = {}  # hash of the weights that the run begins with, where they are not fresh
+        self.init_target: CompactTarget | None = None
+        self.init_hash: dict[str, str] = {}  # {"init": hash of its weights}; empty for a fresh run
 
     def check_demos(self) -> None:
         """Refuses demonstrations of another environment, or frames of another camera than the policy will be shown.
@@ -167,10 +167,10 @@ class TargetRun(Run):
         Raises:
             CheckpointError: they are.
         """
-        spec, shown = self.spec, self.world.camera.name
+        spec, camera = self.spec, self.world.camera.name
         check_spaces(self.dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
         if self.settings.target.observation == "vision":
-            check_camera(self.dataset, shown, "the policy would be shown", "set world.camera.name, or record again")
+            check_camera(self.dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
 
     def find_init(self) -> Path | None:
         """Folder of the target `train.init`; None for a fresh run.
@@ -208,28 +208,28 @@ class TargetRun(Run):
         """
         self.begin()
         if self.init is not None:
-            self.begun, described = load_target(self.init)
-            self.origin = {"init": described.sha256}
-            check_spaces(self.dataset, described.actions, described.observation, f"the target in {self.init}")
-        self.words = self.begun.words if self.begun else vocabulary(self.dataset.manifest.environment)
+            self.init_target, description = load_target(self.init)
+            self.init_hash = {"init": description.sha256}
+            check_spaces(self.dataset, description.actions, description.observation, f"the target in {self.init}")
+        self.words = self.init_target.words if self.init_target else vocabulary(self.dataset.manifest.environment)
         self.samples = load_samples(self.dataset, self.settings.target, self.words, self.tasks, progress)
 
     def job(self) -> Job:
         """See `Run.job`; validated in closed loop where the settings ask for it."""
         assert self.samples is not None
         settings, camera = self.settings, self.world.camera.name
-        if self.begun is None:
+        if self.init_target is None:
             seed = settings.train.seed
             target = new_target(settings.target, self.dataset, self.samples, self.words, camera, seed)
         else:
-            target = continued_target(settings.target, self.begun, camera)
+            target = continued_target(settings.target, self.init_target, camera)
             freeze(target, settings.train.freeze)
         run = Imitation(target.to(self.device), self.samples, settings.train, torch.device(self.device))
         return imitation_job(run, self.save, self.closed_loop if settings.train.closed_loop else None)
 
     def identity(self) -> dict[str, Any]:
         """Shapes, tasks and the weights to begin with."""
-        return {"target": asdict(self.settings.target), "tasks": self.tasks, **self.origin}
+        return {"target": asdict(self.settings.target), "tasks": self.tasks, **self.init_hash}
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
@@ -238,11 +238,11 @@ class TargetRun(Run):
         seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
         return success_of(target, self.tasks, seeds, self.world)
 
-    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+    def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """See `Run.write`."""
         assert isinstance(module, CompactTarget)
         environment = self.dataset.manifest.environment
-        save_target(self.folder, module, environment, made | self.origin, self.settings.train.stored)
+        save_target(self.folder, module, environment, origin | self.init_hash, self.settings.train.stored)
 
 
 class DrafterRun(Run):
@@ -265,17 +265,17 @@ class DrafterRun(Run):
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = self.place()
+        self.folder = self.drafter_folder()
         dataset = open_demos(settings.results, settings.demos)
-        self.dataset = covered(dataset, settings.task, settings.starts)
-        described = read_target(self.target_folder)
-        check_shown(self.dataset, described)
-        described.check_autoregressive(
+        self.dataset = subset(dataset, settings.task, settings.starts)
+        description = read_target(self.target_folder)
+        check_shown(self.dataset, description)
+        description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
 
-    def place(self) -> Path:
-        """Folder of the drafter."""
+    def drafter_folder(self) -> Path:
+        """Where the drafter is written."""
         return artifact_folder("drafter")(self.settings.results, self.settings.policy.drafter, self.target_folder)
 
     def plan(self) -> str:
@@ -298,7 +298,7 @@ class DrafterRun(Run):
                 f"drafter.noise={self.settings.drafter.noise} is drawn for a whole batch: train with one process, or "
                 "without noise"
             )
-        self.target, self.described = load_target(self.target_folder, self.device)
+        self.target, self.description = load_target(self.target_folder, self.device)
         self.teach(progress)
 
     def teach(self, progress: Progress) -> None:
@@ -326,27 +326,27 @@ class DrafterRun(Run):
         s = self.settings
         tasks = list(resolve_tasks(s.task)) if s.task else []
         covering = {"task": tasks, "starts": s.starts} if tasks or s.starts != "all" else {}
-        return {"drafter": asdict(s.drafter), "target": self.described.sha256, **covering}
+        return {"drafter": asdict(s.drafter), "target": self.description.sha256, **covering}
 
-    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+    def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """See `Run.write`."""
         assert isinstance(module, Drafter)
-        save_drafter(self.folder, module, self.target, self.described.sha256, made, self.settings.train.stored)
+        save_drafter(self.folder, module, self.target, self.description.sha256, origin, self.settings.train.stored)
 
 
 class EarlyRun(DrafterRun):
-    """`kerv train drafter drafter=early`; raises as DrafterRun."""
+    """`kerv train drafter drafter=early`; its errors are those of DrafterRun."""
 
     noun = "early drafter"
 
-    def place(self) -> Path:
-        """Folder of the early drafter."""
+    def drafter_folder(self) -> Path:
+        """Where the early drafter is written."""
         return artifact_folder("early")(self.settings.results, self.settings.policy.early, self.target_folder)
 
     def teach(self, progress: Progress) -> None:
         """Collects the target's tokens and pooled prompts."""
-        taught = teach_early(self.target, self.dataset, self.settings.drafter, progress)
-        self.training, self.validation = split(taught, self.settings.train.held_out)
+        samples = teach_early(self.target, self.dataset, self.settings.drafter, progress)
+        self.training, self.validation = split(samples, self.settings.train.held_out)
 
     def job(self) -> Job:
         """See `Run.job`."""
@@ -356,10 +356,10 @@ class EarlyRun(DrafterRun):
         run = EarlyDistillation(early.to(self.device), self.training, self.validation, self.settings.train)
         return Job(early, len(self.training), run.loss, run.validate, self.save)
 
-    def write(self, module: nn.Module, made: dict[str, Any]) -> None:
+    def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """See `Run.write`."""
         assert isinstance(module, EarlyDrafter)
-        save_early(self.folder, module, self.described.sha256, made, self.settings.train.stored)
+        save_early(self.folder, module, self.description.sha256, origin, self.settings.train.stored)
 
 
 DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": EarlyRun}

@@ -50,10 +50,10 @@ class ScoreRun:
         return f"{self.folder}: loss of {self.source} from the prompt and {', '.join(s.inputs)}, {s.steps} steps"
 
     def train(self, on_step: Callable[[int, int], None]) -> Metrics:
-        """Trains on a share of every task's episodes and writes -> measures on the others. None of them certify the
-        score's level: that takes a recording of other episodes, with score=learned."""
-        s, found = self.settings, self.recording.losses(self.source)
-        x, y, held_out = self._inputs(), torch.tensor(found.losses).float(), self._held_out(found.episodes)
+        """Trains on a random share of the episodes and writes -> measures on the others. They do not certify a level of
+        the score: that takes a recording of other episodes, with score=learned."""
+        s, drafts = self.settings, self.recording.losses(self.source)
+        x, y, held_out = self._inputs(), torch.tensor(drafts.losses).float(), self._held_out(drafts.episodes)
         torch.manual_seed(s.seed)
         model = LearnedScore(s.inputs, self.features.shape[1])
         model.standardise(x[~held_out])
@@ -69,19 +69,19 @@ class ScoreRun:
         metrics = {
             "auc": auc(-expected, bad),
             "loss_of_all": float(y[held_out].mean()),
-            **{f"auc.{name}": auc(found.scores[name][held_out.numpy()], bad) for name in s.inputs},
+            **{f"auc.{name}": auc(drafts.scores[name][held_out.numpy()], bad) for name in s.inputs},
         }
         metrics = {name: value for name, value in metrics.items() if math.isfinite(value)}  # no AUC without bad drafts
-        made = {"command": "kerv train score", "settings": asdict(s), "metrics": metrics, **provenance("cpu")}
+        origin = {"command": "kerv train score", "settings": asdict(s), "metrics": metrics, **provenance("cpu")}
         manifest = self.recording.manifest
-        source, read = (self.source, manifest.sources[self.source]), manifest.read_by(self.source, s.inputs)
-        save_score(self.folder, model, manifest.target, source, read, made)
+        source, hashes = (self.source, manifest.sources[self.source]), manifest.read_by(self.source, s.inputs)
+        save_score(self.folder, model, manifest.target, source, hashes, origin)
         return metrics
 
     def _inputs(self) -> Tensor:
         """(n, F + s): features, then the inputs' scores."""
-        found = self.recording.losses(self.source)
-        scores = np.stack([found.scores[name] for name in self.settings.inputs], 1)
+        drafts = self.recording.losses(self.source)
+        scores = np.stack([drafts.scores[name] for name in self.settings.inputs], 1)
         both = [self.features.astype(np.float32), np.maximum(scores, FLOOR).astype(np.float32)]
         return torch.from_numpy(np.concatenate(both, 1))
 

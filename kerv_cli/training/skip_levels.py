@@ -54,18 +54,18 @@ def neighbours_elsewhere(store: Datastore, task: str, entries: int) -> tuple[np.
     rows = np.linspace(shard.start, shard.stop - 1, count).astype(int)
     similarity, chunks = np.zeros(count, np.float32), np.zeros((count, store.tokens.shape[1]), np.int64)
     for i, row in enumerate(rows):
-        found = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
-        similarity[i], chunks[i] = found.similarity[0], found.chunks[0]
+        neighbours = store.query(store.vectors[row], task, 1, without=int(store.seeds[row]))
+        similarity[i], chunks[i] = neighbours.similarity[0], neighbours.chunks[0]
     return rows, similarity, chunks
 
 
 def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
     """The entries of `neighbours_elsewhere`, with the neighbours' chunks compared to their own."""
     space = store.manifest.actions
-    rows, similarity, drafted = neighbours_elsewhere(store, task, entries)
-    own = store.tokens[rows].astype(np.int64)
-    error = np.abs(space.values_of(drafted) - space.values_of(own)).mean(1)
-    strict = (drafted != own)[:, space.strict_tokens(own.shape[1])].any(1)
+    rows, similarity, drafts = neighbours_elsewhere(store, task, entries)
+    expert = store.tokens[rows].astype(np.int64)
+    error = np.abs(space.values_of(drafts) - space.values_of(expert)).mean(1)
+    strict = (drafts != expert)[:, space.strict_tokens(expert.shape[1])].any(1)
     return Matches(similarity, error, strict)
 
 
@@ -116,9 +116,9 @@ def skip_section(
 ) -> SkipSection | None:
     """The calibration's section `skip`: levels of those `tasks` that the datastore holds, and its hash. None where it
     holds none of them."""
-    found = {}
+    levels = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:
-            found[task] = task_levels(match(store, task), epsilon, confidence)
+            levels[task] = task_levels(match(store, task), epsilon, confidence)
         on_progress(done, len(tasks))
-    return SkipSection(store.content, epsilon, confidence, found) if found else None
+    return SkipSection(store.content, epsilon, confidence, levels) if levels else None

@@ -34,13 +34,13 @@ def spec_of(task: str) -> EnvironmentSpec:
     Raises:
         UnknownName: no environment has it; the message names the nearest tasks. UsageError: several have it.
     """
-    known = specs()
-    having = [spec for spec in known.values() if spec.full_name(task) is not None]
-    if not having:
-        raise UnknownName("task", task, [name for spec in known.values() for name in spec.tasks])
-    if len(having) > 1:
-        raise UsageError(f"task '{task}' is one of {' and of '.join(spec.name for spec in having)}: rename one of them")
-    return having[0]
+    environments = specs()
+    owners = [spec for spec in environments.values() if spec.full_name(task) is not None]
+    if not owners:
+        raise UnknownName("task", task, [name for spec in environments.values() for name in spec.tasks])
+    if len(owners) > 1:
+        raise UsageError(f"task '{task}' is one of {' and of '.join(spec.name for spec in owners)}: rename one of them")
+    return owners[0]
 
 
 def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
@@ -52,17 +52,17 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
     """
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")
-    known = list(specs().values())
-    resolved: dict[str, str] = {}  # full name -> environment
+    environments = list(specs().values())
+    tasks: dict[str, str] = {}  # full name -> environment
     for name in names:
-        found = {task: spec.name for spec in known for task in spec.expand(name)}
-        if not found:
-            raise UnknownName("task or suite", name, [n for spec in known for n in (*spec.suites, *spec.tasks)])
-        resolved |= found
-    environments = list(dict.fromkeys(resolved.values()))
-    if len(environments) > 1:
-        raise UsageError(f"task={','.join(names)}: tasks of {' and '.join(environments)} cannot be mixed: name one's")
-    return tuple(resolved)
+        matches = {full: spec.name for spec in environments for full in spec.expand(name)}
+        if not matches:
+            raise UnknownName("task or suite", name, [n for spec in environments for n in (*spec.suites, *spec.tasks)])
+        tasks |= matches
+    owners = list(dict.fromkeys(tasks.values()))
+    if len(owners) > 1:
+        raise UsageError(f"task={','.join(names)}: tasks of {' and '.join(owners)} cannot be mixed: name one's")
+    return tuple(tasks)
 
 
 def task_names() -> Iterator[str]:

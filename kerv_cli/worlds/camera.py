@@ -35,7 +35,7 @@ _open_cameras: weakref.WeakSet[Camera] = weakref.WeakSet()
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """What a frame shows.
+    """The camera of a frame and its resolution.
 
     Attributes:
         name: one of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.
@@ -148,7 +148,7 @@ class Camera:
         self._model = model
         self._camera = int(model.camera(config.name).id)
         pixels = config.size * config.supersample
-        # Read once, when the context is made: multisampling and shadow maps are most of a software frame's cost.
+        # The context reads them when it opens. Multisampling and shadow maps are most of a software frame's cost.
         model.vis.quality.offsamples = 0
         model.vis.quality.shadowsize = 0
         model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)

@@ -1,4 +1,4 @@
-"""Does an environment keep the protocol? Checks on one task, from its specification alone."""
+"""Checks that an environment keeps the protocols of worlds and experts, on one task."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Trial:
         return self.spec.open_world(self.task, CameraConfig(size=SIZE), horizon)
 
     def specification(self) -> str:
-        """Names that belong together."""
+        """Suites and difficulties name what exists, and the sizes fit."""
         spec = self.spec
         unknown = {t for suite in spec.suites.values() for t in suite} - set(spec.tasks)
         if unknown:
@@ -67,14 +67,14 @@ class Trial:
         return np.array(states)
 
     def repeats(self) -> str:
-        """The same to the last bit, whether frames are drawn or not."""
+        """Two episodes of one seed are equal to the last bit, whether frames are drawn or not."""
         first, second = self.trace(self.seed, False), self.trace(self.seed, True)
         if not np.array_equal(first, second):
             raise Failed(f"two episodes of seed {self.seed} differ by {np.abs(first - second).max():.3g}")
         return f"{STEPS} steps, with and without frames"
 
     def differs(self) -> str:
-        """Seeds are different starts."""
+        """Three seeds do not all begin with one initial state."""
         starts = []
         with self.open() as world:
             for seed in range(self.seed, self.seed + 3):
@@ -85,13 +85,14 @@ class Trial:
         return f"{len(set(starts))} of 3 seeds begin differently"
 
     def observation(self) -> str:
-        """Sizes, and that the state begins with the proprioception."""
-        wanted = self.spec.observation
+        """Shapes are as specified, and the state begins with the proprioception."""
+        space = self.spec.observation
         with self.open() as world:
-            seen = world.reset(self.seed)
-            if seen.state.shape != (wanted.state,) or seen.proprioception.shape != (len(wanted.proprioception),):
-                raise Failed(f"state {seen.state.shape}, proprioception {seen.proprioception.shape}: not as specified")
-            if not np.array_equal(seen.state[: len(wanted.proprioception)], seen.proprioception):
+            observation = world.reset(self.seed)
+            state, proprioception = observation.state, observation.proprioception
+            if state.shape != (space.state,) or proprioception.shape != (len(space.proprioception),):
+                raise Failed(f"state {state.shape}, proprioception {proprioception.shape}: not as specified")
+            if not np.array_equal(state[: len(proprioception)], proprioception):
                 raise Failed("the state does not begin with the proprioception")
             if world.end_effector.shape != (3,) or not 0 <= world.gripper <= 1:
                 raise Failed(
@@ -100,7 +101,7 @@ class Trial:
             return f"instruction '{world.instruction}'"
 
     def actions(self) -> str:
-        """What lies outside is clipped, what is no number is refused."""
+        """Actions outside the limits are clipped; a wrong shape and NaN are refused."""
         space, low = self.spec.actions, np.array(self.spec.actions.low)
         with self.open() as first, self.open() as second:
             first.reset(self.seed)
@@ -116,7 +117,7 @@ class Trial:
         return "clipped to the limits, refused where they are no numbers"
 
     def horizon(self) -> str:
-        """An episode ends."""
+        """An episode ends at its horizon, and a step past it is refused."""
         with self.open(horizon=2) as world:
             world.reset(self.seed)
             for _ in range(2):
@@ -130,7 +131,7 @@ class Trial:
         raise Failed("a step past the horizon is accepted")
 
     def frames(self) -> str:
-        """Every camera draws something."""
+        """Every camera draws a frame of the right shape that is not of one colour."""
         with self.open() as world:
             world.reset(self.seed)
             for name, image in world.observe(self.spec.cameras).images.items():
@@ -143,7 +144,7 @@ class Trial:
         return ", ".join(self.spec.cameras)
 
     def expert(self) -> str:
-        """Actions within the limits."""
+        """The expert's actions lie within the limits."""
         expert, space = self.spec.expert(self.task), self.spec.actions
         with self.open() as world:
             observation = world.reset(self.seed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import Part, register
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.spec import EnvironmentSpec, Task
@@ -35,9 +36,7 @@ def __getattr__(name: str) -> EnvironmentSpec:
 
 
 class NoWorld:
-    """What a recorded environment has for a world: a refusal."""
+    """The world class of a recorded environment; opening it is refused."""
 
     def __init__(self, spec: EnvironmentSpec, *rest: object) -> None:
-        from kerv_cli.base.errors import UsageError
-
         raise UsageError(f"{spec.name} is a recording: nothing can be executed in it")

@@ -208,7 +208,7 @@ class EnvironmentSpec:
         return name or self.cameras[0]
 
     def camera(self, config: CameraConfig | None = None) -> CameraConfig:
-        """The view with `camera_name` filled in; raises as that."""
+        """The configuration with the name of `camera_name`; errors as there."""
         from kerv_cli.worlds.camera import CameraConfig
 
         config = config or CameraConfig()

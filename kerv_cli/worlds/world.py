@@ -33,13 +33,13 @@ class EpisodeWorld(ABC):
         Raises:
             UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
         """
-        found = spec.task(task)
-        self.spec, self.task, self.instruction = spec, found.name, found.instruction
+        entry = spec.task(task)
+        self.spec, self.task, self.instruction = spec, entry.name, entry.instruction
         self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
-        self._drawn: dict[tuple[CameraConfig, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}  # of delayed views
+        self._past: dict[tuple[CameraConfig, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}  # of delayed views
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -56,7 +56,7 @@ class EpisodeWorld(ABC):
     @property
     @abstractmethod
     def initial_state(self) -> NDArray[np.float64]:
-        """As `World.initial_state`."""
+        """(n,) numbers that, with the task, rebuild the episode's start."""
 
     @property
     def observation(self) -> Observation:
@@ -67,7 +67,7 @@ class EpisodeWorld(ABC):
 
     @property
     def done(self) -> bool:
-        """As `World.done`."""
+        """Whether the episode succeeded at any step so far, or reached the horizon."""
         self.observation  # noqa: B018 - raises before the first reset
         return self.succeeded or self.steps >= self.horizon
 
@@ -79,21 +79,21 @@ class EpisodeWorld(ABC):
     @property
     def gripper(self) -> float:
         """The number `gripper` of the proprioception; 1 without one."""
-        names, felt = self.spec.observation.proprioception, self.observation.proprioception
-        return float(felt[names.index("gripper")]) if "gripper" in names else 1.0
+        names, values = self.spec.observation.proprioception, self.observation.proprioception
+        return float(values[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
-        """As `World.reset`."""
+        """Starts the episode of `seed` and draws its stress. UsageError: a negative seed."""
         if seed < 0:
             raise UsageError(f"episode seed must be 0 or more, not {seed}")
         self.stress.begin(self.task, seed, self.spec.actions)
-        self._drawn.clear()
+        self._past.clear()
         state = self._start(seed)
         self.steps, self.success, self.succeeded = 0, False, False
-        return self._told(state)
+        return self._observe_state(state)
 
     def step(self, action: ArrayLike) -> Observation:
-        """As `World.step`."""
+        """Executes one control step of an action (D,), changed by the stress; errors as `World.step`."""
         executed = np.asarray(action, dtype=np.float64)
         space = self.spec.actions
         if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
@@ -107,53 +107,53 @@ class EpisodeWorld(ABC):
         state, self.success = self._advance(executed)
         self.succeeded = self.succeeded or self.success
         self.steps += 1
-        return self._told(state)
+        return self._observe_state(state)
 
-    def _told(self, state: NDArray[np.float64]) -> Observation:
-        felt = state[: len(self.spec.observation.proprioception)]
-        self._observation = Observation(felt, state, self.instruction)
+    def _observe_state(self, state: NDArray[np.float64]) -> Observation:
+        proprioception = state[: len(self.spec.observation.proprioception)]
+        self._observation = Observation(proprioception, state, self.instruction)
         return self._observation
 
     def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
-        """As `World.frame`."""
+        """A frame of the current state for a recording, without stress; shape and errors as `World.frame`."""
         self.observation  # noqa: B018 - raises before the first reset
         return self._picture(self.camera if camera is None else self.spec.camera(camera), observed=False)
 
     def observe(self, cameras: Sequence[str]) -> Observation:
-        """As `World.observe`; images have the size of the world's own camera."""
+        """The latest observation with an image of each of `cameras`, in the size of the world's own camera."""
         self.observation  # noqa: B018 - raises before the first reset
         images = {name: self._picture(self.spec.camera(replace(self.camera, name=name)), True) for name in cameras}
         return self.observation.with_images(images)
 
     def _picture(self, config: CameraConfig, observed: bool) -> NDArray[np.uint8]:
-        """A frame, put together of its views. observed: by a policy, so that a stress changes each camera's picture;
-        recorded frames have a past of their own."""
+        """A frame: its views side by side. observed: for a policy, so that a stress changes the image of each camera.
+        Frames for recordings have their own delayed images."""
         views = views_of(config.name)
-        now = {
+        images = {
             view.shown: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
         }
         if observed:
-            now = {shown: self.stress.see(shown, image, self.steps) for shown, image in now.items()}
-        parts = [self._at((config, view, observed), now[view.shown]) for view in views]
+            images = {camera: self.stress.see(camera, image, self.steps) for camera, image in images.items()}
+        parts = [self._at((config, view, observed), images[view.shown]) for view in views]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def _at(self, key: tuple[CameraConfig, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A part of a frame; now: what its camera shows. A delayed view shows the newest picture that is at least
-        `delay` control steps old; before there is one, the episode's first."""
+        """The image of one view. now: the present image of its camera. A delayed view shows the newest image that is at
+        least `delay` control steps old; until there is one, the episode's first."""
         delay = key[1].delay
         if not delay:
             return now
-        drawn = self._drawn.setdefault(key, [])
-        if not drawn or drawn[-1][0] < self.steps:
-            drawn.append((self.steps, now))
-        while len(drawn) > 1 and drawn[1][0] <= self.steps - delay:
-            drawn.pop(0)
-        return drawn[0][1]
+        past = self._past.setdefault(key, [])
+        if not past or past[-1][0] < self.steps:
+            past.append((self.steps, now))
+        while len(past) > 1 and past[1][0] <= self.steps - delay:
+            past.pop(0)
+        return past[0][1]
 
     def close(self) -> None:
-        """As `World.close`."""
+        """Ends the episode; a subclass also frees its simulator."""
         self._observation = None
-        self._drawn.clear()
+        self._past.clear()
 
     def __enter__(self) -> Self:
         return self
@@ -178,7 +178,7 @@ class MujocoWorld(EpisodeWorld):
         """The MjModel, and MjData in which all poses are up to date."""
 
     def reset(self, seed: int) -> Observation:
-        """As `World.reset`."""
+        """Restores the model, starts the episode of `seed` and applies its stress to the model."""
         self._changes.restore()
         observation = super().reset(seed)
         if self.stress.changes_model:
@@ -192,7 +192,7 @@ class MujocoWorld(EpisodeWorld):
         return self._cameras[camera].render(data)
 
     def close(self) -> None:
-        """As `World.close`."""
+        """Restores the model and frees the graphics contexts."""
         self._changes.restore()
         for camera in self._cameras.values():
             camera.close()

@@ -88,7 +88,7 @@ def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapp
 
 
 def _levels(record: EpisodeRecord) -> dict[str, float]:
-    """The gate's level, where one decided and some score could reach it."""
+    """The level that the scores of drafts are compared with, where the episode has a single finite one."""
     levels = {d.trust.level for d in record.decodes if d.trust is not None and math.isfinite(d.trust.level)}
     return {"score": levels.pop()} if len(levels) == 1 else {}
 
@@ -235,12 +235,12 @@ def _modes(record: EpisodeRecord, starts: NDArray[np.int64]) -> Entity:
     return Entity("mode", (style,), starts[changes], columns)
 
 
-def _mode_color(mode: str, place: int) -> int:
-    """0xRRGGBBAA of a mode: from the table, of the proposer of that name, else the `place`-th of the other colours."""
+def _mode_color(mode: str, number: int) -> int:
+    """0xRRGGBBAA of a mode: from the table, of the proposer of that name, else the `number`-th of the other colours."""
     part = parts("proposer").get(mode)
     if mode not in _MODE_COLORS and part is not None and part.colour is not None:
         return part.colour << 8 | 0xFF
-    return _MODE_COLORS.get(mode, _OTHER_COLORS[place % len(_OTHER_COLORS)])
+    return _MODE_COLORS.get(mode, _OTHER_COLORS[number % len(_OTHER_COLORS)])
 
 
 def _boundaries(starts: NDArray[np.int64]) -> Entity:
@@ -261,10 +261,10 @@ def _token_lanes(chunks: Chunks, starts: NDArray[np.int64], names: Sequence[str]
         colors=np.array([s.color for s in OUTCOMES.values()], dtype=np.uint32),
     )
     entities = []
-    for place in range(len(chunks[0]) if chunks else 0):
-        columns = rr.StateChange.columns(state=[chunk[place].kind for chunk in chunks])
-        step, name = divmod(place, len(names))
-        entities.append(Entity(f"tokens/step_{step}/{_part(names[name])}", (style,), starts, columns))
+    for index in range(len(chunks[0]) if chunks else 0):
+        columns = rr.StateChange.columns(state=[chunk[index].kind for chunk in chunks])
+        step, dof = divmod(index, len(names))
+        entities.append(Entity(f"tokens/step_{step}/{_part(names[dof])}", (style,), starts, columns))
     return entities
 
 
@@ -318,7 +318,7 @@ def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) ->
 
 
 def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds: Mapping[str, float]) -> list[Entity]:
-    """Series of numbers per decode. A decode without a number has no row; a number that no decode has has no entity."""
+    """Series of numbers per decode. A decode without a value has no row, and a series without rows has no entity."""
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
@@ -339,12 +339,12 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
         ),
     ]
     for signal, name in SIGNALS.items():
-        found = [getattr(d, signal) for d in decodes]
+        values = [getattr(d, signal) for d in decodes]
         if signal in bounds:
-            both = [() if x is None else (x, bounds[signal]) for x in found]
+            both = [() if x is None else (x, bounds[signal]) for x in values]
             series.append(Series(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF]))
         else:
-            series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in found]))
+            series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in values]))
     return [s.entity(starts) for s in series if any(s.values)]
 
 

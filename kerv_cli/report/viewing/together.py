@@ -27,24 +27,24 @@ def save_together(paths: Sequence[Path], folder: Path) -> Path:
     """
     if len(paths) != len(SIDES):
         raise UsageError(f"--together shows two recordings, not {len(paths)}: name two .rrd files")
-    found = [read_back(path) for path in paths]
+    contents = [read_back(path) for path in paths]
     for key in ("task", "seed"):
-        first, second = (summary["episode"].get(key) for summary in found)
+        first, second = (content["episode"].get(key) for content in contents)
         if first != second:
             raise UsageError(f"--together needs the same {key} on both sides, here {first} and {second}")
     out = folder / f"{paths[0].stem}+{paths[1].stem}.rrd"
     with catch_and_log_exceptions(strict=True):
-        content = _encode(paths, found)
+        data = _encode(paths, contents)
     with atomic_path(out) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(data)
     return out
 
 
-def _encode(paths: Sequence[Path], found: Sequence[dict[str, Any]]) -> bytes:
+def _encode(paths: Sequence[Path], contents: Sequence[dict[str, Any]]) -> bytes:
     recording = rr.RecordingStream("kerv_together")
     memory = recording.memory_recording()
-    episode = found[0]["episode"]
-    methods = [str(summary["episode"].get("method", side)) for side, summary in zip(SIDES, found, strict=True)]
+    episode = contents[0]["episode"]
+    methods = [str(content["episode"].get("method", side)) for side, content in zip(SIDES, contents, strict=True)]
     recording.send_recording_name(f"{episode.get('task')} · seed {episode.get('seed')} · {' and '.join(methods)}")
     for side, path in zip(SIDES, paths, strict=True):
         moved = [
@@ -53,7 +53,7 @@ def _encode(paths: Sequence[Path], found: Sequence[dict[str, Any]]) -> bytes:
             if not chunk.entity_path.startswith("/__properties")
         ]
         recording.send_chunks(moved)
-    columns = [_column(side, name, summary) for side, name, summary in zip(SIDES, methods, found, strict=True)]
+    columns = [_column(side, name, content) for side, name, content in zip(SIDES, methods, contents, strict=True)]
     recording.send_blueprint(
         rrb.Blueprint(
             rrb.Horizontal(*columns),
@@ -67,9 +67,10 @@ def _encode(paths: Sequence[Path], found: Sequence[dict[str, Any]]) -> bytes:
     return bytes(memory.drain_as_bytes())
 
 
-def _column(side: str, method: str, found: dict[str, Any]) -> rrb.Vertical:
-    """One method: camera and path, what became of the tokens, forwards, time, the present decode."""
-    entities, facts = found["entities"], found["episode"]
+def _column(side: str, method: str, content: dict[str, Any]) -> rrb.Vertical:
+    """One method's views: camera and path, outcomes of the tokens, forwards, time, the current decode. content: of its
+    recording, see `read_back`."""
+    entities, facts = content["entities"], content["episode"]
     outcome = "success" if facts.get("success") else "failure"
     top: list[rrb.View] = [rrb.Spatial3DView(origin=f"/{side}/world", name="End effector")]
     if "/camera" in entities:

@@ -33,8 +33,8 @@ OUTCOMES: dict[str, OutcomeStyle] = {
 
 @dataclass(frozen=True)
 class TokenOutcome:
-    """What became of one token of a chunk. Fields are None where there was no draft, target token, limit or known
-    token."""
+    """The outcome of one token of a chunk. A field is None where the token has no draft, no target token, no limit, no
+    committed value or no round."""
 
     kind: str  # a key of OUTCOMES
     token: int | None = None  # what was committed
@@ -45,11 +45,11 @@ class TokenOutcome:
 
     @property
     def short(self) -> str:
-        """`draft → target token` where they differ, else the only known token; at most 9 characters."""
+        """`draft → target token` where they differ, else one token, or the symbol without any; at most 9 characters."""
         if self.draft is not None and self.target is not None and self.draft != self.target:
             return f"{self.draft} → {self.target}"
-        known = next((x for x in (self.draft, self.target, self.token) if x is not None), None)
-        return OUTCOMES[self.kind].symbol if known is None else str(known)
+        token = next((x for x in (self.draft, self.target, self.token) if x is not None), None)
+        return OUTCOMES[self.kind].symbol if token is None else str(token)
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
@@ -67,42 +67,43 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     A rejected token stays `rejected` even if it was filled later; other tokens that were not executed are `dropped`.
     """
     outcomes: list[TokenOutcome | None] = [None] * size
-    for number, played in enumerate(decode.rounds):
-        for place, outcome in round_outcomes(played, number):
-            before = outcomes[place]
+    for number, one_round in enumerate(decode.rounds):
+        for index, outcome in round_outcomes(one_round, number):
+            before = outcomes[index]
             if before is None or before.kind != "rejected":
-                outcomes[place] = outcome
+                outcomes[index] = outcome
     executed = len(decode.actions) * dofs
-    for place in range(max(0, executed - decode.compensated), executed):  # predictions fill the last executed tokens
-        before = outcomes[place]
+    for index in range(max(0, executed - decode.compensated), executed):  # predictions fill the last executed tokens
+        before = outcomes[index]
         if before is None or before.kind != "rejected":
-            outcomes[place] = TokenOutcome("compensated")
-    return [_settled(outcome, decode, place, place < executed) for place, outcome in enumerate(outcomes)]
+            outcomes[index] = TokenOutcome("compensated")
+    return [_committed_outcome(outcome, decode, index, index < executed) for index, outcome in enumerate(outcomes)]
 
 
-def round_outcomes(played: Round, number: int) -> list[tuple[int, TokenOutcome]]:
-    """(index in the chunk, outcome) of what one round judged."""
-    found = []
-    for i in range(max(len(played.drafted), len(played.target_tokens))):
-        draft = played.drafted[i] if i < len(played.drafted) else None
-        target = played.target_tokens[i] if i < len(played.target_tokens) else None
-        place = played.start + i
-        if played.mode == "skip":
+def round_outcomes(one_round: Round, number: int) -> list[tuple[int, TokenOutcome]]:
+    """(index in the chunk, outcome) of every token that one round judged."""
+    outcomes = []
+    drafts, targets, threshold = one_round.drafted, one_round.target_tokens, one_round.threshold
+    for i in range(max(len(drafts), len(targets))):
+        draft = drafts[i] if i < len(drafts) else None
+        target = targets[i] if i < len(targets) else None
+        index = one_round.start + i
+        if one_round.mode == "skip":
             kind = "skipped"
         elif draft is None:
-            kind = "bonus" if played.drafted else "target"
-        elif i >= played.accepted:
+            kind = "bonus" if drafts else "target"
+        elif i >= one_round.accepted:
             kind = "rejected"
         else:
             kind = "accepted" if draft == target else "relaxed"
-        limit = played.threshold[place % len(played.threshold)] if played.threshold and draft is not None else None
-        found.append((place, TokenOutcome(kind, None, draft, target, limit, number)))
-    return found
+        limit = threshold[index % len(threshold)] if threshold and draft is not None else None
+        outcomes.append((index, TokenOutcome(kind, None, draft, target, limit, number)))
+    return outcomes
 
 
-def _settled(outcome: TokenOutcome | None, decode: DecodeRecord, place: int, executed: bool) -> TokenOutcome:
+def _committed_outcome(outcome: TokenOutcome | None, decode: DecodeRecord, index: int, executed: bool) -> TokenOutcome:
     """The outcome with its committed token, given whether its control step was executed."""
-    token = decode.tokens[place] if place < len(decode.tokens) else None
+    token = decode.tokens[index] if index < len(decode.tokens) else None
     if outcome is None:
         outcome = TokenOutcome(_unjudged(decode))
     kind = outcome.kind if executed or outcome.kind == "rejected" else "dropped"
@@ -127,14 +128,14 @@ def decode_table(
         "| token | step | DoF | round | draft | target | off by | r | kept | outcome |",
         "|--:|--:|:--|--:|--:|--:|--:|--:|--:|:--|",
     ]
-    for place, outcome in enumerate(outcomes):
+    for index, outcome in enumerate(outcomes):
         off = None
         if outcome.draft is not None and outcome.target is not None:
             off = abs(outcome.draft - outcome.target)
         numbers = (outcome.round, outcome.draft, outcome.target, off, outcome.limit, outcome.token)
         word = f"{OUTCOMES[outcome.kind].symbol} {outcome.kind}"
         word = f"**{word}**" if outcome.kind == "rejected" else word
-        row = (place, place // len(names), names[place % len(names)], *map(_cell, numbers), word)
+        row = (index, index // len(names), names[index % len(names)], *map(_cell, numbers), word)
         lines.append(f"| {' | '.join(map(str, row))} |")
     return "\n".join(lines)
 

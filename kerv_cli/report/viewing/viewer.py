@@ -24,26 +24,26 @@ _START_SECONDS = 2.0
 _TIMELINES = ("step", "time")
 
 
-def find_recordings(places: Sequence[Path]) -> list[Path]:
-    """The .rrd files among and below `places`, the newest first.
+def find_recordings(paths: Sequence[Path]) -> list[Path]:
+    """The .rrd files among `paths` and in its folders, the newest first.
 
     Raises:
-        UsageError: a place does not exist or is not a recording, or no recording was found.
+        UsageError: a path does not exist or is neither a recording nor a folder, or there is no recording.
     """
-    found: dict[Path, float] = {}
-    for place in (Path(p).expanduser() for p in places):
-        if place.is_dir():
-            found |= {path: path.stat().st_mtime for path in place.rglob("*.rrd") if path.is_file()}
-        elif not place.exists():
-            raise UsageError(f"{place} does not exist: name a recording (.rrd) or a folder of them")
-        elif place.suffix != ".rrd":
-            raise UsageError(f"{place} is not a recording: its name does not end in .rrd")
+    modified: dict[Path, float] = {}
+    for path in (Path(p).expanduser() for p in paths):
+        if path.is_dir():
+            modified |= {file: file.stat().st_mtime for file in path.rglob("*.rrd") if file.is_file()}
+        elif not path.exists():
+            raise UsageError(f"{path} does not exist: name a recording (.rrd) or a folder of them")
+        elif path.suffix != ".rrd":
+            raise UsageError(f"{path} is not a recording: its name does not end in .rrd")
         else:
-            found[place] = place.stat().st_mtime
-    if not found:
-        where = ", ".join(str(p) for p in places) or "nowhere"
+            modified[path] = path.stat().st_mtime
+    if not modified:
+        where = ", ".join(str(p) for p in paths) or "nowhere"
         raise UsageError(f"no recordings in {where}: make some with 'kerv rollout method=ar task=reach-v3'")
-    return sorted(found, key=lambda path: (-found[path], path))
+    return sorted(modified, key=lambda path: (-modified[path], path))
 
 
 def has_display() -> bool:
@@ -70,7 +70,7 @@ def open_recording(paths: Sequence[Path]) -> str:
         raise UsageError("no recording to open")
     chosen = list(paths)[:MOST_OPENED]
     for path in chosen:
-        _checked(path)
+        _reader(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
     if not has_display():
         return _instructions(chosen, more)
@@ -84,8 +84,8 @@ def viewer_command() -> list[str]:
     beside = Path(sys.executable).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
     if beside.is_file():
         return [str(beside)]
-    found = shutil.which("rerun")
-    return [found] if found else [sys.executable, "-m", "rerun"]
+    executable = shutil.which("rerun")
+    return [executable] if executable else [sys.executable, "-m", "rerun"]
 
 
 def _instructions(paths: Sequence[Path], more: str) -> str:
@@ -133,7 +133,7 @@ def read_back(path: Path) -> dict[str, Any]:
         KervError: the file is missing or damaged.
     """
     path = Path(path)
-    reader = _checked(path)
+    reader = _reader(path)
     entry = reader.recordings()[0]
     name, episode = "", {}
     entities: dict[str, int] = {}
@@ -166,13 +166,13 @@ def read_back(path: Path) -> dict[str, Any]:
 
 def read_summary(path: Path) -> str:
     """`read_back` as text; errors as there."""
-    found = read_back(path)
-    lines = [f"{path}: {found['name'] or found['recording']}, {found['bytes'] / 1e6:.2f} MB"]
-    if "step" in found["timelines"]:
-        first, last = found["timelines"]["step"]
+    contents = read_back(path)
+    lines = [f"{path}: {contents['name'] or contents['recording']}, {contents['bytes'] / 1e6:.2f} MB"]
+    if "step" in contents["timelines"]:
+        first, last = contents["timelines"]["step"]
         lines[0] += f", steps {first} to {last}"
-    lines += [f"  {key:<20} {_figure(value)}" for key, value in sorted(found["episode"].items())]
-    rows = ", ".join(f"{entity[1:]} {count}" for entity, count in found["entities"].items() if count)
+    lines += [f"  {key:<20} {_figure(value)}" for key, value in sorted(contents["episode"].items())]
+    rows = ", ".join(f"{entity[1:]} {count}" for entity, count in contents["entities"].items() if count)
     lines.append(f"  rows: {rows}")
     return "\n".join(lines)
 
@@ -181,8 +181,12 @@ def _figure(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _checked(path: Path) -> RrdReader:
-    """A reader of the recording, after checking header, footer and that it holds a recording."""
+def _reader(path: Path) -> RrdReader:
+    """A reader of the file, whose header and footer are valid and which holds a recording.
+
+    Raises:
+        KervError: the file is missing, damaged or empty.
+    """
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
@@ -201,7 +205,7 @@ def _checked(path: Path) -> RrdReader:
 
 def chunks_of(path: Path) -> list[Any]:
     """Every chunk of a recording. KervError: it is missing or damaged."""
-    return _chunks(_checked(path), path)
+    return _chunks(_reader(path), path)
 
 
 def _chunks(reader: RrdReader, path: Path) -> list[Any]:

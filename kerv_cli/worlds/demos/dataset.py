@@ -79,7 +79,7 @@ def episode_path(out: Path, task: str, seed: int) -> Path:
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Hex SHA-256 over the hashes of the episode files; tasks: as in a manifest's JSON."""
+    """Hex SHA-256 over the hashes of the episode files; tasks: of a manifest's JSON."""
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
         for episode in summary["episodes"]:
@@ -181,9 +181,9 @@ class DemoDataset:
 
 def _read_manifest(path: Path) -> DemoManifest:
     value = read_json(path)
-    found = value.get("format") if isinstance(value, dict) else None
-    if found not in (1, FORMAT):
-        raise CheckpointError(f"{path} has format {found}, this kerv reads {FORMAT} and 1")
+    version = value.get("format") if isinstance(value, dict) else None
+    if version not in (1, FORMAT):
+        raise CheckpointError(f"{path} has format {version}, this kerv reads {FORMAT} and 1")
     value = with_environment(value)
     manifest = read(DemoManifest, value, str(path))
     if manifest.sha256 != dataset_hash(value["tasks"]):

@@ -33,7 +33,7 @@ class DemoEpisode:
         states: (T, s) float32, privileged state before each action; it begins with the proprioception.
         labels: (T + tail, D) float32, the clean expert's clipped actions; the last `tail` lie beyond the success.
         executed: (T, D) float32, the actions that moved the robot.
-        initial_state: (n,) float64, as `World.initial_state`, e.g. object and goal placement.
+        initial_state: (n,) float64, of the world's `initial_state`, e.g. object and goal placement.
     """
 
     task: str
@@ -80,7 +80,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         "frame_size": str(episode.frames.shape[1]),
     }
     height, width = episode.frames.shape[1:3]
-    if width != height:  # files of square frames are as they always were
+    if width != height:  # square frames need no width, so that their files keep their bytes
         metadata["frame_width"] = str(width)
     # save_file would hide a full disk behind an error type of its own.
     data = _with_sorted_metadata(save(tensors, metadata=metadata))
@@ -89,8 +89,8 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
-    """The same safetensors bytes with the metadata's keys in order. safetensors writes them in random order, so that
-    the files of two recordings of one episode would have different hashes."""
+    """Sorts the keys of the metadata in the bytes of a safetensors file. safetensors writes them in random order, so
+    that the files of two recordings of one episode would have different hashes."""
     header, start = header_of(data)
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":")).encode()

@@ -1,5 +1,5 @@
-"""Frames of demonstrations as they lie on disk: PNG in the episodes' files, read and decoded when they are asked for.
-Training keeps none of them in memory and no file open, so it does not depend on the size of the dataset."""
+"""Frames of demonstrations as PNG in the episodes' files, read and decoded on access. Training keeps none of them in
+memory and no file open, so it does not depend on the size of the dataset."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ class EncodedFrames:
             first, last = header["png"]["data_offsets"]
         except (OSError, ValueError, KeyError, TypeError, struct.error) as error:
             raise CheckpointError(f"{path} is missing or damaged: {error}") from error
-        places = offsets + begin + first
+        positions = offsets + begin + first
         if len(offsets) < 1 or (np.diff(offsets) <= 0).any() or offsets[0] < 0 or offsets[-1] > last - first:
             raise CheckpointError(f"{path} is damaged: its frames lie outside their tensor")
-        return cls([path], np.zeros(len(offsets) - 1, np.int64), places[:-1], places[1:], size, width)
+        return cls([path], np.zeros(len(offsets) - 1, np.int64), positions[:-1], positions[1:], size, width)
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
@@ -87,7 +87,7 @@ class EncodedFrames:
     def __getitem__(self, chosen: Any) -> NDArray[np.uint8] | EncodedFrames:
         """One frame, decoded, or those that a slice, mask or indices select, still encoded."""
         if isinstance(chosen, int | np.integer):
-            return self._decoded(int(chosen))
+            return self._decode(int(chosen))
         at = np.asarray(chosen) if not isinstance(chosen, slice) else chosen
         return EncodedFrames(self.sources, self.source[at], self.start[at], self.end[at], self.size, self.width)
 
@@ -101,11 +101,11 @@ class EncodedFrames:
             return np.zeros(self.shape, np.uint8)
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         if workers == 1 or len(self) < 16:
-            return np.stack([self._decoded(i) for i in range(len(self))])
+            return np.stack([self._decode(i) for i in range(len(self))])
         with ThreadPoolExecutor(min(workers, 8)) as pool:
-            return np.stack(list(pool.map(self._decoded, range(len(self)))))
+            return np.stack(list(pool.map(self._decode, range(len(self)))))
 
-    def _decoded(self, i: int) -> NDArray[np.uint8]:
+    def _decode(self, i: int) -> NDArray[np.uint8]:
         from PIL import Image
 
         path, start = self.sources[self.source[i]], int(self.start[i])

@@ -1,8 +1,8 @@
 """Demonstrations: scripted experts, recorded to disk with clean labels, and read back.
 
 By default half of the episodes are executed with noise, so that they visit states off the expert's path; their labels
-are still the expert's clean actions at those states. Only successful episodes are kept. With an *actor*, e.g. a policy,
-that one moves the robot and the expert only labels what it visits (DAgger, Ross et al. 2011); every episode is kept.
+are still the expert's clean actions at those states. Only successful episodes are kept. An *actor*, e.g. a policy, may
+move the robot instead; the expert then only labels the states (DAgger, Ross et al. 2011), and every episode is kept.
 
 On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:06d>.safetensors`,
 `failed/<task>/<seed:06d>.json` and, when the recording is complete, `manifest.json`.
@@ -190,7 +190,7 @@ def record(
     Args:
         config: of the recording.
         out: the dataset's folder.
-        on_progress: called with (episodes done, episodes wanted).
+        on_progress: called with (episodes done, episodes in all).
         make_actor: makes the actor that moves the robot in the expert's place.
 
     Returns:
@@ -208,10 +208,10 @@ def record(
     identity = _identity(config)
     _claim_folder(out, identity)
     try:
-        kept, failed = _collect(config, out, on_progress, make_actor)
+        entries, failed = _collect(config, out, on_progress, make_actor)
     finally:
         _release_world()
-    manifest = {**identity, **_summary(config, kept, failed)}
+    manifest = {**identity, **_summary(config, entries, failed)}
     write_json(out / "manifest.json", manifest)
     return read(DemoManifest, manifest, str(out / "manifest.json"))
 
@@ -226,37 +226,38 @@ def _collect(
     on_progress: Callable[[int, int], None] | None,
     make_actor: MakeActor | None,
 ) -> tuple[_Entries, _Failures]:
-    kept: _Entries = {task: [] for task in config.tasks}
+    entries: _Entries = {task: [] for task in config.tasks}
     failed: _Failures = {task: [] for task in config.tasks}
-    wanted = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
-    while any(wanted.values()):
-        for task, outcomes in _run_jobs(config, out, _jobs(wanted), make_actor):
-            kept[task] += [entry for entry in outcomes.values() if entry is not None]
+    seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
+    while any(seeds.values()):
+        for task, outcomes in _run_jobs(config, out, _jobs(seeds), make_actor):
+            entries[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
             if on_progress is not None:
-                on_progress(sum(map(len, kept.values())), config.episodes * len(config.tasks))
-        wanted = {task: _next_seeds(config, len(kept[task]), wanted[task]) for task in config.tasks}
-    return kept, failed
+                on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
+        seeds = {task: _next_seeds(config, len(entries[task]), seeds[task]) for task in config.tasks}
+    return entries, failed
 
 
-def _jobs(wanted: Mapping[str, range]) -> list[tuple[str, range]]:
+def _jobs(seeds: Mapping[str, range]) -> list[tuple[str, range]]:
     return [
-        (task, seeds[start : start + _SEEDS_PER_JOB])
-        for task, seeds in wanted.items()
-        for start in range(0, len(seeds), _SEEDS_PER_JOB)
+        (task, block[start : start + _SEEDS_PER_JOB])
+        for task, block in seeds.items()
+        for start in range(0, len(block), _SEEDS_PER_JOB)
     ]
 
 
-def _next_seeds(config: DemoConfig, kept: int, tried: range) -> range:
+def _next_seeds(config: DemoConfig, successes: int, last: range) -> range:
     # One new seed per failure, in order: the outcome does not depend on how the work is divided.
-    return range(tried.stop, min(tried.stop + config.episodes - kept, config.seed_limit))
+    return range(last.stop, min(last.stop + config.episodes - successes, config.seed_limit))
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
     settings = asdict(config)
     del settings["workers"]
     if not config.policy:
-        del settings["policy"], settings["expert_share"]  # as recordings without an actor always were
+        # recordings from before there were actors lack them and may resume
+        del settings["policy"], settings["expert_share"]
     spec = config.spec
     versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
     identity = {
@@ -267,7 +268,7 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
         "config": settings,
         "versions": versions,
     }
-    return dict(json.loads(json.dumps(identity)))  # as it will be read back: lists for tuples
+    return dict(json.loads(json.dumps(identity)))  # lists for tuples, as in the file
 
 
 def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
@@ -275,25 +276,25 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
     if not path.exists():
         write_json(path, identity)
         return
-    there = read_json(path)
+    stored = read_json(path)
     packages = spec_of(identity["config"]["tasks"][0]).packages
     try:
-        here, before = _comparable(identity, packages), _comparable(there, packages)
+        new, old = _comparable(identity, packages), _comparable(stored, packages)
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{path} is damaged: {error} is not in it") from error
-    if here != before:
-        key = next(key for key in [*here, *before] if here.get(key) != before.get(key))
+    if new != old:
+        key = next(key for key in [*new, *old] if new.get(key) != old.get(key))
         raise UsageError(
-            f"{out} holds demonstrations with {key}={before.get(key)}, not {here.get(key)}: choose another folder"
+            f"{out} holds demonstrations with {key}={old.get(key)}, not {new.get(key)}: choose another folder"
         )
 
 
 def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[str, Any]:
     # Another Python or numpy may resume a recording; another simulator version may have other physics.
     identity = json.loads(json.dumps(with_environment(identity)))
-    same = ("environment", "format", "actions", "observation")
+    keys = ("environment", "format", "actions", "observation")
     versions = {name: identity["versions"].get(name) for name in packages}
-    return {**{key: identity[key] for key in same}, **identity["config"], **versions}
+    return {**{key: identity[key] for key in keys}, **identity["config"], **versions}
 
 
 _Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, None where the expert failed
@@ -367,16 +368,16 @@ def _valid_episode(path: Path, task: str, seed: int, spec: EnvironmentSpec) -> D
     return episode if (episode.task, episode.seed) == (task, seed) else None
 
 
-def _summary(config: DemoConfig, kept: _Entries, failed: _Failures) -> dict[str, Any]:
-    empty = [task for task, entries in kept.items() if not entries]
+def _summary(config: DemoConfig, entries: _Entries, failed: _Failures) -> dict[str, Any]:
+    empty = [task for task, rows in entries.items() if not rows]
     if empty:
         raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
     tasks = {}
     for task in config.tasks:
-        entries = sorted(kept[task], key=lambda entry: entry["seed"])
-        mean = sum(entry["steps"] for entry in entries) / len(entries)
-        tasks[task] = {"mean_steps": round(mean, 2), "failed_seeds": sorted(failed[task]), "episodes": entries}
-    seeds = [entry["seed"] for entries in kept.values() for entry in entries]
+        rows = sorted(entries[task], key=lambda entry: entry["seed"])
+        mean = sum(entry["steps"] for entry in rows) / len(rows)
+        tasks[task] = {"mean_steps": round(mean, 2), "failed_seeds": sorted(failed[task]), "episodes": rows}
+    seeds = [entry["seed"] for rows in entries.values() for entry in rows]
     return {
         "seeds": {"first": min(seeds), "last": max(seeds)},
         "episodes": len(seeds),

@@ -69,16 +69,16 @@ class MetaWorld(MujocoWorld):
         return np.array(state, dtype=np.float64)
 
     def _start_outside(self) -> NDArray[np.float64]:
-        """As `_start`, with the placement moved horizontally away from the centre of its range by `stress.spread`.
-        Where the task refuses a placement, e.g. an object too close to its goal, the move is halved until it does
-        not."""
+        """Starts an episode whose placement is moved horizontally away from the centre of its range by
+        `stress.spread`; returns the state (s,). Where the task refuses a placement, e.g. an object too close to its
+        goal, the move is halved until it is accepted."""
         env = self._env
         inside, space = env._last_rand_vec, env._random_reset_space
         outwards = (self.stress.spread - 1.0) * (inside - (space.low + space.high) / 2)
         outwards[2::3] = 0.0  # heights
         reset_model = env.reset_model
 
-        def placed() -> Any:  # a reset calls it twice; it asks for placements until one suits it
+        def reset_outside() -> Any:  # a reset calls it twice; it asks for placements until one suits it
             shares = (0.5**tries for tries in itertools.count())
 
             def placement() -> NDArray[np.float64]:
@@ -88,7 +88,7 @@ class MetaWorld(MujocoWorld):
             env._get_state_rand_vec = placement
             return reset_model()
 
-        env.reset_model = placed
+        env.reset_model = reset_outside
         try:
             state, _ = env.reset()
         finally:
@@ -111,7 +111,7 @@ class MetaWorld(MujocoWorld):
         return model, data
 
     def close(self) -> None:
-        """As `World.close`."""
+        """Frees simulator and graphics; the next reset builds them anew."""
         super().close()
         if self._env is not None:
             self._env.close()

@@ -1,5 +1,4 @@
-"""Actuation: the robot executes something else than what it is told, by white noise, wrong gains and an axis that
-sticks for a while."""
+"""Actuation: the robot executes an action with white noise, wrong gains and a DoF that sticks for a while."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ class Level:
 
 
 STUCK_SECONDS = 0.25
-"""Of a spell in which a DoF sticks."""
+"""Length of a spell in which a DoF sticks."""
 LEVELS = (Level(0.3, 0.2, 0.5), Level(0.6, 0.4, 1.0), Level(0.9, 0.6, 1.5), Level(1.8, 0.8, 4.0))
 
 
@@ -32,8 +31,8 @@ class Actuation(Stress):
     kind = "actuation"
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`: draws the gains."""
-        level: Level = level_of(LEVELS, self.level)
+        """Draws the gains of the DoFs."""
+        level = level_of(LEVELS, self.level)
         self._random = Draws(task, seed, self.kind, self.level).random()
         self._loose = ~space.is_strict
         self._low, self._high = np.array(space.low)[self._loose], np.array(space.high)[self._loose]
@@ -44,7 +43,7 @@ class Actuation(Stress):
         self._stuck = 0
 
     def act(self, action: Array, step: int) -> Array:
-        """As `Stress.act`."""
+        """The action with gains and noise; a DoF that sticks stands still."""
         noise = self._random.normal(0.0, self._noise, len(self._half)) * self._half
         lasts, begins = self._spells.goes_on(self._random)
         if begins:

@@ -1,10 +1,10 @@
-"""The base of every kind of stress: where it takes hold of an episode, its random numbers, the changes of a model."""
+"""The base of every kind of stress: its hooks in an episode, its random numbers and its changes of a model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
 
 Array = NDArray[np.float64]
+L = TypeVar("L")
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Draws:
 
 
 class ModelChanges:
-    """Arrays of a MuJoCo model that were changed, and what they held before."""
+    """Arrays of a MuJoCo model that a stress changes, with their values before the change."""
 
     def __init__(self) -> None:
         self._before: list[tuple[NDArray[Any], NDArray[Any]]] = []
@@ -50,8 +51,8 @@ class ModelChanges:
 
 
 class Stress:
-    """A shift of a stated size, drawn anew for every episode. A kind overrides the methods in which it takes hold;
-    this class shifts nothing.
+    """A shift of a stated size, drawn anew for every episode. A kind overrides the hooks that it needs; this class
+    shifts nothing.
 
     kind: its name. level: 1 to MOST_STRESS. spread: factor by which the range of initial states is widened around its
     centre. changes_model: whether `change` does anything.
@@ -68,14 +69,14 @@ class Stress:
         """Draws the episode's shift, before its reset. space: of the actions that `act` gets."""
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """Changes the MjModel of an episode that was just reset. What it changes is told to `changes` first."""
+        """Changes the MjModel of an episode that was just reset; `changes.keep` comes before each change."""
 
     def act(self, action: Array, step: int) -> Array:
         """The action (D,) that is executed instead of the clipped `action`. Called once per control step, in order."""
         return action
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """The image (size, size, 3) that the policy is shown instead of `image`, at a control step."""
+        """The image (size, size, 3) that the policy gets instead of `image`, at a control step."""
         return image
 
 
@@ -131,7 +132,7 @@ def objects(model: Any) -> list[int]:
     return [b for b in range(1, model.nbody) if model.body_dofnum[b] > 0 and model.body_rootid[b] not in robots]
 
 
-def level_of(levels: Sequence[Any], level: int) -> Any:
+def level_of(levels: Sequence[L], level: int) -> L:
     """The numbers of level 1 to MOST_STRESS."""
     assert len(levels) == MOST_STRESS
     return levels[level - 1]

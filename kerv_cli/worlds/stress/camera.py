@@ -31,12 +31,12 @@ class CameraJitter(Stress):
     changes_model = True
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers."""
         self._draws = Draws(task, seed, self.kind, self.level)
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """As `Stress.change`."""
-        level: Level = level_of(LEVELS, self.level)
+        """Moves and turns every camera."""
+        level = level_of(LEVELS, self.level)
         random = self._draws.random()
         changes.keep(model.cam_pos, model.cam_quat)
         for camera in range(model.ncam):

@@ -18,17 +18,17 @@ _DEFAULT = 0.5, 0.5, 0.5, 1.0  # rgba of a geom whose colour is its material's
 
 class Colour(Stress):
     """The model's floor, walls and table are painted, each body in one colour. The sky is a texture in the graphics
-    memory and keeps its colour, and so do the robot and what the task is about."""
+    memory and keeps its colour, and so do the robot and the task's objects."""
 
     kind = "colour"
     changes_model = True
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers."""
         self._draws = Draws(task, seed, self.kind, self.level)
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """As `Stress.change`."""
+        """Mixes the colours of background and table with random ones."""
         share, random = level_of(LEVELS, self.level), self._draws.random()
         changes.keep(model.geom_rgba)
         scenery = scenery_of(model)
@@ -36,8 +36,8 @@ class Colour(Stress):
         colours = {body: random.random(3) for body in bodies}
         for geom in scenery:
             material = model.geom_matid[geom]
-            own = material >= 0 and np.allclose(model.geom_rgba[geom], _DEFAULT)
-            rgba = (model.mat_rgba[material] if own else model.geom_rgba[geom]).copy()
+            from_material = material >= 0 and np.allclose(model.geom_rgba[geom], _DEFAULT)
+            rgba = (model.mat_rgba[material] if from_material else model.geom_rgba[geom]).copy()
             rgba[:3] = (1 - share) * rgba[:3] + share * colours[int(model.geom_bodyid[geom])]
             model.geom_rgba[geom] = rgba
 

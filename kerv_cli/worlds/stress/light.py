@@ -31,12 +31,12 @@ class Light(Stress):
     changes_model = True
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers."""
         self._draws = Draws(task, seed, self.kind, self.level)
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """As `Stress.change`."""
-        level: Level = level_of(LEVELS, self.level)
+        """Scales all light, and turns and moves the lamps."""
+        level = level_of(LEVELS, self.level)
         random, head = self._draws.random(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
         strengths = (*lights, head.ambient, head.diffuse, head.specular)

@@ -1,4 +1,4 @@
-"""Object: what the task is about is larger or smaller, heavier or lighter, smoother or rougher, and begins outside the
+"""Object: the task's objects are larger or smaller, heavier or lighter, smoother or rougher, and begin outside the
 range of the training."""
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ LEVELS = (Level(1.1, 1.6, 1.5, 1.2), Level(1.2, 2.5, 2.0, 1.4), Level(1.3, 4.0, 
 
 class Objects(Stress):
     """Objects are the bodies with joints that no robot moves. Friction is that of all geoms, because a contact has the
-    larger one of its two, and the damping of the objects' joints. Meshes keep their size, and so does what hangs on
-    a hinge or a slide."""
+    larger one of its two, and the damping of the objects' joints. Meshes and objects on a hinge or a slide keep their
+    size."""
 
     kind = "object"
     changes_model = True
@@ -39,12 +39,12 @@ class Objects(Stress):
         self.spread = level_of(LEVELS, level).spread
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers."""
         self._draws = Draws(task, seed, self.kind, self.level)
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """As `Stress.change`."""
-        level: Level = level_of(LEVELS, self.level)
+        """Scales the objects' size, mass and friction."""
+        level = level_of(LEVELS, self.level)
         random = self._draws.random()
         size, mass, friction = (either(random, factor) for factor in (level.size, level.mass, level.friction))
         changes.keep(model.geom_friction, model.dof_damping, model.dof_frictionloss, model.dof_invweight0)

@@ -9,7 +9,7 @@ from kerv_cli.worlds.stress.base import Array, Draws, Spells, Stress, level_of
 from kerv_cli.worlds.vectors import unit_vector
 
 SECONDS = 0.1
-"""Of a burst."""
+"""Length of a burst."""
 LEVELS = (2.0, 4.0, 8.0, 14.0)
 """Bursts per second that begin while none lasts."""
 
@@ -21,22 +21,22 @@ class Push(Stress):
     kind = "push"
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers and its rate of bursts."""
         group = space.dofs_of("position")
         self._random = Draws(task, seed, self.kind, self.level).random()
         self._spells = Spells.per_second(level_of(LEVELS, self.level), SECONDS, space.control_hz)
         self._at = group
         low, high = np.array(space.low)[group], np.array(space.high)[group]
         self._half, self._middle = (high - low) / 2, (high + low) / 2
-        self._pushed = self._middle
+        self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
-        """As `Stress.act`."""
+        """The action, with its position group replaced while a burst lasts."""
         lasts, begins = self._spells.goes_on(self._random)
         if begins:
-            self._pushed = self._middle + unit_vector(self._random, len(self._half)) * self._half
+            self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half
         if not lasts:
             return action
         executed = action.copy()
-        executed[self._at] = self._pushed
+        executed[self._at] = self._push
         return executed

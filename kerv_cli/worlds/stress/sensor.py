@@ -1,4 +1,4 @@
-"""Sensor: the camera's picture is noisy, blurred, or the one from before."""
+"""Sensor: the camera's image is noisy and blurred, or is the one observed before."""
 
 from __future__ import annotations
 
@@ -31,19 +31,20 @@ class Sensor(Stress):
     kind = "sensor"
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """As `Stress.begin`."""
+        """Fixes the episode's random numbers and forgets the images of the last one."""
         self._draws = Draws(task, seed, self.kind, self.level)
         self._last: dict[str, NDArray[np.uint8]] = {}
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """As `Stress.see`; its random numbers follow from the control step, however often the policy looks."""
-        level: Level = level_of(LEVELS, self.level)
+        """The blurred and noisy image, or the last one of this camera. The random numbers follow from the control step,
+        so that repeated calls of a step agree."""
+        level = level_of(LEVELS, self.level)
         random = self._draws.random(camera, step)
         dropped = random.random() < level.dropped
         if dropped and camera in self._last:
             return self._last[camera]
         blur = level.blur / 100 * image.shape[0]
-        seen = gaussian_filter(image.astype(np.float32), sigma=(blur, blur, 0))
-        seen += random.standard_normal(image.shape, dtype=np.float32) * level.noise
-        self._last[camera] = np.clip(np.rint(seen), 0, 255).astype(np.uint8)
+        blurred = gaussian_filter(image.astype(np.float32), sigma=(blur, blur, 0))
+        blurred += random.standard_normal(image.shape, dtype=np.float32) * level.noise
+        self._last[camera] = np.clip(np.rint(blurred), 0, 255).astype(np.uint8)
         return self._last[camera]

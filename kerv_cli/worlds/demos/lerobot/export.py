@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, write_json
@@ -42,7 +45,7 @@ from kerv_cli.worlds.demos.lerobot.layout import (
     numbers,
 )
 
-EVERY = 10  # of the images every so many are read for the statistics
+EVERY = 10  # statistics are computed from every tenth image
 
 
 @dataclass
@@ -67,14 +70,14 @@ class Moments:
         """For stats.json."""
         mean = self.total / self.count
         std = np.sqrt(np.maximum(self.squares / self.count - mean**2, 0))
-        named = {"min": self.low, "max": self.high, "mean": mean, "std": std}
+        values = {"min": self.low, "max": self.high, "mean": mean, "std": std}
         shape = self.shape or (-1,)
-        return {name: np.reshape(x, shape).tolist() for name, x in named.items()} | {"count": [self.count]}
+        return {name: np.reshape(x, shape).tolist() for name, x in values.items()} | {"count": [self.count]}
 
 
 @dataclass
 class Export:
-    """A dataset on its way to `folder`."""
+    """The state of an export of `dataset` to `folder`."""
 
     dataset: DemoDataset
     folder: Path
@@ -94,12 +97,12 @@ class Export:
     def columns(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
         """Every numeric column of an episode (n, …), one row per frame."""
         steps = episode.frame_steps
-        felt = len(self.dataset.manifest.observation.proprioception)
+        width = len(self.dataset.manifest.observation.proprioception)
         count = len(steps)
         done = np.zeros(count, dtype=bool)
         done[-1] = True
         return {
-            STATE: episode.states[steps, :felt].astype(np.float32),
+            STATE: episode.states[steps, :width].astype(np.float32),
             ENVIRONMENT: episode.states[steps].astype(np.float32),
             ACTION: episode.labels[steps].astype(np.float32),
             EXECUTED: episode.executed[steps].astype(np.float32),
@@ -111,10 +114,9 @@ class Export:
             "task_index": np.full(count, self.tasks[episode.task]),
         }
 
-    def table(self, episode: DemoEpisode, file: int) -> Any:
-        """The episode's rows as a pyarrow table; its entry in the list of episodes is added. file: where it goes."""
-        import pyarrow as pa
-
+    def table(self, episode: DemoEpisode, file: int) -> pa.Table:
+        """The episode's rows as a pyarrow table; adds the episode's entry to `episodes`. file: number of its data
+        file."""
         columns, arrays = self.columns(episode), {}
         for name, values in columns.items():
             if values.ndim == 2:
@@ -148,8 +150,6 @@ class Export:
 
     def write_data(self, progress: Callable[[int, int], None]) -> None:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
-        import pyarrow.parquet as pq
-
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
             with atomic_path(data_path(self.folder, file)) as temporary:
@@ -198,10 +198,6 @@ class Export:
 
     def write_meta(self) -> None:
         """Tasks, episodes, statistics and, last, the description: without it there is no dataset."""
-        import pandas as pd
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         names = pd.Index([_instruction(task) for task in self.tasks], name="task")
         with atomic_path(self.folder / TASKS) as temporary:
             pd.DataFrame({"task_index": list(self.tasks.values())}, index=names).to_parquet(temporary)
@@ -226,10 +222,10 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
         raise UsageError("two tasks have the same instruction, which LeRobot tells tasks apart by: export them apart")
     tasks = {name: number for number, name in enumerate(names)}
     (folder / INFO).unlink(missing_ok=True)
-    made = Export(dataset, folder, config["camera"]["name"], rate, tasks)
-    made.write_data(progress)
-    made.write_meta()
-    return made
+    result = Export(dataset, folder, config["camera"]["name"], rate, tasks)
+    result.write_data(progress)
+    result.write_meta()
+    return result
 
 
 def _instruction(task: str) -> str:

@@ -1,4 +1,4 @@
-"""Reads a LeRobot dataset of version 3 into demonstrations of ours: tables with images or videos beside them."""
+"""Converts a LeRobot dataset of version 3, tables with images or videos beside them, to demonstrations."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
@@ -64,27 +67,26 @@ class Source:
 
     @property
     def key(self) -> str:
-        """The camera's feature."""
+        """Name of the feature that holds the camera's images."""
         return self.camera if self.camera in self.info["features"] else f"{IMAGES}{self.camera}"
 
     def names(self, feature: str, prefix: str) -> list[str]:
-        """Names of a vector's numbers, as far as the dataset has them."""
-        described = self.info["features"].get(feature)
-        if described is None:
+        """Names of a vector's numbers: the dataset's where they are complete and distinct, else `prefix`_0, …; empty
+        without such a feature."""
+        entry = self.info["features"].get(feature)
+        if entry is None:
             return []
-        names, count = described.get("names"), int(np.prod(described["shape"]))
+        names, count = entry.get("names"), int(np.prod(entry["shape"]))
         if isinstance(names, dict):
             names = next(iter(names.values()), None)
         if not isinstance(names, list) or len(names) != count or len(set(names)) != count:
             return [f"{prefix}_{i}" for i in range(count)]
         return [str(name) for name in names]
 
-    def table(self, episode: Mapping[str, Any]) -> Any:
+    def table(self, episode: Mapping[str, Any]) -> pa.Table:
         """The rows of one episode, in order."""
-        import pyarrow.parquet as pq
-
-        place = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
-        path = self.folder / str(self.info.get("data_path") or DATA).format(**place)
+        indices = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
+        path = self.folder / str(self.info.get("data_path") or DATA).format(**indices)
         try:
             table = pq.read_table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
         except (OSError, ValueError) as error:
@@ -93,14 +95,14 @@ class Source:
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
 
-    def frames(self, episode: Mapping[str, Any], table: Any) -> np.ndarray:
+    def frames(self, episode: Mapping[str, Any], table: pa.Table) -> np.ndarray:
         """(T, h, w, 3) uint8 of one episode."""
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
-        place = {f"{x}_index": int(episode[f"videos/{self.key}/{x}_index"]) for x in ("chunk", "file")}
-        path = self.folder / str(self.info.get("video_path") or VIDEO).format(video_key=self.key, **place)
+        indices = {f"{x}_index": int(episode[f"videos/{self.key}/{x}_index"]) for x in ("chunk", "file")}
+        path = self.folder / str(self.info.get("video_path") or VIDEO).format(video_key=self.key, **indices)
         start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
-        return np.stack(list(_decoded(path, start, rate, len(table))))
+        return np.stack(list(_video_frames(path, start, rate, len(table))))
 
 
 def import_lerobot(
@@ -170,8 +172,8 @@ def _manifest(
     actions: np.ndarray,
     state: int,
 ) -> dict[str, Any]:
-    felt = source.names(STATE, "state")
-    observation = ObservationSpace(tuple(felt[:state]), state, (), (0.0, 0.0, 0.0))
+    proprioception = source.names(STATE, "state")
+    observation = ObservationSpace(tuple(proprioception[:state]), state, (), (0.0, 0.0, 0.0))
     tasks = {task: _summary(rows) for task, rows in entries.items()}
     seeds = [e["seed"] for rows in entries.values() for e in rows]
     config = {
@@ -244,11 +246,11 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 
 def _task_names(tasks: Mapping[int, str]) -> dict[int, str]:
     """task_index -> a name that can be a folder's and a setting's, made from the instruction."""
-    found: dict[int, str] = {}
+    names: dict[int, str] = {}
     for number, text in tasks.items():
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
-        found[number] = name if name not in found.values() else f"{name}-{number}"
-    return found
+        names[number] = name if name not in names.values() else f"{name}-{number}"
+    return names
 
 
 def _identifier(name: str) -> str:
@@ -261,8 +263,6 @@ def _task_of(row: Mapping[str, Any]) -> Any:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    import pyarrow.parquet as pq
-
     try:
         return list(pq.read_table(path).to_pylist())
     except (OSError, ValueError) as error:
@@ -270,8 +270,6 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
     data = cell.get("bytes")
     try:
         with Image.open(io.BytesIO(data) if data else folder / str(cell.get("path"))) as image:
@@ -280,7 +278,7 @@ def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
         raise CheckpointError(f"an image in {folder} cannot be read: {str(error)[:120]}") from error
 
 
-def _decoded(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
+def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
     """`count` frames of a video at start, start + 1 / rate, … seconds, each the nearest one."""
     try:
         import av
@@ -291,13 +289,13 @@ def _decoded(path: Path, start: float, rate: float, count: int) -> Iterator[np.n
             stream = container.streams.video[0]
             if start > 0:
                 container.seek(int(start / float(stream.time_base)), stream=stream)
-            wanted, half = 0, 0.5 / rate
+            done, half = 0, 0.5 / rate
             for frame in container.decode(stream):
-                while wanted < count and float(frame.time) >= start + wanted / rate - half:
+                while done < count and float(frame.time) >= start + done / rate - half:
                     yield frame.to_ndarray(format="rgb24")
-                    wanted += 1
-                if wanted == count:
+                    done += 1
+                if done == count:
                     return
     except (av.error.FFmpegError, OSError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
-    raise CheckpointError(f"{path} ends {count - wanted} frames before its episode does")
+    raise CheckpointError(f"{path} ends {count - done} frames before its episode does")
