@@ -1,4 +1,4 @@
-"""What the device can do, measured: bytes read per second, multiply-adds per second; and the stopwatch of the bench."""
+"""Measured rates of the device, bytes read and multiply-adds per second; and the stopwatch of the bench."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Model:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the trunk's weights."""
+        """Number format of the trunk's weights."""
         dtype: torch.dtype = self.target.head.weight.dtype
         return dtype
 

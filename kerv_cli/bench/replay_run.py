@@ -65,7 +65,7 @@ class Replay:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What was executed where."""
+        """Study, target, device and versions."""
         device = str(self.model.target.device)
         return {
             "study": self.study,

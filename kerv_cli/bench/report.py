@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from kerv_cli.base.files import atomic_path
 from kerv_cli.bench.ceilings import MethodCeiling
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.phases import Phase
@@ -64,9 +67,7 @@ def comparison_rows(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[st
 def plot_roofline(path: Path, title: str, machine: Machine, phases: Sequence[Phase]) -> None:
     """GFLOP/s over operations per byte, both logarithmic: the device's roof and every phase below it."""
     import matplotlib as mpl
-    import numpy as np
 
-    from kerv_cli.base.files import atomic_path
     from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
 
     limited = [phase for phase in phases if phase.floor > 0]

@@ -41,7 +41,7 @@ class Bench:
 
     @property
     def title(self) -> str:
-        """What was measured where, in words."""
+        """Target, number format, device and threads, in words."""
         device = self.model.target.device
         return f"{self.model.name}, {self.dtype}, {stamp(str(device))['device_name']}, {torch.get_num_threads()} thread"
 

@@ -24,7 +24,7 @@ _BOLD: dict[str, tuple[int, str]] = {
     "skip.s_min": (-1, "the smallest s_min"),
     "chunk": (1, "the longest chunk"),
 }
-"""Axis of a study -> the direction in which it saves more forwards, and how its boldest value is called."""
+"""Axis of a study -> the direction in which it saves more forwards, and the name of its boldest value."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def _beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
 
 
 def boldest(axis: str) -> str:
-    """How the choice on this axis is called."""
+    """Name of the choice on this axis, e.g. `the largest r`."""
     return _BOLD.get(axis, (0, "the fastest setting"))[1]
 
 

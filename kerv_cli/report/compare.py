@@ -30,7 +30,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Difference:
-    """Something that the two sides do not share. `None`: that side does not have it."""
+    """A setting, weight, machine or version in which the two sides differ. `None`: that side lacks it."""
 
     key: str
     first: Any
@@ -39,8 +39,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """first, second: names. settings: what differs between them. results: measure -> value of the first, value of the
-    second, difference or ratio, and its 95 % interval where there is one."""
+    """The comparison of two sides. first, second: their names. settings: their differences. results: a row per measure
+    with both values, their difference or ratio, and its 95 % interval where there is one."""
 
     first: str
     second: str

@@ -41,8 +41,8 @@ def confidence_of_a_look(looks: int) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a setting's episodes say at a look. low, high: of its success minus the baseline's, at the look's
-    confidence."""
+    """The answer for a setting at a look. difference: its success minus the baseline's; low, high: the interval at the
+    look's confidence."""
 
     label: str
     verdict: str  # SMALLER, LARGER or OPEN

@@ -18,7 +18,7 @@ from kerv_cli.base.files import atomic_path
 from kerv_cli.base.registry import parts
 
 INK, MUTED, GRID = "#1f2933", "#6b7785", "#e3e8ee"
-COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # told apart when colour-blind
+COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
 STYLE: Any = {
     "figure.constrained_layout.use": True,
     "font.size": 10,

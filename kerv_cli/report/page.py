@@ -57,7 +57,7 @@ def render(
     Args:
         whole, per_task: the study's `study_table` and `per_task_table`.
         figures: HTML elements.
-        files: the tables and plots that were written, to be linked.
+        files: the study's tables and plots; the page links the tables.
     """
     template = Environment(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
@@ -99,7 +99,7 @@ def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str
 
 
 def caution(whole: pd.DataFrame) -> str:
-    """What a reader must know before the numbers; empty where there is nothing."""
+    """Warnings that stand before the numbers, in one line; empty where there is none."""
     rows = rows_of(whole, MICRO)
     privileged = sorted({str(row["target"]) for row in rows if "privileged" in str(row["observation"])})
     clauses = []

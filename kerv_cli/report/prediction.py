@@ -41,8 +41,8 @@ class Predictions:
 
 
 def read_predictions(results: Path, target: str) -> Predictions | None:
-    """The errors in a target's calibration; None without such a target or calibration. They are those of the
-    demonstrations, so the target's weights may have changed since.
+    """The errors in a target's calibration; None without such a target or calibration. The errors depend on the
+    demonstrations alone, so they hold for later weights of the target too.
 
     Raises:
         CheckpointError: the calibration is damaged or of another format.

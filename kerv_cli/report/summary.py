@@ -71,7 +71,7 @@ def _printed(frame: pd.DataFrame) -> Table:
 
 
 def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
-    """What a command prints of a study's table."""
+    """A study's table for the terminal."""
     return SummaryTable(table, averaging)
 
 

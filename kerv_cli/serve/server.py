@@ -37,7 +37,7 @@ class PolicyServer:
 
     @contextlib.contextmanager
     def listening(self, host: str, port: int) -> Iterator[Any]:
-        """The listening server; `serve_forever()` and `shutdown()` are its own. port 0: a free one.
+        """The listening server, with the methods `serve_forever()` and `shutdown()`. port 0: a free one.
 
         Raises:
             UsageError: the address cannot be used. KervError: the package websockets is missing.
@@ -94,8 +94,8 @@ class PolicyServer:
     def reply(
         self, connection: Any, session: Session, message: Any, latencies: Latencies, before: float | None
     ) -> float | None:
-        """Answers one frame -> milliseconds that the answer took, or `before` after an error. before: of the last
-        answer, which is told to the client."""
+        """Answers one frame -> milliseconds that the answer took, or `before` after an error. before: milliseconds of
+        the last answer, which the client gets as `prev_total_ms`."""
         began = time.perf_counter()
         try:
             if not isinstance(message, bytes):

@@ -22,7 +22,7 @@ GRIPPERS: Mapping[str, Gripper] = {
     "signed_inverted": lambda values: np.where(values > 0.5, -1.0, 1.0),
 }
 """How the strict DoFs (a gripper: 0 closed to 1 open) are sent: as they are, or −1 closed and 1 open, or the reverse,
-which LIBERO's simulator wants."""
+which LIBERO's simulator expects."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Session:
         }
 
     def _executed(self, message: Mapping[str, Any]) -> np.ndarray:
-        """The actions that were executed since the last answer: all of it, or as many as `executed` says."""
+        """The actions of the last answer that were executed since: all of them, or the first `executed` ones."""
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):
             raise UsageError(f"{EXECUTED}={str(count)[:40]}: 0 to {len(self.last)} control steps of the last answer")

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.boundary import BoundaryRanges
 from kerv_cli.methods.build import compose
@@ -40,10 +41,7 @@ from kerv_cli.training.predictor_fit import (
 from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
-
-if TYPE_CHECKING:
-    from kerv_cli.engine.decoder import Decoder
-    from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
@@ -98,7 +96,7 @@ class CalibrationRun:
     """`kerv calibrate`: call `load`, then any of `presample`, `boundary` and `skip`, then `finish`, which writes.
 
     Attributes:
-        notes: lines for the user: sections that were not computed now, and whether an earlier run's were kept.
+        notes: lines for the user, one per section that was not computed: why, and whether an earlier one stays.
 
     Raises:
         UsageError: a number out of range, an unknown task. CheckpointError: no such target or demonstrations,
@@ -131,7 +129,7 @@ class CalibrationRun:
         self.notes: list[str] = []
 
     def plan(self) -> str:
-        """One line for --plan: what would be fitted, on what, and where it is written."""
+        """One line for --plan: demonstrations, decodes, boundary windows, skip levels and the file."""
         held_out, proposer = sum(self.chosen.values()), self.settings.proposer.kind
         skip = f"skip levels from {self.datastore}" if self.stored else f"no skip levels: no datastore {self.datastore}"
         return (

@@ -34,7 +34,8 @@ def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> Dem
 
 
 def _one_side(dataset: DemoDataset, chosen: Sequence[int]) -> list[int]:
-    """Of every task the episodes whose first place, as a rule the object, begins at or below the task's median x."""
+    """The episodes in which the observation's first place, as a rule the object, begins at or below its median x over
+    the chosen episodes of the task."""
     places = dataset.manifest.observation.places
     if not places:
         raise UsageError("starts=half: these demonstrations name no place that begins on one side")

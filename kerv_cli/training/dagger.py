@@ -6,7 +6,6 @@ import functools
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import find_target
 from kerv_cli.base.settings import WorldSettings
+from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.build import own_decoder
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.worlds.demos.recording import DemoConfig
@@ -26,7 +26,7 @@ class TargetActor:
     the chunks, drawn by task and seed, the expert acts instead; then the target decodes anew. actions: those of the
     current chunk that are not executed yet."""
 
-    def __init__(self, target: Any, expert_share: float) -> None:
+    def __init__(self, target: Target, expert_share: float) -> None:
         self.decoder = own_decoder(target)
         self.chunk, self.share = target.chunk, expert_share
         self.actions: deque[NDArray[np.float64]] = deque()
@@ -63,8 +63,9 @@ class TargetActor:
 
 
 @functools.lru_cache(maxsize=1)
-def _target_in(folder: Path, sha256: str) -> Any:
+def _target_in(folder: Path, sha256: str) -> Target:
     torch.set_num_threads(1)
+    target: Target
     target, description = load_target(folder)
     if description.sha256 != sha256:
         raise CheckpointError(

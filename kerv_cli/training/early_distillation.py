@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.settings import DrafterSettings, TrainSettings
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.early import EarlyDrafter, choose, padded
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
@@ -53,7 +53,7 @@ class EarlyObservations(Observations):
 
 @torch.inference_mode()
 def teach_early(
-    target: Any,
+    target: ReadableTarget,
     dataset: DemoDataset,
     settings: DrafterSettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
@@ -79,7 +79,7 @@ def teach_early(
 
 
 def _teach_recorded(
-    target: Any, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
+    target: ReadableTarget, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
 ) -> EarlySamples:
     """The decodes of a target of any family that has `pooled`, one observation at a time; arguments as in
     `teach_early`."""

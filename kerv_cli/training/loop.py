@@ -69,7 +69,7 @@ class Progress:
 
 class Loop:
     """Runs a `Job`. folder: holds `resume.safetensors` and `log.csv`. identity: hash of everything that determines the
-    run; another run is never resumed. ranks: this process's place among those that train together."""
+    run; another run is never resumed. ranks: the rank of this process among those that train together."""
 
     def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str, ranks: Ranks = ALONE) -> None:
         self.job, self.settings, self.folder, self.identity, self.ranks = job, settings, folder, identity, ranks

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +14,8 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.methods.calibration_file import Errors
 from kerv_cli.methods.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
 from kerv_cli.training.observations import check_tail
-
-if TYPE_CHECKING:
-    from kerv_cli.worlds.demos.dataset import DemoDataset
-    from kerv_cli.worlds.demos.episode_file import DemoEpisode
+from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 RATIOS = np.logspace(-3, 3, 49)  # q / r that are tried, r = 1
 DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)  # tried by the damped filter

@@ -40,8 +40,8 @@ Progress = Callable[[int, int], None]
 
 
 class Recorder(Skip):
-    """Compares every source's draft with the target, by a forward of its own, and executes the first source's in a
-    random share of the decodes; the others are verified. Not for timing.
+    """Compares every source's draft with the target in an additional forward, and executes the draft of the first
+    source unverified in a random share of the decodes. Its times mean nothing.
 
     rows: the rows of the current episode, one per decode and source. features: its pooled prompts (F,), one per draft
     of the first source, if the settings ask for them.

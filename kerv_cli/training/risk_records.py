@@ -69,7 +69,7 @@ class RiskRecords:
         return rows, list(tensors["features"])
 
     def missing(self, task: str, seeds: Sequence[int]) -> list[int]:
-        """Those of the seeds that are still to be recorded."""
+        """The seeds among `seeds` whose episode is not recorded."""
         return [seed for seed in seeds if self.read(task, seed) is None]
 
     def _columns(self) -> list[str]:

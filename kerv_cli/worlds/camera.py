@@ -35,7 +35,7 @@ _open_cameras: weakref.WeakSet[Camera] = weakref.WeakSet()
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """What a frame shows.
+    """The camera of a frame and its resolution.
 
     Attributes:
         name: one of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.

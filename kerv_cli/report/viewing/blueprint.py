@@ -45,7 +45,7 @@ class EpisodeMeta:
 
     chunk_steps: int  # H
     dofs: tuple[str, ...]  # names of the D degrees of freedom
-    frames: bool  # camera frames were kept
+    frames: bool  # the episode has camera frames
     drafted: bool  # some token was drafted, compensated or skipped
     threshold: bool  # some acceptance rule had a threshold
     signals: tuple[str, ...]  # keys of SIGNALS that some decode has

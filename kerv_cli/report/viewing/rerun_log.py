@@ -88,7 +88,7 @@ def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapp
 
 
 def _levels(record: EpisodeRecord) -> dict[str, float]:
-    """The gate's level, where one decided and some score could reach it."""
+    """The level that the scores of drafts are compared with, where the episode has a single finite one."""
     levels = {d.trust.level for d in record.decodes if d.trust is not None and math.isfinite(d.trust.level)}
     return {"score": levels.pop()} if len(levels) == 1 else {}
 
@@ -318,7 +318,7 @@ def _tables(record: EpisodeRecord, chunks: Chunks, starts: NDArray[np.int64]) ->
 
 
 def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds: Mapping[str, float]) -> list[Entity]:
-    """Series of numbers per decode. A decode without a number has no row; a number that no decode has has no entity."""
+    """Series of numbers per decode. A decode without a value has no row, and a series without rows has no entity."""
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]

@@ -190,7 +190,7 @@ def record(
     Args:
         config: of the recording.
         out: the dataset's folder.
-        on_progress: called with (episodes done, episodes wanted).
+        on_progress: called with (episodes done, episodes in all).
         make_actor: makes the actor that moves the robot in the expert's place.
 
     Returns:

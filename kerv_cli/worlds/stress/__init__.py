@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
 KIND = "stress"
 NEEDED = "needed"
-"""Trait of a kind: what it changes of a world, names of `_MISSING`."""
+"""Trait of a kind: its needs, keys of `_MISSING`."""
 STRESSABLE = "stressable"
-"""Attribute of a world's class: what can be changed of it, names of `_MISSING`."""
+"""Attribute of a world's class: the needs that it meets, keys of `_MISSING`."""
 
 _MISSING = {
     "actions": "its world takes no stress",
@@ -29,7 +29,7 @@ _MISSING = {
     "model": "its world has no MuJoCo model",
     "range": "its world cannot widen the range of initial states",
 }
-"""What a kind may need -> why an environment cannot do it."""
+"""Need of a kind of stress -> why an environment does not meet it."""
 
 
 def build(settings: StressSettings) -> Stress:

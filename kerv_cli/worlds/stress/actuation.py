@@ -32,7 +32,7 @@ class Actuation(Stress):
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         """Draws the gains of the DoFs."""
-        level: Level = level_of(LEVELS, self.level)
+        level = level_of(LEVELS, self.level)
         self._random = Draws(task, seed, self.kind, self.level).random()
         self._loose = ~space.is_strict
         self._low, self._high = np.array(space.low)[self._loose], np.array(space.high)[self._loose]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
 
 Array = NDArray[np.float64]
+L = TypeVar("L")
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Stress:
         """Draws the episode's shift, before its reset. space: of the actions that `act` gets."""
 
     def change(self, model: Any, changes: ModelChanges) -> None:
-        """Changes the MjModel of an episode that was just reset; `changes.keep` is called for an array before it changes."""
+        """Changes the MjModel of an episode that was just reset; `changes.keep` comes before each change."""
 
     def act(self, action: Array, step: int) -> Array:
         """The action (D,) that is executed instead of the clipped `action`. Called once per control step, in order."""
@@ -137,7 +138,7 @@ def objects(model: Any) -> list[int]:
     return [b for b in range(1, model.nbody) if model.body_dofnum[b] > 0 and model.body_rootid[b] not in robots]
 
 
-def level_of(levels: Sequence[Any], level: int) -> Any:
+def level_of(levels: Sequence[L], level: int) -> L:
     """The numbers of level 1 to MOST_STRESS."""
     assert len(levels) == MOST_STRESS
     return levels[level - 1]

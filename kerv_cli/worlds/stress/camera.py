@@ -35,7 +35,7 @@ class CameraJitter(Stress):
 
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Moves and turns every camera."""
-        level: Level = level_of(LEVELS, self.level)
+        level = level_of(LEVELS, self.level)
         random = self._draws.random()
         changes.keep(model.cam_pos, model.cam_quat)
         for camera in range(model.ncam):

@@ -18,7 +18,7 @@ _DEFAULT = 0.5, 0.5, 0.5, 1.0  # rgba of a geom whose colour is its material's
 
 class Colour(Stress):
     """The model's floor, walls and table are painted, each body in one colour. The sky is a texture in the graphics
-    memory and keeps its colour, and so do the robot and what the task is about."""
+    memory and keeps its colour, and so do the robot and the task's objects."""
 
     kind = "colour"
     changes_model = True

@@ -36,7 +36,7 @@ class Light(Stress):
 
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Scales all light, and turns and moves the lamps."""
-        level: Level = level_of(LEVELS, self.level)
+        level = level_of(LEVELS, self.level)
         random, head = self._draws.random(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
         strengths = (*lights, head.ambient, head.diffuse, head.specular)

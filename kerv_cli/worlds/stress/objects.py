@@ -28,8 +28,8 @@ LEVELS = (Level(1.1, 1.6, 1.5, 1.2), Level(1.2, 2.5, 2.0, 1.4), Level(1.3, 4.0, 
 
 class Objects(Stress):
     """Objects are the bodies with joints that no robot moves. Friction is that of all geoms, because a contact has the
-    larger one of its two, and the damping of the objects' joints. Meshes keep their size, and so does what hangs on
-    a hinge or a slide."""
+    larger one of its two, and the damping of the objects' joints. Meshes and objects on a hinge or a slide keep their
+    size."""
 
     kind = "object"
     changes_model = True
@@ -44,7 +44,7 @@ class Objects(Stress):
 
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Scales the objects' size, mass and friction."""
-        level: Level = level_of(LEVELS, self.level)
+        level = level_of(LEVELS, self.level)
         random = self._draws.random()
         size, mass, friction = (either(random, factor) for factor in (level.size, level.mass, level.friction))
         changes.keep(model.geom_friction, model.dof_damping, model.dof_frictionloss, model.dof_invweight0)

@@ -38,7 +38,7 @@ class Sensor(Stress):
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
         """The blurred and noisy image, or the last one of this camera. The random numbers follow from the control step,
         so that repeated calls of a step agree."""
-        level: Level = level_of(LEVELS, self.level)
+        level = level_of(LEVELS, self.level)
         random = self._draws.random(camera, step)
         dropped = random.random() < level.dropped
         if dropped and camera in self._last:

@@ -1,1 +1,1 @@
-"""LeRobot datasets of version 3: written from our demonstrations, read into them (docs/data.md)."""
+"""LeRobot datasets of version 3: demonstrations are exported to them and imported from them (docs/data.md)."""

@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, write_json
@@ -111,11 +114,9 @@ class Export:
             "task_index": np.full(count, self.tasks[episode.task]),
         }
 
-    def table(self, episode: DemoEpisode, file: int) -> Any:
+    def table(self, episode: DemoEpisode, file: int) -> pa.Table:
         """The episode's rows as a pyarrow table; adds the episode's entry to `episodes`. file: number of its data
         file."""
-        import pyarrow as pa
-
         columns, arrays = self.columns(episode), {}
         for name, values in columns.items():
             if values.ndim == 2:
@@ -149,8 +150,6 @@ class Export:
 
     def write_data(self, progress: Callable[[int, int], None]) -> None:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
-        import pyarrow.parquet as pq
-
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
             with atomic_path(data_path(self.folder, file)) as temporary:
@@ -199,10 +198,6 @@ class Export:
 
     def write_meta(self) -> None:
         """Tasks, episodes, statistics and, last, the description: without it there is no dataset."""
-        import pandas as pd
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         names = pd.Index([_instruction(task) for task in self.tasks], name="task")
         with atomic_path(self.folder / TASKS) as temporary:
             pd.DataFrame({"task_index": list(self.tasks.values())}, index=names).to_parquet(temporary)

@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
@@ -80,10 +83,8 @@ class Source:
             return [f"{prefix}_{i}" for i in range(count)]
         return [str(name) for name in names]
 
-    def table(self, episode: Mapping[str, Any]) -> Any:
+    def table(self, episode: Mapping[str, Any]) -> pa.Table:
         """The rows of one episode, in order."""
-        import pyarrow.parquet as pq
-
         indices = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
         path = self.folder / str(self.info.get("data_path") or DATA).format(**indices)
         try:
@@ -94,7 +95,7 @@ class Source:
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
 
-    def frames(self, episode: Mapping[str, Any], table: Any) -> np.ndarray:
+    def frames(self, episode: Mapping[str, Any], table: pa.Table) -> np.ndarray:
         """(T, h, w, 3) uint8 of one episode."""
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
@@ -262,8 +263,6 @@ def _task_of(row: Mapping[str, Any]) -> Any:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    import pyarrow.parquet as pq
-
     try:
         return list(pq.read_table(path).to_pylist())
     except (OSError, ValueError) as error:
@@ -271,8 +270,6 @@ def _rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
     data = cell.get("bytes")
     try:
         with Image.open(io.BytesIO(data) if data else folder / str(cell.get("path"))) as image:
