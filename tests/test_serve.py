@@ -247,7 +247,7 @@ def test_the_decoder_is_told_what_was_executed(policy: tuple[Interface, Decoder]
 def test_grippers(policy: tuple[Interface, Decoder], gripper: str, values: list[float]) -> None:
     from dataclasses import replace
 
-    made = replace(policy[0], gripper=gripper).sent(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
+    made = replace(policy[0], gripper=gripper).converted(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
     np.testing.assert_allclose(made[:, 3], values)
     np.testing.assert_allclose(made[:, 0], [0.3, 0])
 

@@ -34,7 +34,7 @@ class Tracked:
 
 
 def export(run: RunEntry, to: str, folder: Path) -> list[str]:
-    """Hands a run to a tracker, or writes it as CSV -> names of the tracked runs or files. folder: of its data.
+    """Hands a run to a tracker, or writes it as CSV -> names of the runs or files. folder: of the tracker's data.
 
     Raises:
         UnknownName: no such tracker. UsageError: its package is not installed; the message says how to install it.

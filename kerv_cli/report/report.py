@@ -26,8 +26,8 @@ from kerv_cli.report.task_map import has_task_map, task_map
 
 @dataclass(frozen=True)
 class Report:
-    """What `report` wrote. files: paths, in order. tables: study -> its `study_table`. agreement: `agreement_table`
-    with another run of the study."""
+    """Files and tables of a report. files: in the order of writing. tables: study -> its `study_table`. agreement: the
+    `agreement_table` with another run of the study."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
