@@ -24,7 +24,7 @@ from kerv_cli.base.settings import (
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget

@@ -22,7 +22,7 @@ from kerv_cli.base.files import sha256_of, write_folder, write_json
 from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.registry import find
 from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
-from kerv_cli.methods.certification import Certified, certify, episodes_needed
+from kerv_cli.methods.risk.certification import Certified, certify, episodes_needed
 
 FORMAT = 1
 DECODES, FEATURES = "decodes.parquet", "features.npy"
