@@ -24,8 +24,8 @@ from kerv_cli.engine.loss import chunk_loss, target_tokens
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.methods.risk import RiskSkipSettings
-from kerv_cli.methods.risk.certification import certify, episodes_needed, hoeffding_bentkus, p_value
 from kerv_cli.methods.risk.gate import Audit, Evidence, RiskSkip
+from kerv_cli.methods.risk.recording import certify, episodes_needed, hoeffding_bentkus, p_value
 from kerv_cli.methods.risk.scores import Draft
 from kerv_cli.report.risk import auc, coverage
 from kerv_cli.training import risk_recording

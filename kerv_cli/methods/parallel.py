@@ -33,7 +33,8 @@ class ParallelPass(Skip):
     def take(self, chunk: Chunk) -> bool:
         """As `Skip.take`; always."""
         chunk.cache.length = 0
-        self.take_many([chunk], chunk.prompt, lambda rows: chunk.cache)
+        hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
+        chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
 
     def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:

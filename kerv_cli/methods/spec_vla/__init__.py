@@ -1,4 +1,4 @@
-"""Acceptance token by token (docs/methods.md §2.1, §2.3): strict, or Spec-VLA's within one radius. Settings and registration."""
+"""Acceptance token by token, strict or within Spec-VLA's one radius (docs/methods.md §2.1). Settings, registration."""
 
 from __future__ import annotations
 
