@@ -35,7 +35,7 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
 
     from kerv_cli.base.config import compose
     from kerv_cli.base.settings import DrafterSettings, TrainTargetSettings
-    from kerv_cli.methods.eagle import Drafter, save_drafter
+    from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
     from kerv_cli.targets.compact.folder import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary

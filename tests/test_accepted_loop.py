@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, random_prompt, random_target
 
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.acceptance import Acceptance
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.parts import Fixed
+from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.proposers import Stateless
-from kerv_cli.methods.thresholds import Fixed
+from kerv_cli.methods.heisd.rules import ByGroup, ByProposer
+from kerv_cli.methods.spec_vla.rules import Relaxed
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 GROUP_LIMIT, TOKEN_LIMIT = 12, 7
@@ -135,7 +136,9 @@ def assert_same(
         return NearTrees(greedy, name, seed + offset, nodes, spread=4, switching=kind == "hybrid" and not offset)
 
     before, after = (made("retrieval" if seed % 2 else "early", 1) if inside else None), made("drafter", 0)
-    acceptance = Acceptance(space, kind, strict_dofs, GROUP_LIMIT, TOKEN_LIMIT)
+    relaxed, sequence = Relaxed(space, strict_dofs), ByGroup(space, GROUP_LIMIT, TOKEN_LIMIT)
+    rules = {"relaxed": relaxed, "sequence": sequence, "hybrid": ByProposer(sequence, relaxed)}
+    acceptance = rules.get(kind)  # none: strict
     parts = Parts(acceptance, Fixed(r), prefill_draft=before, proposer=after)
     result = Decoder(target, parts).decode_prompt(prompt)
 

@@ -24,12 +24,12 @@ from kerv_cli.base.settings import (
 )
 from kerv_cli.lab.policy import check, decoder_for, identity_of, unseen_tasks
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.datastore import Datastore
-from kerv_cli.methods.eagle import Drafter
-from kerv_cli.methods.early import EarlyDrafter, save_early
-from kerv_cli.methods.learned_score import LearnedScore, save_score
-from kerv_cli.methods.parts import QdrantSearchSettings
-from kerv_cli.methods.risk_file import RiskManifest, save_risk
+from kerv_cli.methods.eagle.drafter import Drafter
+from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+from kerv_cli.methods.retrieval import QdrantSearchSettings
+from kerv_cli.methods.retrieval.datastore import Datastore
+from kerv_cli.methods.risk.recording import RiskManifest, save_risk
+from kerv_cli.methods.risk.scores import LearnedScore, save_score
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild

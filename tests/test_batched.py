@@ -28,6 +28,7 @@ from kerv_cli.bench.sequences import read_study
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab import run
@@ -37,10 +38,9 @@ from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, blocks_of, make_cell
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.together import Wanted, run_together
-from kerv_cli.methods.early import EarlyDrafter
-from kerv_cli.methods.proposers import EarlyProposer
-from kerv_cli.methods.thresholds import Fixed
-from kerv_cli.methods.verify_skip import AlwaysSkip, ParallelPass
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
+from kerv_cli.methods.parallel import ParallelPass
+from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study, study_table

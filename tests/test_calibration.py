@@ -25,11 +25,10 @@ from kerv_cli.base.settings import CalibrateSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.calibrate import calibrate
 from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.record import Round
 from kerv_cli.methods.artifacts import MadeFor
-from kerv_cli.methods.boundary import BoundaryRanges
-from kerv_cli.methods.build import Context
-from kerv_cli.methods.calibration_file import (
+from kerv_cli.methods.calibration import (
     BoundarySection,
     Calibration,
     Demonstrations,
@@ -40,8 +39,11 @@ from kerv_cli.methods.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from kerv_cli.methods.kinematics import PREDICTORS, ActionHistory, Noise
-from kerv_cli.methods.parts import FixedThresholdSettings, KinematicThresholdSettings
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.heisd.boundary import BoundaryRanges
+from kerv_cli.methods.kinematics import KinematicThresholdSettings
+from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise
+from kerv_cli.methods.spec_vla import FixedThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.training.calibration import CalibrationRun, reference_level
 from kerv_cli.training.predictor_fit import (

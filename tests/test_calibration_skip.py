@@ -22,15 +22,9 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.cli.calibrate import calibrate
-from kerv_cli.methods.boundary import BoundaryRanges
-from kerv_cli.methods.calibration_file import (
-    NEVER,
-    Calibration,
-    Variability,
-    load_calibration,
-    save_calibration,
-)
-from kerv_cli.methods.datastore import Datastore, Manifest, Shard
+from kerv_cli.methods.calibration import NEVER, Calibration, Variability, load_calibration, save_calibration
+from kerv_cli.methods.heisd.boundary import BoundaryRanges
+from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels

@@ -21,9 +21,8 @@ from kerv_cli.base.settings import DrafterSettings, PolicySettings, TargetSettin
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.eagle import load_drafter, read_drafter
-from kerv_cli.methods.early import load_early
-from kerv_cli.methods.proposers import DrafterProposer, EarlyProposer
+from kerv_cli.methods.eagle.drafter import DrafterProposer, load_drafter, read_drafter
+from kerv_cli.methods.early.drafter import EarlyProposer, load_early
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width

@@ -14,11 +14,11 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.tree import TokenTree
-from kerv_cli.methods.kinematics import ActionHistory, Hold, Linear
-from kerv_cli.methods.parts import CompensateSettings
-from kerv_cli.methods.proposers import Stateless
-from kerv_cli.methods.rectify import Compensation, assemble
+from kerv_cli.methods.kinematics import CompensateSettings
+from kerv_cli.methods.kinematics.prediction import Compensation, Hold, Linear, assemble
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 D, N = 4, 16

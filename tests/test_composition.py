@@ -13,68 +13,83 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
 from kerv_cli.lab.policy import check as check_rollout
-from kerv_cli.methods import parts as p
-from kerv_cli.methods.build import check, needs
+from kerv_cli.methods.compose import check, needs
+from kerv_cli.methods.eagle import DrafterProposerSettings
+from kerv_cli.methods.heisd import (
+    FusedBoundarySettings,
+    HybridAcceptanceSettings,
+    HybridProposerSettings,
+    RandomBoundarySettings,
+    SequenceAcceptanceSettings,
+    SimilaritySkipSettings,
+)
+from kerv_cli.methods.jacobi import JacobiProposerSettings
+from kerv_cli.methods.kinematics import CompensateSettings, KinematicThresholdSettings, ScheduleThresholdSettings
+from kerv_cli.methods.merged import MergedProposerSettings
+from kerv_cli.methods.retrieval import RetrievalProposerSettings
+from kerv_cli.methods.risk import RiskSkipSettings
+from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
+from kerv_cli.methods.streak import StreakSkipSettings
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {
     "prefill_draft": NoSettings(),
     "proposer": NoSettings(),
     "acceptance": NoSettings("strict"),
-    "threshold": p.FixedThresholdSettings(r=9),
+    "threshold": FixedThresholdSettings(r=9),
     "rectifier": NoSettings("reinfer"),
     "boundary": NoSettings("always"),
     "skip": NoSettings(),
 }
-CHAIN = p.DrafterProposerSettings(depth=15, top_k=1, nodes=15)
-RELAXED = p.RelaxedAcceptanceSettings(strict_dofs=True)
-SKIP = p.SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0)
-K_LEVEL = p.KinematicThresholdSettings(r_min=5, r_max=15, phi=2.0, k_s=None)
-BOUNDARY = p.FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5)
+CHAIN = DrafterProposerSettings(depth=15, top_k=1, nodes=15)
+RELAXED = RelaxedAcceptanceSettings(strict_dofs=True)
+SKIP = SimilaritySkipSettings(s_min=None, max_skips=2, up=0.0, down=0.0)
+K_LEVEL = KinematicThresholdSettings(r_min=5, r_max=15, phi=2.0, k_s=None)
+BOUNDARY = FusedBoundarySettings(alpha=0.5, window=15, f_star=0.5)
 ONE_PASS = {
-    "prefill_draft": p.MergedProposerSettings(sources=["early"], fallback=["hold"], nodes=48, neighbours=1),
+    "prefill_draft": MergedProposerSettings(sources=["early"], fallback=["hold"], nodes=48, neighbours=1),
     "acceptance": RELAXED,
-    "rectifier": p.CompensateSettings(predictor="draft"),
+    "rectifier": CompensateSettings(predictor="draft"),
 }
 PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a default that moves is a preset that moves
     "ar": {},
     "expert": {},  # a policy, no way of decoding
-    "naive_sd": {"proposer": p.DrafterProposerSettings(depth=5, top_k=1, nodes=5)},
+    "naive_sd": {"proposer": DrafterProposerSettings(depth=5, top_k=1, nodes=5)},
     "spec_vla": {"proposer": CHAIN, "acceptance": RELAXED},
-    "jacobi": {"proposer": p.JacobiProposerSettings(depth=0)},
+    "jacobi": {"proposer": JacobiProposerSettings(depth=0)},
     "hold": {"proposer": NoSettings("hold"), "acceptance": RELAXED},
     "kalman_only": {"proposer": NoSettings("kalman"), "acceptance": RELAXED},
     "kerv": {
         "proposer": CHAIN,
         "acceptance": RELAXED,
         "threshold": K_LEVEL,
-        "rectifier": p.CompensateSettings("compensate", "damped", 1, True, 1, 0, -1),
+        "rectifier": CompensateSettings("compensate", "damped", 1, True, 1, 0, -1),
     },
     "kerv_paper": {
-        "proposer": p.DrafterProposerSettings(depth=5, top_k=8, nodes=50),
-        "acceptance": p.RelaxedAcceptanceSettings(strict_dofs=False),
+        "proposer": DrafterProposerSettings(depth=5, top_k=8, nodes=50),
+        "acceptance": RelaxedAcceptanceSettings(strict_dofs=False),
         "threshold": K_LEVEL,
-        "rectifier": p.CompensateSettings("compensate", "kalman", 1, False, 1, 4, -1),
+        "rectifier": CompensateSettings("compensate", "kalman", 1, False, 1, 4, -1),
     },
     "heisd": {
-        "proposer": p.HybridProposerSettings(depth=15, top_k=1, nodes=24, neighbours=3),
-        "acceptance": p.HybridAcceptanceSettings(strict_dofs=True, group_limit=30, token_limit=15),
+        "proposer": HybridProposerSettings(depth=15, top_k=1, nodes=24, neighbours=3),
+        "acceptance": HybridAcceptanceSettings(strict_dofs=True, group_limit=30, token_limit=15),
         "boundary": dataclasses.replace(BOUNDARY, f_star=0.3),
         "skip": SKIP,
     },
     "heisd_paper": {
-        "proposer": p.HybridProposerSettings(depth=5, top_k=8, nodes=50, neighbours=5),
-        "acceptance": p.HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
+        "proposer": HybridProposerSettings(depth=5, top_k=8, nodes=50, neighbours=5),
+        "acceptance": HybridAcceptanceSettings(strict_dofs=False, group_limit=30, token_limit=15),
         "boundary": BOUNDARY,
         "skip": SKIP,
     },
     "retrieval_only": {
-        "proposer": p.RetrievalProposerSettings(neighbours=5, nodes=50),
-        "acceptance": p.SequenceAcceptanceSettings(group_limit=30, token_limit=15),
+        "proposer": RetrievalProposerSettings(neighbours=5, nodes=50),
+        "acceptance": SequenceAcceptanceSettings(group_limit=30, token_limit=15),
     },
     "spec_vla_paper": {
-        "proposer": p.DrafterProposerSettings(depth=5, top_k=8, nodes=50),
-        "acceptance": p.RelaxedAcceptanceSettings(strict_dofs=False),
+        "proposer": DrafterProposerSettings(depth=5, top_k=8, nodes=50),
+        "acceptance": RelaxedAcceptanceSettings(strict_dofs=False),
     },
     "early_unverified": {
         "prefill_draft": NoSettings("early"),
@@ -82,7 +97,7 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "skip": NoSettings("always"),
     },
     "retrieval_unverified": {
-        "prefill_draft": p.RetrievalProposerSettings(),
+        "prefill_draft": RetrievalProposerSettings(),
         "acceptance": RELAXED,
         "skip": NoSettings("always"),
     },
@@ -92,16 +107,16 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "prefill_draft": ONE_PASS["prefill_draft"],
         "proposer": CHAIN,
         "acceptance": RELAXED,
-        "skip": p.StreakSkipSettings(most=8, tolerance=0.05),
+        "skip": StreakSkipSettings(most=8, tolerance=0.05),
     },
     "one_pass_risk": {
         "prefill_draft": NoSettings("early"),
         "proposer": CHAIN,
         "acceptance": RELAXED,
-        "skip": p.RiskSkipSettings(score="odds", epsilon=0.15, delta=0.1, audit=0.05, opening=1),
+        "skip": RiskSkipSettings(score="odds", epsilon=0.15, delta=0.1, audit=0.05, opening=1),
     },
     "parallel": {"skip": NoSettings("parallel")},
-    "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": p.JacobiProposerSettings(depth=0)},
+    "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": JacobiProposerSettings(depth=0)},
 }
 
 
@@ -134,10 +149,10 @@ def test_every_part_of_a_preset_can_be_replaced(method: str) -> None:
     asked = composed(f"method={method}", *words.split(), "boundary=random", "skip=none", "threshold.tau=7")
     replaced = {
         "prefill_draft": NoSettings("hold"),
-        "proposer": p.RetrievalProposerSettings(),
-        "acceptance": p.SequenceAcceptanceSettings(),
-        "threshold": p.ScheduleThresholdSettings(tau=7.0),
-        "boundary": p.RandomBoundarySettings(),
+        "proposer": RetrievalProposerSettings(),
+        "acceptance": SequenceAcceptanceSettings(),
+        "threshold": ScheduleThresholdSettings(tau=7.0),
+        "boundary": RandomBoundarySettings(),
     }
     assert asked.parts() == {**AR, **replaced}
 
@@ -224,7 +239,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
     with pytest.raises(UnknownName, match="unknown prefill_draft 'drafter'"):
         composed("prefill_draft=drafter")
     # a part from elsewhere can still be named in settings that Hydra did not compose
-    method = {**AR, "prefill_draft": p.HybridProposerSettings()}
+    method = {**AR, "prefill_draft": HybridProposerSettings()}
     with pytest.raises(UsageError, match="prefill_draft=hybrid: it reads the target's states"):
         check(method, 0, 4)
 

@@ -9,9 +9,8 @@ import pytest
 from kerv_cli.base import settings as s
 from kerv_cli.base.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import part_of, parts
 from kerv_cli.lab.resolve import resolve
-from kerv_cli.methods.parts import part_of
 
 SCHEMAS = {
     "rollout": s.RolloutSettings,

@@ -26,8 +26,8 @@ from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, Poli
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli import build as command
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
-from kerv_cli.methods.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
-from kerv_cli.methods.parts import QdrantSearchSettings
+from kerv_cli.methods.retrieval import QdrantSearchSettings
+from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import DatastoreBuild, directions, leave_one_out

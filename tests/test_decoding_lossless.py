@@ -20,8 +20,8 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.eagle import Drafter
-from kerv_cli.methods.proposers import DrafterProposer, JacobiProposer
+from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.jacobi.proposer import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget

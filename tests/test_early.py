@@ -17,8 +17,9 @@ from safetensors.torch import load_file
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.engine.history import ActionHistory
 from kerv_cli.methods.artifacts import artifact_folder
-from kerv_cli.methods.early import (
+from kerv_cli.methods.early.drafter import (
     EarlyDrafter,
     choose,
     choose_with_odds,
@@ -27,7 +28,6 @@ from kerv_cli.methods.early import (
     read_early,
     save_early,
 )
-from kerv_cli.methods.kinematics import ActionHistory
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget

@@ -13,13 +13,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.methods.kinematics import (
+from kerv_cli.engine.history import WINDOW, ActionHistory
+from kerv_cli.methods.kinematics.prediction import (
     FILTERS,
     HORIZON,
     PREDICTORS,
-    WINDOW,
     Acceleration,
-    ActionHistory,
     Hold,
     Kalman,
     Linear,

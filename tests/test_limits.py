@@ -16,7 +16,7 @@ from kerv_cli.base.limits import check_settings
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.registry import parts
 from kerv_cli.lab.resolve import resolve
-from kerv_cli.methods.kinematics import MINIMUM
+from kerv_cli.methods.kinematics.prediction import MINIMUM
 
 SCHEMAS = {
     "rollout": s.RolloutSettings,

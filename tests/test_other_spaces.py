@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.cli.app import app
-from kerv_cli.methods.early import EarlyDrafter, save_early
+from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 

@@ -25,12 +25,13 @@ from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import Situation
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.history import ActionHistory
 from kerv_cli.lab.policy import identity_of
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.build import check, needs
-from kerv_cli.methods.build import compose as compose_decoder
-from kerv_cli.methods.kinematics import ActionHistory, Hold
-from kerv_cli.methods.proposers import MergedProposer, PredictionProposer
+from kerv_cli.methods.compose import check, needs
+from kerv_cli.methods.compose import compose as compose_decoder
+from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
+from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 

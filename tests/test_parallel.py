@@ -14,7 +14,7 @@ from kerv_cli.base.settings import RolloutSettings, TargetSettings, TrainDrafter
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.lab.policy import check, decoder_for
-from kerv_cli.methods.verify_skip import ParallelPass
+from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget, Inputs

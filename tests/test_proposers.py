@@ -15,23 +15,17 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.tree import TokenTree
-from kerv_cli.methods.boundary import Random
-from kerv_cli.methods.datastore import Datastore, Manifest, prompt_key
-from kerv_cli.methods.eagle import Drafter
-from kerv_cli.methods.early import EarlyDraft
-from kerv_cli.methods.kinematics import ActionHistory, Hold, Kalman, Linear, Noise
-from kerv_cli.methods.parts import SimilaritySkipSettings
-from kerv_cli.methods.proposers import (
-    DrafterProposer,
-    EarlyProposer,
-    HybridProposer,
-    MergedProposer,
-    PredictionProposer,
-    RetrievalProposer,
-    Stateless,
-)
-from kerv_cli.methods.verify_skip import SkipLevels, VerifySkip
+from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.early.drafter import EarlyDraft, EarlyProposer
+from kerv_cli.methods.heisd import SimilaritySkipSettings
+from kerv_cli.methods.heisd.boundary import Random
+from kerv_cli.methods.heisd.rules import HybridProposer, SkipLevels, VerifySkip
+from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
+from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, RetrievalProposer, prompt_key
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.worlds.metaworld.spec import SPEC
 

@@ -17,9 +17,8 @@ from test_decoding_lossless import decode, plain_greedy
 from test_openvla import imported, kerv, loaded, shown
 from torch import Tensor
 
-from kerv_cli.methods.eagle import load_drafter
-from kerv_cli.methods.proposers import DrafterProposer
-from kerv_cli.methods.public import Convention, PublicDrafter, PublicShape
+from kerv_cli.methods.eagle.drafter import DrafterProposer, load_drafter
+from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.openvla.config import Language
 from kerv_cli.targets.openvla.target import OpenVLATarget
 

@@ -13,8 +13,7 @@ import pytest
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import Part, find, kinds, load, parts, register
-from kerv_cli.methods.parts import METHOD_KINDS, PREFILL, STATES
+from kerv_cli.base.registry import METHOD_KINDS, PREFILL, STATES, Part, find, kinds, load, parts, register
 
 PLUGIN = """
 from dataclasses import dataclass
@@ -58,7 +57,7 @@ def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) 
     assert "\n" not in str(refused.value)
     with pytest.raises(UsageError, match="proposer 'drafter' is registered twice"):
         register(Part("proposer", "drafter", "elsewhere:build"))
-    assert find("proposer", "drafter").build == "kerv_cli.methods.build:drafter"
+    assert find("proposer", "drafter").build == "kerv_cli.methods.eagle.drafter:DrafterProposer.build"
     register(Part("threshold", "mine", "two:build"))  # another kind: another name
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
@@ -94,7 +93,7 @@ def test_every_proposer_says_when_it_can_draft() -> None:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("kerv_cli.methods.parts:nothing_there", "kerv_cli.methods.parts has no nothing_there"),
+        ("kerv_cli.methods.ar:nothing_there", "kerv_cli.methods.ar has no nothing_there"),
         ("kerv_cli.nowhere:build", "kerv_cli.nowhere"),
     ],
 )
@@ -132,7 +131,8 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
         ("not_there", "kerv: plugin not_there cannot be imported (No module named 'not_there')"),
         (
             "collides",
-            "kerv: proposer 'drafter' is registered twice: kerv_cli.methods.build:drafter and collides:build",
+            "kerv: proposer 'drafter' is registered twice: kerv_cli.methods.eagle.drafter:DrafterProposer.build and "
+            "collides:build",
         ),
     ],
 )

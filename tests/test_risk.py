@@ -23,11 +23,10 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.loss import auc, chunk_loss, target_tokens
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import run_episode
-from kerv_cli.methods.audit import Audit, Evidence
-from kerv_cli.methods.certification import certify, episodes_needed, hoeffding_bentkus, p_value
-from kerv_cli.methods.parts import RiskSkipSettings
-from kerv_cli.methods.risk import RiskSkip
-from kerv_cli.methods.scores import Draft
+from kerv_cli.methods.risk import RiskSkipSettings
+from kerv_cli.methods.risk.gate import Audit, Evidence, RiskSkip
+from kerv_cli.methods.risk.recording import certify, episodes_needed, hoeffding_bentkus, p_value
+from kerv_cli.methods.risk.scores import Draft
 from kerv_cli.report.risk import coverage
 from kerv_cli.training import risk_recording
 
@@ -269,7 +268,7 @@ def kerv(*words: str) -> tuple[int, str]:
 def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
     from kerv_cli.base.settings import DrafterSettings
-    from kerv_cli.methods.early import EarlyDrafter, save_early
+    from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
     from kerv_cli.targets.checkpoint import load_target
 
     results = tmp_path_factory.mktemp("risk")

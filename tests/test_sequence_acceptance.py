@@ -16,9 +16,9 @@ from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.engine.acceptance import Acceptance, accept_by_distance, accept_by_group
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.build import Context
-from kerv_cli.methods.proposers import Stateless
+from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 POSITION_GRIPPER = SPEC.actions

@@ -10,17 +10,17 @@ import torch
 from examples.own_target import MockTarget
 from test_unverified import SHOWN, Near
 
-from kerv_cli.engine.acceptance import Acceptance
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.parts import StreakSkipSettings
-from kerv_cli.methods.proposers import MergedProposer
-from kerv_cli.methods.thresholds import Fixed
-from kerv_cli.methods.verify_skip import StreakSkip
+from kerv_cli.engine.parts import Fixed
+from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.spec_vla.rules import Relaxed
+from kerv_cli.methods.streak import StreakSkipSettings
+from kerv_cli.methods.streak.skip import StreakSkip
 
 
 def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:
     skip = StreakSkip(StreakSkipSettings(**settings), source)
-    acceptance = Acceptance(target.actions, "relaxed", strict_dofs=True) if radius else None
+    acceptance = Relaxed(target.actions) if radius else None
     parts = Parts(acceptance, Fixed(radius), prefill_draft=draft or source, skip=skip)
     made = Decoder(target, parts)
     made.reset("t", 0, np.zeros(3))

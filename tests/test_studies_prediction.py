@@ -14,8 +14,8 @@ from kerv_cli.base.settings import StudySettings
 from kerv_cli.lab.plan import plan
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.artifacts import MadeFor
-from kerv_cli.methods.calibration_file import Calibration, Demonstrations, save_calibration
-from kerv_cli.methods.kinematics import FILTERS, Noise
+from kerv_cli.methods.calibration import Calibration, Demonstrations, save_calibration
+from kerv_cli.methods.kinematics.prediction import FILTERS, Noise
 from kerv_cli.report.prediction import (
     calibrated_targets,
     predicting_targets,

@@ -15,8 +15,8 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RolloutSettings
-from kerv_cli.methods.build import Context
-from kerv_cli.methods.thresholds import Threshold
+from kerv_cli.engine.parts import Threshold
+from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 levels = st.floats(0, 50)

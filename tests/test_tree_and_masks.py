@@ -14,7 +14,7 @@ from kerv_cli.engine.acceptance import accept_by_distance
 from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.tree import ROOT, TokenTree, merge, visible_in_prefill, visible_in_verification
 from kerv_cli.engine.unread import ancestors
-from kerv_cli.methods.proposers import rows_of
+from kerv_cli.methods.merged.proposer import rows_of
 from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.trunk import Trunk
 

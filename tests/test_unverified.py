@@ -16,10 +16,12 @@ from test_proposers import stored
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.kinematics import Hold
-from kerv_cli.methods.parts import SimilaritySkipSettings
-from kerv_cli.methods.proposers import ChainProposer, PredictionProposer, RetrievalProposer
-from kerv_cli.methods.verify_skip import AlwaysSkip, SkipLevels, VerifySkip
+from kerv_cli.engine.proposer import ChainProposer
+from kerv_cli.methods.heisd import SimilaritySkipSettings
+from kerv_cli.methods.heisd.rules import SkipLevels, VerifySkip
+from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
+from kerv_cli.methods.retrieval.datastore import RetrievalProposer
+from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 PAUSE = 0.03

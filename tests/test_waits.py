@@ -14,19 +14,14 @@ from test_proposers import HELD, D, situation, stored
 
 from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.boundary import Always
-from kerv_cli.methods.eagle import Drafter
-from kerv_cli.methods.early import EarlyDrafter
-from kerv_cli.methods.kinematics import Hold, Kalman, Noise
-from kerv_cli.methods.proposers import (
-    DrafterProposer,
-    EarlyProposer,
-    HybridProposer,
-    JacobiProposer,
-    MergedProposer,
-    PredictionProposer,
-    RetrievalProposer,
-)
+from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
+from kerv_cli.methods.heisd.boundary import Always
+from kerv_cli.methods.heisd.rules import HybridProposer
+from kerv_cli.methods.jacobi.proposer import JacobiProposer
+from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Noise, PredictionProposer
+from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.methods.retrieval.datastore import RetrievalProposer
 from kerv_cli.targets.compact.trunk import LayerStack
 
 CHUNK = 2

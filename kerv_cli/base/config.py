@@ -20,8 +20,8 @@ from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.limits import check_settings
+from kerv_cli.base.registry import PART_GROUPS, PREFILL, part_of
 from kerv_cli.base.settings import DERIVED_FROM
-from kerv_cli.methods.parts import PART_GROUPS, PREFILL, part_of
 
 T = TypeVar("T")
 

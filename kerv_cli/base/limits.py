@@ -11,6 +11,10 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from kerv_cli.base.errors import UnknownName, UsageError
 
+MOST_TOKENS = 65_536  # of a draft or its tree
+MOST_BINS = 65_536
+MOST_DECODES = 1_000_000  # of an episode, in which a setting may count
+
 PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
 """Names of folders below `results`: no separators, not hidden, never `..`."""
 

@@ -1,8 +1,9 @@
 """What kerv is put together from: parts of a method, artifacts, targets, environments and executors, by kind and name.
 
-Names, settings and needs are known without importing torch or MuJoCo. `build` names a function, `module:function`,
-whose module is imported when the part is built. Everything that depends on which parts there are derives from here:
-what a method loads, the identity of its results, which compositions are refused, completion, `--cfg`, colours.
+Names, settings and needs are known without importing torch or MuJoCo. `build` names what makes the part,
+`module:function` or `module:Class.method`, whose module is imported when the part is built. Everything that depends on
+which parts there are derives from here: what a method loads, the identity of its results, which compositions are
+refused, completion, `--cfg`, colours.
 
 A package adds parts by an entry point of the group `kerv.parts`, a file by `KERV_PLUGINS=module,…`: the module is
 imported and registers its parts.
@@ -23,6 +24,36 @@ from kerv_cli.base.limits import check_settings
 
 PLUGINS = "KERV_PLUGINS"
 
+OWN = (
+    "kerv_cli.worlds.registration",
+    "kerv_cli.targets.registration",
+    "kerv_cli.methods.ar",
+    "kerv_cli.methods.spec_vla",
+    "kerv_cli.methods.eagle",
+    "kerv_cli.methods.early",
+    "kerv_cli.methods.kinematics",
+    "kerv_cli.methods.parallel",
+    "kerv_cli.methods.streak",
+    "kerv_cli.methods.risk",
+    "kerv_cli.methods.unverified",
+    "kerv_cli.methods.retrieval",
+    "kerv_cli.methods.heisd",
+    "kerv_cli.methods.jacobi",
+    "kerv_cli.methods.merged",
+    "kerv_cli.lab.executors.registration",
+)
+"""Modules that register kerv's own parts when they are imported, as plugins do; none imports anything heavy. Messages
+list parts in this order."""
+
+METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
+"""The parts of a method, in the order in which a decode uses them."""
+
+PART_GROUPS = (*METHOD_KINDS, "datastore")
+"""Settings of a rollout whose choices are parts; YAML files in conf/<group>/ are further choices."""
+
+PREFILL, STATES = "prefill", "states"
+"""When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
+
 
 @dataclass
 class NoSettings:
@@ -36,12 +67,18 @@ def nothing(settings: Any) -> tuple[str, ...]:
     return ()
 
 
+def reads(*kinds: str) -> Callable[[Any], tuple[str, ...]]:
+    """`Part.needs` of a part that needs these artifacts, whatever its settings."""
+    return lambda settings: kinds
+
+
 @dataclass(frozen=True)
 class Part:
     """One choice among the parts of a kind.
 
     kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
-    environment, stress or executor. build: `module:function`; its arguments are documented where the kind is used.
+    environment, stress or executor. build: `module:function` or `module:Class.method`; its arguments are documented
+    where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
     settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
     and timeline.
@@ -89,19 +126,20 @@ def register(part: Part) -> Part:
 
 
 def load(name: str) -> Any:
-    """Imports the object that `module:attribute` names.
+    """Imports the object that `module:attribute` or `module:attribute.attribute` names.
 
     Raises:
         UsageError: no such module or attribute.
     """
     module, _, attribute = name.partition(":")
     try:
-        found = importlib.import_module(module)
+        imported = importlib.import_module(module)
     except ImportError as error:
         raise UsageError(f"{module} cannot be imported: {error}") from error
-    if not hasattr(found, attribute):
-        raise UsageError(f"{module} has no {attribute}")
-    return getattr(found, attribute)
+    try:
+        return functools.reduce(getattr, attribute.split("."), imported)
+    except AttributeError:
+        raise UsageError(f"{module} has no {attribute}") from None
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
@@ -114,6 +152,15 @@ def find(kind: str, name: str, what: str = "") -> Part:
     if name not in known:
         raise UnknownName(what or kind, name, known)
     return known[name]
+
+
+def part_of(group: str, name: str) -> Part:
+    """The part that a group of settings chooses; an in-prefill draft's part is an ordinary proposer.
+
+    Raises:
+        UnknownName: there is none.
+    """
+    return find("proposer" if group == "prefill_draft" else group, name, f"{group}.kind")
 
 
 def parts(kind: str) -> Mapping[str, Part]:
@@ -135,7 +182,8 @@ def load_plugins() -> None:
     Raises:
         UsageError: a plugin that cannot be imported.
     """
-    importlib.import_module("kerv_cli.methods.parts")
+    for name in OWN:
+        importlib.import_module(name)
     named = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
     for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *named]:
         try:

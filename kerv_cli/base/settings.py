@@ -5,21 +5,28 @@ Nothing heavy is imported here: a wrong override is answered before torch or MuJ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from kerv_cli.base import manifests
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, limits, number
-from kerv_cli.base.registry import NoSettings, find
-from kerv_cli.methods import parts
+from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, find, part_of
 
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
 
 MOST_STRESS = 4
 """The highest level of every kind of stress."""
+
+LOSS_SCALE = 0.1
+"""ε_a: mean abs difference of two chunks that counts as a whole loss, normalised action units."""
+
+
+def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
+    """Makes the settings of the part `name`: the default of a group."""
+    return lambda: find(kind, name).settings(kind=name)
 
 
 @dataclass
@@ -104,7 +111,7 @@ class RuntimeSettings:
     threads: int = number(1, 1, 256)  # torch threads of each process
     executor: str = "local"  # sweeps: what runs the blocks: local (processes here) | slurm | ray
     workers: int = number(1, 1, 4096)  # sweeps: blocks that run at the same time
-    executor_options: dict[str, Any] = field(default_factory=dict)  # see SlurmOptions, RayOptions in parts.py
+    executor_options: dict[str, Any] = field(default_factory=dict)  # see lab/executors/registration.py
 
 
 @dataclass(kw_only=True)
@@ -154,22 +161,22 @@ class PolicySettings:
 
 @dataclass
 class RolloutSettings(TaskSettings):
-    """`kerv rollout`: episodes of one method. Its parts are settings of the classes in kerv_cli/methods/parts.py."""
+    """`kerv rollout`: episodes of one method. Its parts are settings of the classes in kerv_cli/methods."""
 
     episodes: int = number(3, 1, 1_000_000)  # per task
     # first seed; episode i uses seed + i in every setting: that is the pairing
     seed: int = number(EVALUATION_SEED, 0, 2**31 - 1)
     policy: PolicySettings = field(default_factory=PolicySettings)
     method: str = "ar"  # name of the composition; its parts follow
-    prefill_draft: Any = field(default_factory=NoSettings)  # a proposer, before the prefill
-    proposer: Any = field(default_factory=NoSettings)
-    acceptance: Any = field(default_factory=lambda: NoSettings("strict"))
-    threshold: Any = field(default_factory=parts.FixedThresholdSettings)
-    rectifier: Any = field(default_factory=lambda: NoSettings("reinfer"))
-    boundary: Any = field(default_factory=lambda: NoSettings("always"))
-    skip: Any = field(default_factory=NoSettings)
+    prefill_draft: Any = field(default_factory=chosen("proposer"))  # a proposer, before the prefill
+    proposer: Any = field(default_factory=chosen("proposer"))
+    acceptance: Any = field(default_factory=chosen("acceptance", "strict"))
+    threshold: Any = field(default_factory=chosen("threshold", "fixed"))
+    rectifier: Any = field(default_factory=chosen("rectifier", "reinfer"))
+    boundary: Any = field(default_factory=chosen("boundary", "always"))
+    skip: Any = field(default_factory=chosen("skip"))
     chunk: int = number(0, 0, 1024)  # H, control steps decoded at once; 0: as many as the target was trained for
-    datastore: Any = field(default_factory=lambda: NoSettings("exact"))
+    datastore: Any = field(default_factory=chosen("datastore", "exact"))
     world: RolloutWorldSettings = field(default_factory=RolloutWorldSettings)
     rollout: TimingSettings = field(default_factory=TimingSettings)
     deviation_every: int = number(0, 0, 1_000_000)  # decodes between two deviation samples; 0: never
@@ -182,7 +189,7 @@ class RolloutSettings(TaskSettings):
 
     def parts(self) -> dict[str, Any]:
         """Kind -> settings, for every part of the method."""
-        return {kind: getattr(self, kind) for kind in parts.METHOD_KINDS}
+        return {kind: getattr(self, kind) for kind in METHOD_KINDS}
 
 
 @dataclass
@@ -197,19 +204,19 @@ class ServeSettings(RunSettings):
     task_name: str = ""  # task=NAME: the task, for parts whose levels differ between tasks
     policy: PolicySettings = field(default_factory=PolicySettings)
     method: str = "ar"
-    prefill_draft: Any = field(default_factory=NoSettings)
-    proposer: Any = field(default_factory=NoSettings)
-    acceptance: Any = field(default_factory=lambda: NoSettings("strict"))
-    threshold: Any = field(default_factory=parts.FixedThresholdSettings)
-    rectifier: Any = field(default_factory=lambda: NoSettings("reinfer"))
-    boundary: Any = field(default_factory=lambda: NoSettings("always"))
-    skip: Any = field(default_factory=NoSettings)
+    prefill_draft: Any = field(default_factory=chosen("proposer"))
+    proposer: Any = field(default_factory=chosen("proposer"))
+    acceptance: Any = field(default_factory=chosen("acceptance", "strict"))
+    threshold: Any = field(default_factory=chosen("threshold", "fixed"))
+    rectifier: Any = field(default_factory=chosen("rectifier", "reinfer"))
+    boundary: Any = field(default_factory=chosen("boundary", "always"))
+    skip: Any = field(default_factory=chosen("skip"))
     chunk: int = number(0, 0, 1024)
-    datastore: Any = field(default_factory=lambda: NoSettings("exact"))
+    datastore: Any = field(default_factory=chosen("datastore", "exact"))
 
     def parts(self) -> dict[str, Any]:
         """Kind -> settings, for every part of the method."""
-        return {kind: getattr(self, kind) for kind in parts.METHOD_KINDS}
+        return {kind: getattr(self, kind) for kind in METHOD_KINDS}
 
 
 @dataclass
@@ -499,9 +506,9 @@ class CalibrateSettings(TaskSettings):
     # positions; each has ranges of its own
     boundary_windows: list[int] = field(default_factory=lambda: [5, 15, 30], metadata=limits(3, 10_000))
     decodes: int = number(60, 0, 100_000)  # pre-sampling, per task: decodes whose median variability is K_S; 0: none
-    proposer: Any = field(default_factory=parts.DrafterProposerSettings)  # pre-sampling decodes with these parts
-    acceptance: Any = field(default_factory=parts.RelaxedAcceptanceSettings)
-    threshold: Any = field(default_factory=parts.FixedThresholdSettings)
+    proposer: Any = field(default_factory=chosen("proposer", "drafter"))  # pre-sampling decodes with these parts
+    acceptance: Any = field(default_factory=chosen("acceptance", "relaxed"))
+    threshold: Any = field(default_factory=chosen("threshold", "fixed"))
 
     def check_together(self, prefix: str) -> None:
         """Raises UsageError without a window, or for a pre-sampling that drafts nothing."""
@@ -522,7 +529,7 @@ class CalibrateRiskSettings(TaskSettings):
     sources: list[str] = field(default_factory=lambda: ["early"])  # what drafts; the first one's drafts are executed
     scores: list[str] = field(default_factory=lambda: ["odds", "entropy", "familiarity", "steadiness"])
     unverified: float = number(0.8, 0, 1)  # share of the decodes in which the draft is executed, else verified first
-    scale: float = number(parts.LOSS_SCALE, above=0, most=1e6)  # ε_a, normalised action units
+    scale: float = number(LOSS_SCALE, above=0, most=1e6)  # ε_a, normalised action units
     epsilon: float = number(0.15, above=0, most=0.99)  # of the table that is printed
     delta: float = number(0.1, above=0, most=0.5)
     features: bool = False  # keep the pooled prompts, for `kerv train score`
@@ -548,10 +555,10 @@ def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSe
         CheckpointError: not such settings. UnknownName: a part that is not registered here.
     """
     settings = manifests.read(RolloutSettings, dict(plain), "a stored setting", tolerant)
-    for group in parts.PART_GROUPS:
+    for group in PART_GROUPS:
         value = getattr(settings, group)
         if not isinstance(value, Mapping):
             continue  # a kind of part that is younger than these settings: its default
-        schema = parts.part_of(group, value["kind"]).settings
+        schema = part_of(group, value["kind"]).settings
         setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}", tolerant))
     return settings

@@ -26,7 +26,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
 from kerv_cli.bench.machine import median_seconds
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.eagle import Drafter
+from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact.packed import FastLinear, pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, BlockedLinear, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget

@@ -11,7 +11,7 @@ import torch
 from kerv_cli.bench.machine import Machine, measure_machine, timed
 from kerv_cli.bench.model import Model
 from kerv_cli.engine.transfer import read
-from kerv_cli.methods.eagle import DraftState, draft_chain, observe
+from kerv_cli.methods.eagle.drafter import DraftState, draft_chain, observe
 
 Seen = np.ndarray | torch.Tensor | None
 """The argument `seen` of `Target.forward`: which tokens of a draft each of its tokens attends to; None: a chain."""

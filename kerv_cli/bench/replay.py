@@ -16,7 +16,7 @@ from kerv_cli.bench.sequences import Recorded
 from kerv_cli.engine.cost import DRAFTER, DecodeSequence, Forward
 from kerv_cli.engine.tree import TokenTree, visible_in_verification
 from kerv_cli.engine.unread import Unread
-from kerv_cli.methods.eagle import draft_tree
+from kerv_cli.methods.eagle.drafter import draft_tree
 
 _SPARE = 8
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from kerv_cli.methods.calibration_file import Calibration
+    from kerv_cli.methods.calibration import Calibration
 
 
 RISK, PLOT = "risk", "coverage.png"

@@ -4,7 +4,8 @@ go to the smaller summed distance, then to the node proposed first."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Protocol
 
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.tree import ROOT, TokenTree
@@ -92,39 +93,33 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
 
-@dataclass(frozen=True)
-class Acceptance:
-    """An acceptance rule for one action space.
-
-    kind: strict, relaxed, sequence or hybrid. strict_dofs: the space's strict DoFs must match. group_limit,
-    token_limit: of `sequence`, bins.
-    """
-
-    space: ActionSpace
-    kind: str = "strict"
-    strict_dofs: bool = True
-    group_limit: int = 0
-    token_limit: int = 0
+class Acceptance(Protocol):
+    """An acceptance rule: which nodes of a draft are as good as the target's tokens."""
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """The rule for drafts of `proposer`: under `hybrid`, `sequence` for retrieved ones and `relaxed` for others."""
-        if self.kind != "hybrid":
-            return self
-        return replace(self, kind="sequence" if proposer == "retrieval" else "relaxed")
+        """The rule for drafts of `proposer`."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Largest accepted distance per DoF, bins (D,): 0 for `strict`, `token_limit` for `sequence`, `r` otherwise; 0
-        for strict DoFs under `sequence` and `strict_dofs`."""
-        if self.kind == "strict":
-            return (0,) * self.space.dofs
-        limit = self.token_limit if self.kind == "sequence" else r
-        exact = self.strict_dofs or self.kind == "sequence"
-        return tuple(0 if exact and strict else limit for strict in self.space.is_strict)
+        """Largest accepted distance per DoF at radius r, bins (D,)."""
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
         """The longest accepted path; arguments as `accept_by_distance`, r in bins."""
-        limits = self.limits(r)
-        if self.kind == "sequence":
-            groups = {"group_limit": self.group_limit, "bounds": self.space.bounds}
-            return accept_by_group(tree, target_tokens, start, limits, **groups)  # type: ignore[arg-type]
-        return accept_by_distance(tree, target_tokens, start, limits)
+
+
+@dataclass(frozen=True)
+class Strict:
+    """A draft token must equal the target's: lossless. Base of rules with other limits."""
+
+    space: ActionSpace
+
+    def of_drafts_from(self, proposer: str) -> Acceptance:
+        """The same for all."""
+        return self
+
+    def limits(self, r: int) -> tuple[int, ...]:
+        """As `Acceptance.limits`: all zero."""
+        return (0,) * self.space.dofs
+
+    def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
+        """As `Acceptance.judge`: by distance."""
+        return accept_by_distance(tree, target_tokens, start, self.limits(r))

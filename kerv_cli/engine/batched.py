@@ -7,52 +7,20 @@ Only methods whose every decode is the same sequence of forwards can be batched:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, deviation, record_of
+from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.parts import TakesMany
 from kerv_cli.engine.protocol import Cache
-from kerv_cli.engine.record import PARALLEL, UNTIMED, DecodeRecord, Round
-from kerv_cli.methods.kinematics import ActionHistory
-from kerv_cli.methods.proposers import EarlyProposer
-from kerv_cli.methods.verify_skip import ParallelPass
-
-_BATCHED = {
-    ("none", "none", "none"): "ar",
-    ("early", "none", "always"): "early_unverified",
-    ("none", "none", "parallel"): "parallel",
-}
-"""Kinds of prefill_draft, proposer and skip -> the method that is made of them."""
-
-
-def check_batch(parts: Mapping[str, Any], method: str, batch: int) -> None:
-    """Refuses more than one episode at a time for methods that cannot be batched. parts: kind -> settings.
-
-    Raises:
-        UsageError: another method, or a threshold that follows one episode.
-    """
-    kinds = parts["prefill_draft"].kind, parts["proposer"].kind, parts["skip"].kind
-    if batch == 1:
-        return
-    if kinds not in _BATCHED:
-        *names, last = _BATCHED.values()
-        raise UsageError(
-            f"rollout.batch={batch} with method={method}: {', '.join(names)} and {last} alone decode several episodes "
-            "at once, leave it out"
-        )
-    if kinds[0] != "none" and parts["threshold"].kind != "fixed":
-        raise UsageError(
-            f"rollout.batch={batch} with threshold={parts['threshold'].kind}: its radius follows one episode's "
-            "decodes, use threshold=fixed"
-        )
+from kerv_cli.engine.record import UNTIMED, DecodeRecord, Round
 
 
 class Lane:
@@ -88,7 +56,7 @@ class BatchDecoder:
         """decoder: of a method that `check_batch` accepts. deviation_every: as in RolloutSettings."""
         self.decoder, self.target, self.every = decoder, decoder.target, deviation_every
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
-        self.draft, self.skip = decoder.parts.prefill_draft, decoder.parts.skip
+        self.skip = decoder.parts.skip
         self._caches: dict[int, Cache] = {}
 
     def lane(self) -> Lane:
@@ -127,10 +95,8 @@ class BatchDecoder:
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
             group = [chunk for chunk in chunks if chunk.prompt_length == length]
             prompt = torch.cat([chunk.prompt for chunk in group])
-            if isinstance(self.skip, ParallelPass):
-                _parallel(group, self._parallel_tokens(prompt))
-            elif isinstance(self.draft, EarlyProposer):
-                self._drafted(group, prompt, self.draft)
+            if isinstance(self.skip, TakesMany):
+                self.skip.take_many(group, prompt, self._cache)
             else:
                 _one_by_one(group, self._tokens(prompt))
 
@@ -147,24 +113,11 @@ class BatchDecoder:
         tokens: list[list[int]] = torch.stack(found, 1).tolist()
         return tokens
 
-    def _parallel_tokens(self, prompt: Tensor) -> list[list[int]]:
-        target: Any = self.target
-        hidden = target.parallel_pass(prompt, self._cache(len(prompt)))
-        tokens: list[list[int]] = target.head(hidden[:, : self._size]).argmax(-1).tolist()
-        return tokens
-
-    def _drafted(self, chunks: Sequence[Chunk], prompt: Tensor, draft: EarlyProposer) -> None:
-        """Takes the early drafter's chunks, unverified."""
-        histories = [chunk.situation.history.values() for chunk in chunks]
-        found = draft.early.tokens_of(draft.target.pooled(prompt), histories, max(self.limits, default=0))
-        for chunk, tokens in zip(chunks, found, strict=True):
-            chunk.skip(tokens, draft.name)
-
     def _autoregressive(self, chunks: Sequence[Chunk]) -> list[np.ndarray | None]:
         """The actions (H, D) that autoregressive decoding would have chosen for each chunk; None where it decoded
         them."""
         found: list[np.ndarray | None] = [None] * len(chunks)
-        if self.draft is None and self.skip is None:
+        if self.skip is None:
             return found
         space = self.target.actions
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
@@ -196,9 +149,3 @@ def _one_by_one(chunks: Sequence[Chunk], found: Sequence[Sequence[int]]) -> None
         for start, token in enumerate(tokens):
             mode = "decode" if start else "prefill"
             chunk.commit(Round(mode, "none", start, (), (token,), 0, 1, 0, ()), [token])
-
-
-def _parallel(chunks: Sequence[Chunk], found: Sequence[Sequence[int]]) -> None:
-    """Commits tokens as a parallel target's pass does."""
-    for chunk, tokens in zip(chunks, found, strict=True):
-        chunk.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, chunk.size, 0, ()), tokens)

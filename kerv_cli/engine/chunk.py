@@ -1,4 +1,4 @@
-"""What the parts of a decode share: the chunk, the situation before it, the clock; the protocols of proposers."""
+"""What the parts of a decode share: the chunk, the situation before it, the clock."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,12 +14,11 @@ from torch import Tensor
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.protocol import Cache
-from kerv_cli.engine.record import PHASES, Round, Trust
-from kerv_cli.engine.tree import TokenTree
-from kerv_cli.engine.unread import Unread
-from kerv_cli.methods.boundary import Choice
-from kerv_cli.methods.kinematics import ActionHistory
+from kerv_cli.engine.record import PARALLEL, PHASES, Round, Trust
+
+Mode = Literal["retrieval", "drafter"]
 
 
 class Clock:
@@ -97,6 +96,14 @@ class Rejection:
     target: tuple[int, ...] = ()
 
 
+@dataclass(frozen=True)
+class Choice:
+    """A boundary's decision: which side drafts, and F where the decision used it."""
+
+    mode: Mode
+    metric: float | None = None
+
+
 class Chunk:
     """The N tokens of one decode. Only its own methods change what is committed; the parts of a method read it.
 
@@ -171,6 +178,10 @@ class Chunk:
         self.tokens = list(tokens[: self.size])
         self.rounds.append(Round("skip", proposer, 0, tuple(self.tokens), (), self.size, self.size, 0, ()))
 
+    def commit_at_once(self, tokens: Sequence[int]) -> None:
+        """Commits all N tokens after one pass of a parallel target."""
+        self.commit(Round(PARALLEL, "none", 0, (), tuple(tokens), 0, self.size, 0, ()), tokens)
+
     def close(self, values: np.ndarray, with_target_token: bool) -> None:
         """Ends the chunk with values (steps, D), normalised: its committed tokens, then predictions. with_target_token:
         whether the target token at the rejected position stays committed."""
@@ -179,54 +190,3 @@ class Chunk:
             self.rounds[-1] = self.rounds[-1].without_bonus()
         del self.tokens[values.size :]
         self.closed = values
-
-
-class DraftsChunks(Protocol):
-    """A source of merged drafts: drafts whole chunks without the target's hidden states."""
-
-    @property
-    def name(self) -> str:
-        """As in the record, e.g. `early`."""
-
-    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
-        it has no draft."""
-
-    def is_sure(self, chunk: Chunk) -> bool:
-        """Whether it expects its first chain to be accepted whole."""
-
-
-class Proposer(Protocol):
-    """Drafts a tree behind the committed tokens."""
-
-    @property
-    def name(self) -> str:
-        """As in the record, e.g. `drafter`."""
-
-    @property
-    def needs_states(self) -> bool:
-        """Whether it reads the target's hidden states, so that it cannot draft before the prefill."""
-
-    @property
-    def nodes(self) -> int:
-        """Most nodes of its trees, for which the cache has room; 0: as many as the chunk has tokens."""
-
-    def begin(self, chunk: Chunk) -> None:
-        """Called once per chunk, when the prompt is encoded and the first tokens are committed."""
-
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
-        """A tree of depth ≤ `depth`; an empty one where it has no draft. One that lies on the device is read together
-        with the target's tokens."""
-
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
-        target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those
-        behind rejected nodes included."""
-
-
-@runtime_checkable
-class Asks(Protocol):
-    """A proposer that needs numbers of the encoded prompt on the host."""
-
-    def ask(self, chunk: Chunk) -> None:
-        """Called before the prefill: adds to `chunk.asked` what is to be read with its tokens."""

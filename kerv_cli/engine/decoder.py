@@ -11,19 +11,16 @@ from torch import Tensor
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.acceptance import Acceptance
-from kerv_cli.engine.chunk import Asks, Chunk, Clock, Proposer, Rejection, Situation, steps_of
+from kerv_cli.engine.acceptance import Acceptance, Strict
+from kerv_cli.engine.chunk import Chunk, Clock, Rejection, Situation, steps_of
+from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
+from kerv_cli.engine.proposer import Asks, Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
 from kerv_cli.engine.transfer import read, upload
-from kerv_cli.engine.tree import TokenTree, visible_in_prefill
+from kerv_cli.engine.tree import EMPTY, TokenTree, visible_in_prefill
 from kerv_cli.engine.unread import Unread
-from kerv_cli.methods.boundary import Boundary
-from kerv_cli.methods.kinematics import ActionHistory
-from kerv_cli.methods.proposers import EMPTY
-from kerv_cli.methods.rectify import Compensation
-from kerv_cli.methods.thresholds import Fixed, Threshold
-from kerv_cli.methods.verify_skip import Skip
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Parts:
     threshold: Threshold | None = None  # None: r = 0
     prefill_draft: Proposer | None = None
     proposer: Proposer | None = None
-    rectifier: Compensation | None = None
+    rectifier: Rectifier | None = None
     boundary: Boundary | None = None
     skip: Skip | None = None
 
@@ -75,7 +72,7 @@ class Decoder:
         if draft is not None and draft.needs_states:
             raise UsageError(f"prefill_draft '{draft.name}' reads the target's states, which come after it")
         self.steps = steps_of(chunk, target.chunk)
-        self.acceptance = self.parts.acceptance or Acceptance(target.actions)
+        self.acceptance: Acceptance = self.parts.acceptance or Strict(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
         size = self.steps * target.actions.dofs
         nodes = max((p.nodes for p in (draft, self.parts.proposer) if p is not None), default=0)
@@ -314,7 +311,7 @@ class Decoder:
         if rectifier is None or last.accepted == len(last.drafted):
             return
         # where the target's token filled the last place nothing is missing, if it may be used
-        if chunk.left or not rectifier.settings.use_target_token:
+        if chunk.left or not rectifier.uses_target_token:
             rectifier.close(chunk)
 
 

@@ -77,6 +77,9 @@ class TokenTree:
         return path[::-1]
 
 
+EMPTY = TokenTree((), (), ())
+
+
 def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
     """A prefix tree of several drafts; common beginnings become one path."""
     tokens: list[int] = []

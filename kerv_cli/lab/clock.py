@@ -10,7 +10,7 @@ import numpy as np
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.record import DecodeRecord, Delay
 from kerv_cli.lab.latency import Latency, steps_of
-from kerv_cli.methods.kinematics import Noise, Predictor, build_predictor
+from kerv_cli.methods.kinematics.prediction import Noise, Predictor, build_predictor
 
 CHUNK, POSITION = "chunk", "position"
 """Compensations: drop the new chunk's stale actions; show the decoder the end effector where it will be."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.base.settings import CONSTANT, EXPERT, PROFILE, WAITS, RolloutSettings, TimingSettings
-from kerv_cli.methods.parts import METHOD_KINDS, part_of
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
 """The parts that judge drafts."""

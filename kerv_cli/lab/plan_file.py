@@ -8,10 +8,10 @@ from typing import Any
 
 from kerv_cli.base.files import read_yaml, to_yaml
 from kerv_cli.base.manifests import read
+from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.lab.identity import complete_settings
 from kerv_cli.lab.plan import Cell, parse_seeds, seeds_text
-from kerv_cli.methods.parts import METHOD_KINDS
 
 
 @dataclass(frozen=True)

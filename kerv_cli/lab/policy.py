@@ -13,7 +13,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
-from kerv_cli.engine.batched import BatchDecoder, check_batch
+from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, deviation
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab import timing
@@ -21,8 +21,8 @@ from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.build import check as check_method
-from kerv_cli.methods.build import compose, needs
+from kerv_cli.methods.compose import check as check_method
+from kerv_cli.methods.compose import check_batch, compose, needs
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress

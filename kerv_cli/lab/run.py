@@ -15,7 +15,7 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.episode import ActionDecoder, run_episode
 from kerv_cli.lab.policy import batch_decoder_for, clock_for, decoder_for
 from kerv_cli.lab.together import Ended, Wanted, run_together
-from kerv_cli.methods.build import own_decoder
+from kerv_cli.methods.compose import own_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import World

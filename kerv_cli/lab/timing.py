@@ -8,7 +8,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings, TimingSettings
 from kerv_cli.lab import latency
 from kerv_cli.lab.clock import CHUNK
-from kerv_cli.methods.build import needs
+from kerv_cli.methods.compose import needs
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import find_target
-from kerv_cli.methods.calibration_file import Calibration, Errors, calibration_place, read_calibration
-from kerv_cli.methods.kinematics import PREDICTORS
+from kerv_cli.methods.calibration import Calibration, Errors, calibration_place, read_calibration
+from kerv_cli.methods.kinematics.prediction import PREDICTORS
 from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
 
 REFERENCE = "hold"

@@ -11,8 +11,7 @@ import numpy as np
 
 from kerv_cli.base.files import atomic_path
 from kerv_cli.engine.loss import BAD, auc
-from kerv_cli.methods.certification import certify, episode_means
-from kerv_cli.methods.risk_file import Losses, RiskRecording
+from kerv_cli.methods.risk.recording import Losses, RiskRecording, certify, episode_means
 from kerv_cli.report.drawing import COLOURS, DASHES, MUTED, STYLE, colour, entitle, figure_bytes, new_figure
 
 REPEATS = 200

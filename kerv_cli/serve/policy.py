@@ -11,7 +11,7 @@ from kerv_cli.base.settings import ServeSettings
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.build import check, compose, needs
+from kerv_cli.methods.compose import check, compose, needs
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
 
 WARM_UP = 4  # decodes

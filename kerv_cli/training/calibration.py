@@ -18,9 +18,7 @@ from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.boundary import BoundaryRanges
-from kerv_cli.methods.build import compose
-from kerv_cli.methods.calibration_file import (
+from kerv_cli.methods.calibration import (
     BoundarySection,
     Calibration,
     Demonstrations,
@@ -29,6 +27,8 @@ from kerv_cli.methods.calibration_file import (
     load_calibration,
     save_calibration,
 )
+from kerv_cli.methods.compose import compose
+from kerv_cli.methods.heisd.boundary import BoundaryRanges
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.observations import check_frames, check_shown, instruction_of
 from kerv_cli.training.predictor_fit import (

@@ -15,7 +15,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import find_target
 from kerv_cli.base.settings import WorldSettings
 from kerv_cli.engine.protocol import Target
-from kerv_cli.methods.build import own_decoder
+from kerv_cli.methods.compose import own_decoder
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.worlds.demos.recording import DemoConfig
 from kerv_cli.worlds.spec import EnvironmentSpec, World

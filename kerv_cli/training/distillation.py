@@ -14,12 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.settings import DrafterSettings
-from kerv_cli.engine.acceptance import Acceptance
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.protocol import Target
-from kerv_cli.methods.eagle import Drafter
-from kerv_cli.methods.proposers import DrafterProposer
-from kerv_cli.methods.thresholds import Fixed
+from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.spec_vla.rules import Relaxed
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import Samples
 from kerv_cli.training.loop import Metrics
@@ -173,9 +172,8 @@ class Distillation:
 
 def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r: int) -> float:
     """AL (docs/methods.md §7) of decoding `prompts` with a chain of up to 5 drafts at radius r."""
-    acceptance = Acceptance(target.actions, "relaxed" if r else "strict")
     proposer = DrafterProposer(drafter, target, depth=5, top_k=1, nodes=5)
-    decoder = Decoder(target, Parts(acceptance, Fixed(r), proposer=proposer))
+    decoder = Decoder(target, Parts(Relaxed(target.actions), Fixed(r), proposer=proposer))
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     rounds = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in rounds) / max(1, len(rounds))

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from kerv_cli.base.settings import DrafterSettings, TrainSettings
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.early import EarlyDrafter, choose, padded
+from kerv_cli.methods.early.drafter import EarlyDrafter, choose, padded
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss

@@ -11,8 +11,8 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.methods.calibration_file import Errors
-from kerv_cli.methods.kinematics import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
+from kerv_cli.methods.calibration import Errors
+from kerv_cli.methods.kinematics.prediction import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
 from kerv_cli.training.observations import check_tail
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode

@@ -12,7 +12,7 @@ from kerv_cli.base.provenance import provenance
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDrafterSettings, DrafterSettings
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.public import Convention, read_public, save_public
+from kerv_cli.methods.eagle.public import Convention, read_public, save_public
 from kerv_cli.targets.checkpoint import FORMAT
 
 

@@ -14,23 +14,24 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance, versions
-from kerv_cli.base.registry import NoSettings, find
+from kerv_cli.base.registry import NoSettings, find, part_of
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import CalibrateRiskSettings, RolloutSettings, as_plain
-from kerv_cli.engine.chunk import Chunk, DraftsChunks
+from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.loss import chunk_loss, target_tokens
+from kerv_cli.engine.parts import Skip
+from kerv_cli.engine.proposer import DraftsChunks
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.run import close_worlds, open_world
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.build import Context, compose
-from kerv_cli.methods.parts import part_of
-from kerv_cli.methods.risk import episode_numbers
-from kerv_cli.methods.risk_file import Draw, RiskManifest, RiskRecording, save_risk
-from kerv_cli.methods.scores import Draft, Score
-from kerv_cli.methods.verify_skip import Skip
+from kerv_cli.methods.compose import compose
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.risk.gate import episode_numbers
+from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, save_risk
+from kerv_cli.methods.risk.scores import Draft, Score
 from kerv_cli.training.risk_records import RiskRecords, Row
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.stress import build as build_stress

@@ -19,8 +19,8 @@ from kerv_cli.base.provenance import provenance
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.methods.artifacts import artifact_folder
-from kerv_cli.methods.eagle import Drafter, save_drafter
-from kerv_cli.methods.early import EarlyDrafter, save_early
+from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
+from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget

@@ -16,8 +16,8 @@ from kerv_cli.base.provenance import provenance
 from kerv_cli.base.settings import TrainScoreSettings
 from kerv_cli.engine.loss import BAD, auc
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.learned_score import FLOOR, LearnedScore, save_score
-from kerv_cli.methods.risk_file import FEATURES, RiskRecording
+from kerv_cli.methods.risk.recording import FEATURES, RiskRecording
+from kerv_cli.methods.risk.scores import FLOOR, LearnedScore, save_score
 
 Metrics = dict[str, float]
 

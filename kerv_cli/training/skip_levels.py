@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.methods.calibration_file import NEVER, SkipLevel, SkipSection
+from kerv_cli.methods.calibration import NEVER, SkipLevel, SkipSection
 
 if TYPE_CHECKING:
-    from kerv_cli.methods.datastore import Datastore
+    from kerv_cli.methods.retrieval.datastore import Datastore
 
 ENTRIES = 4000  # looked up per task, evenly spread; on MT10, levels from 1000 did not hold on other episodes
 LEAST = 20  # entries above a level; fewer do not support it

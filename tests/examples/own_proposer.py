@@ -11,8 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import Part, register
-from kerv_cli.methods.parts import PREFILL
+from kerv_cli.base.registry import PREFILL, Part, register
 
 
 @dataclass

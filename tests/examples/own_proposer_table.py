@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.artifacts import Artifact, Request, artifact_folder
-from kerv_cli.methods.build import Context
-from kerv_cli.methods.proposers import ChainProposer
+from kerv_cli.methods.context import Context
 from kerv_cli.targets.checkpoint import Description, TargetDescription, load_state, read_description, save_module
 
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
-from kerv_cli.methods.parts import RayOptions
+from kerv_cli.lab.executors.registration import RayOptions
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
-from kerv_cli.methods.parts import SlurmOptions
+from kerv_cli.lab.executors.registration import SlurmOptions
 
 T = TypeVar("T")
 

@@ -1,4 +1,4 @@
-"""The EAGLE-style drafter and its dynamic tree (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
+"""The EAGLE-style drafter, its dynamic tree, its proposer and its files (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
 
 Input at position i: concat(embedding of the token at i + 1, the target's last hidden state at i), mapped to the model's
 width; the decoder layers predict the hidden state at i + 1, from which the target's frozen head gives the logits for
@@ -8,6 +8,7 @@ beginning, in training and at inference.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,12 +19,15 @@ from torch import Tensor, nn
 
 from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.protocol import Cache as AnyCache
 from kerv_cli.engine.protocol import ReadableTarget, Target
+from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.engine.unread import Unread
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
-from kerv_cli.methods.public import PublicShape, load_public
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.eagle.public import PublicShape, load_public
 from kerv_cli.targets.checkpoint import FLOAT32, Description, read_description, save_module
 from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.packed import load_packed
@@ -171,6 +175,43 @@ def _keep_best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, dept
     index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
     index[best] = torch.arange(best.shape[0], device=tokens.device)
     return Unread.tree(tokens[best], index[parents[best]], depth)
+
+
+class DrafterProposer:
+    """EAGLE-style drafter with a dynamic tree (docs/methods.md §2.2)."""
+
+    name = "drafter"
+    needs_states = True
+
+    def __init__(self, drafter: DraftsStates, target: Target, depth: int, top_k: int, nodes: int) -> None:
+        """depth: tokens; top_k: children expanded per level; nodes: kept after reranking."""
+        self.drafter, self.target = drafter, target
+        self.depth, self.top_k, self.nodes = depth, top_k, nodes
+        capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
+        self.state = DraftState(drafter.new_cache(1, capacity), torch.empty(0))
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> DrafterProposer:
+        """proposer=drafter, and the drafter's side of hybrid: settings of either have depth, top_k and nodes."""
+        return cls(context.artifact("drafter"), context.target, settings.depth, settings.top_k, settings.nodes)
+
+    def begin(self, chunk: Chunk) -> None:
+        """Feeds the drafter the prompt's states and embeddings."""
+        following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
+        observe(self.drafter, self.state, following, chunk.hidden, 0)
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+        """A chain or dynamic tree of the settings' size."""
+        return draft_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """Feeds the drafter the states of the newly committed positions."""
+        following = self.embed(chunk.tokens[first + 1 :])
+        observe(self.drafter, self.state, following, hidden, chunk.prompt_length + first)
+
+    def embed(self, tokens: list[int]) -> Tensor:
+        """T tokens -> the target's embeddings (1, T, E)."""
+        return self.target.embed(upload([tokens], self.target.device))
 
 
 @dataclass(frozen=True)

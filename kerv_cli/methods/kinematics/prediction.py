@@ -1,4 +1,5 @@
-"""Kinematic prediction of the next actions from the last ones (docs/methods.md §3.1, KERV §3).
+"""Kinematic prediction of the next actions from the last ones, as a draft, and after a rejection instead of decoding on
+(docs/methods.md §3.1, KERV §3).
 
 Every predictor here is a fixed linear function of its window for given noise and window length. The weights are
 computed once; predicting is one small matrix product.
@@ -8,51 +9,25 @@ Actions are normalised to [-1, 1], one control step is the unit of time.
 from __future__ import annotations
 
 import functools
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import NoSettings, find
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.history import WINDOW
+from kerv_cli.engine.proposer import ChainProposer
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.kinematics import CompensateSettings
 
-WINDOW = 10  # KERV's action context AC, control steps
 MINIMUM = 4  # actions that a prediction needs; longer windows were not measurably better on the demonstrations
 HORIZON = 8  # steps ahead that weights are computed for
+LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: MINIMUM
 
-
-class ActionHistory:
-    """The last `window` executed actions, normalised and continuous."""
-
-    def __init__(self, dofs: int, window: int = WINDOW) -> None:
-        self.dofs = dofs
-        self._actions: deque[np.ndarray] = deque(maxlen=window)
-        self._stacked = np.zeros((0, dofs))  # the same, for the readers of one decode; never written to
-        self._stacked.flags.writeable = False
-
-    def append(self, action: np.ndarray) -> None:
-        """An action (D,) in [-1, 1] was executed.
-
-        Raises:
-            ValueError: another shape, or a number that is not finite.
-        """
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (self.dofs,) or not np.isfinite(action).all():
-            raise ValueError(f"an executed action must be {self.dofs} finite numbers, not {action}")
-        self._actions.append(action)
-        self._stacked = np.array(self._actions)
-        self._stacked.flags.writeable = False
-
-    def values(self, pending: np.ndarray | None = None) -> np.ndarray:
-        """(m, D), oldest first, m ≤ window.
-
-        pending: (k, D) steps of the present chunk that are known but not yet executed. They are appended as if
-        executed, so that the next step is one step ahead instead of k + 1.
-        """
-        if pending is None or not len(pending):
-            return self._stacked
-        known = np.concatenate([self._stacked, np.asarray(pending, dtype=np.float64)])
-        return known[-(self._actions.maxlen or 0) :]
+DRAFT = "draft"
+"""`rectifier.predictor` that fills from the rejected draft instead of from a kinematic predictor."""
 
 
 @dataclass(frozen=True)
@@ -281,3 +256,115 @@ def build_predictor(
     if kind not in noise:
         raise UsageError(f"predictor '{kind}' has no fitted noise: run 'kerv calibrate'")
     return FILTERS[kind](held, noise[kind], minimum, window, horizon)
+
+
+def predictor_of(settings: NoSettings, context: Context) -> Predictor:
+    """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
+    name, target = settings.kind, context.target
+    if find("predictor", name).traits.get("fitted"):
+        return context.calibration.predictor(name, horizon=target.chunk)
+    least = LEAST_HISTORY.get(name, MINIMUM)
+    return build_predictor(name, target.actions.is_strict, {}, least, horizon=target.chunk)
+
+
+class PredictionProposer(ChainProposer):
+    """A kinematic prediction of the chunk (docs/methods.md §3.1, §6: `hold`, `kalman_only`). Committed steps of the
+    chunk count as executed. Drafts nothing while the history is shorter than the predictor's minimum."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        self.name, self.predictor = predictor.name, predictor
+
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> PredictionProposer:
+        """proposer=hold, linear, kalman, …"""
+        return cls(predictor_of(settings, context))
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """The predicted tokens of the chunk's remaining places; none while the history is too short."""
+        whole = len(chunk.tokens) // chunk.dofs
+        pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
+        history = chunk.situation.history.values(chunk.space.values_of(pending))
+        predicted = self.predictor.predict(history, chunk.steps - whole)
+        if predicted is None:
+            return []
+        tokens: list[int] = chunk.space.bins_of(predicted).flatten().tolist()
+        return [tokens[len(chunk.tokens) - whole * chunk.dofs :][:depth]]
+
+
+class Compensation:
+    """KERV: keep what was accepted, predict the rest of that control step, drop the rest of the chunk.
+
+    With `use_target_token` (ours) the target token at the rejected position is kept too; the verification has computed
+    it already. `steps` (PL) lets the prediction fill further control steps. With `predictor: draft` (ours) the rejected
+    draft's remaining tokens fill first and the prediction only what they lack: unlike a filter, the draft knows the
+    observation. After a compensation there is none for `rest` decodes.
+    """
+
+    def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
+        self.settings, self.predictor = settings, predictor
+        self.resting = 0
+
+    @classmethod
+    def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
+        """rectifier=compensate."""
+        name = "hold" if settings.predictor == DRAFT else settings.predictor
+        return cls(settings, find("predictor", name).built(NoSettings(name), context))
+
+    @property
+    def uses_target_token(self) -> bool:
+        """As `Rectifier.uses_target_token`."""
+        return self.settings.use_target_token
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self.resting = 0
+
+    def next_decode(self) -> None:
+        """A decode ended."""
+        self.resting = max(0, self.resting - 1)
+
+    def close(self, chunk: Chunk) -> bool:
+        """Ends the chunk after a rejection, if a prediction can fill what is missing -> whether it did."""
+        if self.resting:
+            return False
+        tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
+        drafted = chunk.rejection.draft if self.settings.predictor == DRAFT else ()
+        values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
+        if values is None or 0 <= self.settings.max_dropped < chunk.steps - len(values):
+            return False
+        chunk.close(values, self.settings.use_target_token)
+        # + 1, because `next_decode` also counts the decode that compensated
+        self.resting = self.settings.rest + 1
+        return True
+
+
+def assemble(
+    tokens: list[int],
+    chunk: Chunk,
+    predictor: Predictor,
+    settings: CompensateSettings,
+    drafted: Sequence[int] = (),
+) -> np.ndarray | None:
+    """Known tokens, then `drafted` ones, then the prediction -> (steps, D) normalised actions; None where the history
+    is too short to predict what is still missing.
+
+    A step of which fewer than `min_verified` DoFs are known is dropped, unless nothing would be left.
+    """
+    dofs, horizon = chunk.dofs, chunk.steps
+    whole, part = divmod(len(tokens), dofs)
+    filled = 1 if whole == 0 or (part and part >= settings.min_verified) else 0
+    steps = min(horizon, whole + max(filled, settings.steps - 1 + filled))
+    values = chunk.space.values_of(np.array([*tokens, *drafted][: steps * dofs], dtype=np.int64))
+    flat = np.full(steps * dofs, np.nan)
+    flat[: len(values)] = values
+    actions: np.ndarray = flat.reshape(steps, dofs)
+    history = chunk.situation.history.values(actions[:whole])
+    if len(history):  # strict DoFs are held, whoever drafted; without a last value the draft's is the best there is
+        flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
+    if np.isnan(actions).any():
+        predicted = predictor.predict(history, steps - whole)
+        if predicted is None:
+            return None
+        gap = np.isnan(actions[whole:])
+        actions[whole:][gap] = predicted[gap]
+    return actions

@@ -14,8 +14,8 @@ from kerv_cli.base.files import sha256_of, write_json
 from kerv_cli.base.manifests import read_file
 from kerv_cli.base.places import artifact, beside
 from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request
-from kerv_cli.methods.boundary import LEAST, BoundaryRanges
-from kerv_cli.methods.kinematics import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
+from kerv_cli.methods.heisd.boundary import LEAST, BoundaryRanges
+from kerv_cli.methods.kinematics.prediction import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 from kerv_cli.targets.checkpoint import TargetDescription
 
 FORMAT = 2

@@ -29,10 +29,14 @@ from kerv_cli.base import registry
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import check_files, content_of, read_file
 from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.transfer import read
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
-from kerv_cli.methods.search import ExactIndex, Index, best
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.retrieval.search import ExactIndex, Index, best
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
@@ -377,3 +381,53 @@ def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[
             return depth
         node = children[node, token]
     return len(group)
+
+
+class RetrievalProposer(Stateless):
+    """The nearest stored chunks of the task, merged by kinematic group (docs/methods.md §4.2)."""
+
+    name = "retrieval"
+
+    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
+        self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
+        self.waits = target.device.type == "cpu"
+        self._found: tuple[Chunk, Neighbours] | None = None
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> RetrievalProposer:
+        """proposer=retrieval, and retrieval's side of hybrid: settings of either have neighbours and nodes."""
+        return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
+
+    @classmethod
+    def of_nearest(cls, context: Context) -> RetrievalProposer:
+        """Retrieval of the one best chunk."""
+        return cls(context.artifact("datastore"), context.target, 1, 1)
+
+    def neighbours(self, chunk: Chunk) -> Neighbours:
+        """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
+        if self._found is None or self._found[0] is not chunk:
+            self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
+        assert self._found is not None
+        return self._found[1]
+
+    def ask(self, chunk: Chunk) -> None:
+        """As `Asks.ask`: the search key."""
+        if not self.waits and (self._found is None or self._found[0] is not chunk):
+            pooled = self.datastore.pooled(chunk.prompt, self.target)
+            chunk.asked.append((pooled, lambda found: self._search(chunk, found)))
+
+    def _search(self, chunk: Chunk, pooled: np.ndarray) -> None:
+        key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
+        self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+        chunk.similarity = float(self._found[1].similarity[0])
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """The neighbours' chunks as one tree, merged by kinematic group."""
+        chunks = self.neighbours(chunk).chunks[:, : chunk.size]
+        return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
+        start = len(chunk.tokens)
+        found: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
+        return found

@@ -1,4 +1,5 @@
-"""Risk-controlled verification: a calibrated gate and its audit (docs/methods.md §4.6, ours)."""
+"""Risk-controlled verification: a calibrated gate, and its online audit: has the risk left ε? (docs/methods.md §4.6,
+ours)"""
 
 from __future__ import annotations
 
@@ -7,13 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from kerv_cli.engine.chunk import Chunk, DraftsChunks
+from kerv_cli.base.registry import NoSettings, find
+from kerv_cli.base.settings import LOSS_SCALE
+from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.loss import chunk_loss, executed_loss, judged_tokens
+from kerv_cli.engine.parts import Skip
+from kerv_cli.engine.proposer import DraftsChunks
 from kerv_cli.engine.record import ALARM, AUDIT, DOUBT, GATE, NO_DRAFT, OPENING, TRUSTED, Trust
-from kerv_cli.methods.audit import Audit
-from kerv_cli.methods.parts import RiskSkipSettings
-from kerv_cli.methods.scores import Draft, Score
-from kerv_cli.methods.verify_skip import Skip
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.heisd.rules import retrieval_of
+from kerv_cli.methods.merged.proposer import first_source
+from kerv_cli.methods.risk import RiskSkipSettings
+from kerv_cli.methods.risk.recording import RiskRecording
+from kerv_cli.methods.risk.scores import Draft, Score
+
+BETS = np.linspace(0.1, 0.9, 9)  # shares of the wealth that can be lost on one loss
 
 
 def episode_numbers(purpose: str, task: str, seed: int) -> np.random.Generator:
@@ -40,6 +49,23 @@ class RiskSkip(Skip):
         self.decodes = 0  # of this episode
         self.suspicious = False  # the last decode was verified with a loss of `doubt` or more
         self.random = np.random.default_rng(0)
+
+    @classmethod
+    def build(cls, settings: RiskSkipSettings, context: Context) -> RiskSkip:
+        """skip=risk.
+
+        Raises:
+            CheckpointError: the recording does not know the source or the score, or is too small to certify anything.
+        """
+        draft = context.built["prefill_draft"]
+        source = retrieval_of(context) if draft is None else first_source(draft)
+        score = find("score", settings.score).built(NoSettings(settings.score), context)
+        if settings.level is not None:
+            return cls(settings, source, score, settings.level, LOSS_SCALE)
+        recording: RiskRecording = context.artifact("risk")
+        recording.check_size(source.name, settings.epsilon, settings.delta)
+        level = recording.certified(source.name, settings.score, settings.epsilon, settings.delta).level
+        return cls(settings, source, score, level, recording.manifest.scale)
 
     def begin(self, task: str, seed: int) -> None:
         """As `Skip.begin`: which decodes are audited depends on task and seed alone."""
@@ -95,3 +121,61 @@ class RiskSkip(Skip):
             self.audit.add(loss)
             if self.audit.alarm and not trust.alarm:
                 chunk.trust = replace(chunk.trust, alarm=True)
+
+
+class Evidence:
+    """Anytime-valid evidence about the mean of losses in [0, 1], from those seen so far: two e-processes, each a
+    mixture of bets (Waudby-Smith and Ramdas 2024). Whoever stops when one reaches 1/δ errs with probability δ at most,
+    whenever he looks.
+
+    above: against "the mean is at most ε"; below: against "the mean is at least ε".
+    """
+
+    def __init__(self, epsilon: float) -> None:
+        self.epsilon = epsilon
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing was seen."""
+        self._above = np.ones(len(BETS))
+        self._below = np.ones(len(BETS))
+
+    def add(self, loss: float) -> None:
+        """One more loss."""
+        excess = loss - self.epsilon
+        self._above *= 1 + BETS / self.epsilon * excess
+        self._below *= 1 - BETS / (1 - self.epsilon) * excess
+
+    @property
+    def above(self) -> float:
+        """e-value of "the risk has left ε"."""
+        return float(self._above.mean())
+
+    @property
+    def below(self) -> float:
+        """e-value of "the risk is within ε"."""
+        return float(self._below.mean())
+
+
+class Audit:
+    """Collects the losses of decodes that the gate would have skipped but that were verified. Raises an alarm when the
+    evidence that the risk is above ε reaches 1/δ, and ends it when the evidence since then that it is not does.
+
+    """
+
+    def __init__(self, epsilon: float, delta: float) -> None:
+        self.evidence, self.level = Evidence(epsilon), 1 / delta
+        self.alarm = False
+
+    def reset(self) -> None:
+        """A new episode begins: nothing is carried over, so that episodes do not depend on their order."""
+        self.evidence.reset()
+        self.alarm = False
+
+    def add(self, loss: float) -> None:
+        """The loss of one audited decode."""
+        self.evidence.add(loss)
+        reached = self.evidence.below if self.alarm else self.evidence.above
+        if reached >= self.level:
+            self.alarm = not self.alarm
+            self.evidence.reset()

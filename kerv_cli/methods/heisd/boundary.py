@@ -10,13 +10,14 @@ import math
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import numpy as np
 
 from kerv_cli.base.errors import CheckpointError
-
-Mode = Literal["retrieval", "drafter"]
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.engine.chunk import Choice, Mode
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.heisd import FusedBoundarySettings, RandomBoundarySettings
 
 LEAST = 3  # positions; fewer have no curvature
 STILL = 1e-3  # metres; a hand with a shorter path counts as still (in Meta-World a control step at full speed is 10 mm)
@@ -112,24 +113,6 @@ class BoundaryRanges:
         return alpha * radius + (1 - alpha) * length
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A boundary's decision: which side drafts, and F where the decision used it."""
-
-    mode: Mode
-    metric: float | None = None
-
-
-class Boundary(Protocol):
-    """Chooses the side of a hybrid proposer that drafts the next chunk."""
-
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """path (n, 3): the episode's measured positions up to now, metres, oldest first; the newest `window` count."""
-
-    def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """Generator for one episode; depends on the boundary's seed, the task and the episode's seed alone."""
-
-
 class Seeded:
     """Base of all boundaries: the episode's generator."""
 
@@ -146,6 +129,11 @@ class Always(Seeded):
 
     mode: Mode
 
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> Always:
+        """boundary=always_retrieval, always_drafter."""
+        return cls("retrieval" if settings.kind == "always_retrieval" else "drafter")
+
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """As `Boundary.choose`."""
         return Choice(self.mode)
@@ -157,6 +145,11 @@ class Random(Seeded):
 
     p: float
     seed: int = 0
+
+    @classmethod
+    def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
+        """boundary=random."""
+        return cls(settings.p, settings.seed)
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """As `Boundary.choose`."""
@@ -171,6 +164,12 @@ class Fused(Seeded):
     alpha: float
     window: int
     f_star: float
+
+    @classmethod
+    def build(cls, settings: FusedBoundarySettings, context: Context) -> Fused:
+        """boundary=fused."""
+        ranges = context.calibration.ranges(settings.window)
+        return cls(ranges, settings.alpha, settings.window, settings.f_star)
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """As `Boundary.choose`."""

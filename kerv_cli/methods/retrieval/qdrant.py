@@ -18,8 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from kerv_cli.base.errors import StorageError, UsageError
-from kerv_cli.methods.parts import QdrantSearchSettings
-from kerv_cli.methods.search import best, length_of_longest, slack
+from kerv_cli.methods.retrieval import QdrantSearchSettings
+from kerv_cli.methods.retrieval.search import best, length_of_longest, slack
 
 BATCH = 131_072  # numbers sent at once: below a server's limit for one request
 MARGIN = 8  # rows requested beyond k, so that ties at the k-th place seldom need a second search

@@ -1,39 +1,13 @@
-"""The acceptance radius r in bins (docs/methods.md §3.2). Thresholds keep r as a real number and round it for use."""
+"""KERV's thresholds: the acceptance radius r in bins (docs/methods.md §3.2). They keep r as a real number and round it
+for use."""
 
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Self
 
-
-class Threshold(Protocol):
-    """Gives the acceptance radius r of every decode, from the variability K of the decodes before it."""
-
-    def reset(self) -> None:
-        """A new episode begins."""
-
-    def radius(self) -> int:
-        """r of the next decode, in bins."""
-
-    def update(self, variability: float | None) -> None:
-        """A decode ended; its kinematic variability K in normalised action units, None where nothing was compared."""
-
-
-class Fixed:
-    """The same r in every decode (Spec-VLA)."""
-
-    def __init__(self, r: int) -> None:
-        self.r = r
-
-    def reset(self) -> None:
-        """Nothing to reset."""
-
-    def radius(self) -> int:
-        """r."""
-        return self.r
-
-    def update(self, variability: float | None) -> None:
-        """K is not used."""
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.kinematics import KinematicThresholdSettings, ScheduleThresholdSettings
 
 
 class Kinematic:
@@ -45,6 +19,17 @@ class Kinematic:
     def __init__(self, r_min: int, r_max: int, phi: float, k_s: float) -> None:
         self.r_min, self.r_max, self.phi, self.k_s = r_min, r_max, phi, k_s
         self.reset()
+
+    @classmethod
+    def build(cls, settings: KinematicThresholdSettings, context: Context) -> Self:
+        """threshold=kinematic, change; K_S is the task's, from the calibration, where none is given.
+
+        Raises:
+            UsageError: a radius above the largest distance of two tokens.
+        """
+        context.check_radius("r_max", settings.r_max)
+        k_s = settings.k_s if settings.k_s is not None else context.calibration.k_s(context.task)
+        return cls(settings.r_min, settings.r_max, settings.phi, k_s)
 
     def reset(self) -> None:
         """r as after a decode with K = K_S."""
@@ -95,6 +80,12 @@ class Schedule:
     def __init__(self, r_min: int, r_max: int, phi: float, tau: float) -> None:
         self.r_min, self.r_max, self.phi, self.tau = r_min, r_max, phi, tau
         self.reset()
+
+    @classmethod
+    def build(cls, settings: ScheduleThresholdSettings, context: Context) -> Schedule:
+        """threshold=schedule; errors as `Kinematic.build`."""
+        context.check_radius("r_max", settings.r_max)
+        return cls(settings.r_min, settings.r_max, settings.phi, settings.tau)
 
     def reset(self) -> None:
         """Starts again at t = 0."""

@@ -1,0 +1,19 @@
+"""Autoregressive decoding (docs/methods.md §1): the absence of every part. Settings and registration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from kerv_cli.base.registry import PREFILL, Part, register
+
+_NOTHING = "kerv_cli.methods.ar:nothing"
+
+
+def nothing(settings: Any, context: Any) -> None:
+    """Choices that stand for the absence of a part."""
+
+
+register(Part("proposer", "none", _NOTHING, colour=0x6E7B8B, traits={"when": PREFILL}))
+register(Part("rectifier", "reinfer", _NOTHING))  # the target decodes on
+register(Part("boundary", "always", _NOTHING))  # the method has one proposer
+register(Part("skip", "none", _NOTHING))

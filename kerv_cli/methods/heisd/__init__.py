@@ -1,0 +1,120 @@
+"""HeiSD (docs/methods.md §2.1, §4.3, §4.4): retrieval and the drafter on two sides of a boundary, acceptance by
+kinematic groups, and execution without verification where a stored observation is similar. Settings and registration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
+from kerv_cli.base.registry import STATES, Part, reads, register
+
+_RULES = "kerv_cli.methods.heisd.rules:"
+_BOUNDARY = "kerv_cli.methods.heisd.boundary:"
+
+
+@dataclass
+class HybridProposerSettings:
+    """HeiSD: retrieval on one side of the boundary, the drafter on the other (§4.4). The paper's five neighbours need
+    about 50 nodes and cost more than they gain here."""
+
+    kind: str = "hybrid"
+    depth: int = number(15, 1, MOST_TOKENS)  # the drafter's, tokens
+    top_k: int = number(1, 1, MOST_TOKENS)
+    nodes: int = number(24, 1, MOST_TOKENS)  # of either side's tree
+    neighbours: int = number(3, 1, MOST_TOKENS)
+
+
+register(
+    Part(
+        *("proposer", "hybrid", _RULES + "HybridProposer.build", HybridProposerSettings),
+        needs=reads("drafter", "datastore"),
+        traits={"when": STATES, "sides": True},
+    )
+)
+
+
+# --- which drafts are good enough (§2.1)
+
+
+@dataclass
+class SequenceAcceptanceSettings:
+    """HeiSD: a kinematic group of one control step is accepted or rejected as a whole; strict DoFs must match."""
+
+    kind: str = "sequence"
+    group_limit: int = number(30, 0, MOST_BINS)  # summed bias of a group, bins
+    token_limit: int = number(15, 0, MOST_BINS)  # bias of one token, bins
+
+
+@dataclass
+class HybridAcceptanceSettings:
+    """HeiSD: retrieved drafts by `sequence`, all others by `relaxed`."""
+
+    kind: str = "hybrid"
+    strict_dofs: bool = True
+    group_limit: int = number(30, 0, MOST_BINS)
+    token_limit: int = number(15, 0, MOST_BINS)
+
+
+register(Part("acceptance", "sequence", _RULES + "ByGroup.build", SequenceAcceptanceSettings))
+register(Part("acceptance", "hybrid", _RULES + "ByProposer.build", HybridAcceptanceSettings))
+
+
+# --- which side of the hybrid proposer drafts (§4.4)
+
+
+@dataclass
+class FusedBoundarySettings:
+    """HeiSD: retrieval where the path is straight and fast, the drafter where it bends or slows down."""
+
+    kind: str = "fused"
+    alpha: float = number(0.5, 0, 1)  # weight of the radius of curvature against the path length
+    window: int = number(15, 3, MOST_DECODES)  # newest measured positions
+    f_star: float = number(0.3, -1e9, 1e9)  # fused metric from which retrieval drafts (measured; HeiSD: 0.5)
+
+
+@dataclass
+class RandomBoundarySettings:
+    """The control of the fused boundary: the same shares without the metric."""
+
+    kind: str = "random"
+    p: float = number(0.5, 0, 1)  # probability of retrieval
+    seed: int = number(0, 0, 2**32 - 1)
+
+
+_CHOOSES = {"chooses": True}
+for _side in ("retrieval", "drafter"):
+    register(Part("boundary", f"always_{_side}", _BOUNDARY + "Always.build", traits=_CHOOSES))
+_fused = (_BOUNDARY + "Fused.build", FusedBoundarySettings, reads("calibration"))
+register(Part("boundary", "fused", *_fused, traits=_CHOOSES))
+register(Part("boundary", "random", _BOUNDARY + "Random.build", RandomBoundarySettings, traits=_CHOOSES))
+
+
+# --- what is executed without a verification (§4.3)
+
+
+@dataclass
+class SimilaritySkipSettings:
+    """HeiSD: a retrieved chunk whose similarity reaches s_min is executed without a forward of the target's trunk."""
+
+    kind: str = "similarity"
+    s_min: float | None = number(None, -1e9, 1e9)  # None: the task's, from the calibration
+    max_skips: int = number(2, 1, MOST_DECODES)  # decodes in a row without a verification
+    # share of the calibrated range that s_min rises after a failed episode (HeiSD: 0.25), and falls after a successful
+    # one; above 0 results depend on the order of episodes
+    up: float = number(0.0, 0, 1e9)
+    down: float = number(0.0, 0, 1e9)
+
+
+def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
+    """The datastore, and the calibration where no level is given."""
+    return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
+
+
+register(
+    Part(
+        *("skip", "similarity", _RULES + "VerifySkip.build", SimilaritySkipSettings),
+        needs=needs_of_similarity,
+        colour=0xF0E442,
+    )
+)

@@ -1,0 +1,115 @@
+"""Merges drafts of several sources into one prefix tree (docs/methods.md §5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from kerv_cli.base.registry import find
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.proposer import DraftsChunks, Stateless
+from kerv_cli.engine.transfer import read, upload
+from kerv_cli.engine.tree import ROOT, TokenTree, merge
+from kerv_cli.engine.unread import Placed, Unread
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.early.drafter import EarlyProposer
+from kerv_cli.methods.merged import MergedProposerSettings
+from kerv_cli.methods.retrieval import RetrievalProposerSettings
+
+
+class MergedProposer(Stateless):
+    """Merges the chains of several sources into one prefix tree (docs/methods.md §5). At most `nodes` nodes: the last
+    chains are dropped first.
+
+    fallback: sources that draft only where none of the others is sure of its chunk, because every node costs time.
+    """
+
+    def __init__(self, sources: Sequence[DraftsChunks], nodes: int, fallback: Sequence[DraftsChunks] = ()) -> None:
+        every = [*sources, *fallback]
+        self.name = every[0].name if len(every) == 1 else "merged"
+        self.sources, self.fallback, self.nodes = sources, fallback, nodes
+
+    @classmethod
+    def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
+        """proposer=merged."""
+
+        def source(name: str) -> DraftsChunks:
+            part = find("proposer", name)
+            own: Any = part.settings(kind=name)
+            if isinstance(own, RetrievalProposerSettings):
+                own = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
+            built: DraftsChunks = part.built(own, context)
+            return built
+
+        sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
+        return cls(sources, settings.nodes, fallback)
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+        """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
+        return self._unread(chunk, depth) or self._tree(chunk, depth)
+
+    def _tree(self, chunk: Chunk, depth: int) -> TokenTree:
+        sources = list(self.sources)
+        if not any(source.is_sure(chunk) for source in sources):
+            sources += self.fallback
+        chains = [chain for source in sources for chain in source.chains(chunk, depth)]
+        tree = merge(chains)
+        while len(tree) > self.nodes:
+            if len(chains) == 1:
+                return TokenTree.chain(chains[0][: self.nodes])
+            del chains[-1]
+            tree = merge(chains)
+        return tree
+
+    def _unread(self, chunk: Chunk, depth: int) -> Unread | None:
+        """An early draft that was not read, and all other chains beside it, whether they will be wanted or not: which
+        of them are nodes of the tree is known once the draft is read. None where there is none, or no room."""
+        early = next((source for source in self.sources if isinstance(source, EarlyProposer)), None)
+        if early is None or (numbers := early.unread(chunk)) is None:
+            return None
+        start, device = len(chunk.tokens), numbers.device
+        own = numbers[start : min(chunk.size, start + depth)].long()
+        others = [s for s in (*self.sources, *self.fallback) if s is not early]
+        beside = [chain for source in others for chain in source.chains(chunk, depth) if chain]
+        lengths = [own.shape[0], *(len(chain) for chain in beside)]
+
+        def placed(found: np.ndarray) -> Placed:
+            early.take(chunk, found)
+            tree = self._tree(chunk, depth)
+            return tree, rows_of(tree, [early.chains(chunk, depth)[0], *beside])
+
+        if sum(lengths) > max(self.nodes, chunk.size):
+            early.take(chunk, read(numbers)[0])
+            return None
+        if not beside:
+            return Unread(own, numbers, placed)
+        depths = np.concatenate([np.arange(length) for length in lengths])
+        chain_of = np.repeat(np.arange(len(lengths)), lengths)
+        visible = (chain_of[:, None] == chain_of) & (depths[:, None] >= depths)
+        tokens = torch.cat([own, upload([token for chain in beside for token in chain], device)])
+        return Unread(tokens, numbers, placed, upload(visible, device), upload(depths, device))
+
+
+def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
+    """The rows of a merged tree's nodes where its chains were forwarded one behind the other, unmerged."""
+    children = {(parent, token): i for i, (parent, token) in enumerate(zip(tree.parents, tree.tokens, strict=True))}
+    rows, first = [0] * len(tree), 0
+    for chain in reversed(chains):
+        first -= len(chain)
+        node: int | None = ROOT
+        for place, token in enumerate(chain):
+            node = children.get((ROOT if node is None else node, token))
+            if node is None:
+                break
+            rows[node] = first + place
+    total = sum(len(chain) for chain in chains)
+    return [total + row for row in rows]
+
+
+def first_source(draft: Any) -> DraftsChunks:
+    """What drafts whole chunks before the prefill: an in-prefill draft, of a merged one its first source."""
+    first: DraftsChunks = draft.sources[0] if isinstance(draft, MergedProposer) else draft
+    return first

@@ -1,0 +1,49 @@
+"""Parallel decoding (docs/methods.md §6): registration, and the part, which needs nothing heavy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.registry import Part, register
+from kerv_cli.engine.parts import Skip
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.protocol import Cache, ParallelTarget
+    from kerv_cli.methods.context import Context
+
+
+class ParallelPass(Skip):
+    """Decodes all tokens by one bidirectional pass of a parallel target, as OpenVLA-OFT does (§6): each is chosen
+    without knowing the others, and none is verified."""
+
+    phase = "prefill"
+
+    def __init__(self, target: ParallelTarget) -> None:
+        self.target = target
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> ParallelPass:
+        """skip=parallel."""
+        return cls(context.target)
+
+    def take(self, chunk: Chunk) -> bool:
+        """As `Skip.take`; always."""
+        chunk.cache.length = 0
+        hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
+        chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
+        return True
+
+    def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
+        """As `TakesMany.take_many`."""
+        hidden = self.target.parallel_pass(prompt, cache(len(chunks)))
+        rows = self.target.head(hidden[:, : chunks[0].size]).argmax(-1).tolist()
+        for chunk, tokens in zip(chunks, rows, strict=True):
+            chunk.commit_at_once(tokens)
+
+
+_BUILD = "kerv_cli.methods.parallel:ParallelPass.build"
+register(Part("skip", "parallel", _BUILD, colour=0x17BECF, traits={"parallel": True}))  # a parallel target's decoding

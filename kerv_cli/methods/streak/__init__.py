@@ -1,0 +1,27 @@
+"""Trust for as long as verification agrees (docs/methods.md §4.5, ours). Settings and registration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kerv_cli.base.limits import number
+from kerv_cli.base.registry import Part, register
+
+
+@dataclass
+class StreakSkipSettings:
+    """Verified chunks that agree with their draft allow 1, 2, 4, … unverified decodes (§4.5). The draft is the
+    in-prefill one, of `merged` its first source's."""
+
+    kind: str = "streak"
+    most: int = number(8, 1)  # decodes in a row without a verification
+    tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
+
+
+register(
+    Part(
+        *("skip", "streak", "kerv_cli.methods.streak.skip:StreakSkip.build", StreakSkipSettings),
+        colour=0xE8C547,
+        traits={"takes_draft": True, "merges": True},
+    )
+)

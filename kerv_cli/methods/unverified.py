@@ -1,0 +1,47 @@
+"""Drafts that are never verified (docs/methods.md §6): registration, and the part, which needs nothing heavy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.registry import Part, register
+from kerv_cli.engine.parts import Skip
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.proposer import DraftsChunks
+    from kerv_cli.engine.protocol import Cache
+    from kerv_cli.methods.context import Context
+
+
+class AlwaysSkip(Skip):
+    """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
+    whole chunk yet, the target decodes."""
+
+    def __init__(self, source: DraftsChunks) -> None:
+        self.source = source
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> AlwaysSkip:
+        """skip=always."""
+        return cls(context.built["prefill_draft"])
+
+    def take(self, chunk: Chunk) -> bool:
+        """As `Skip.take`."""
+        chains = self.source.chains(chunk, chunk.size)
+        if not chains or len(chains[0]) < chunk.size:
+            return False
+        chunk.skip(chains[0], self.source.name)
+        return True
+
+    def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
+        """As `TakesMany.take_many`, where the source is an `EarlyProposer`."""
+        source: Any = self.source
+        for chunk, tokens in zip(chunks, source.tokens_of(chunks, prompt), strict=True):
+            chunk.skip(tokens, self.source.name)
+
+
+register(Part("skip", "always", "kerv_cli.methods.unverified:AlwaysSkip.build", traits={"takes_draft": True}))
