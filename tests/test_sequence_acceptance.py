@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace, Group
-from kerv_cli.engine.acceptance import Acceptance, accept_by_distance, accept_by_group
+from kerv_cli.engine.acceptance import Acceptance, Strict, accept_by_distance, accept_by_group
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.proposer import Stateless
@@ -224,3 +224,19 @@ def test_in_the_loop_paths_end_with_groups_and_a_begun_group_has_one_verdict() -
                 assert r.threshold == LIMITS
                 accepted += r.accepted
     assert accepted > 20
+
+
+class Anything(Strict):
+    """A rule of somebody else's: every token will do."""
+
+    def limits(self, r: int) -> tuple[int, ...]:
+        return (self.space.tokens,) * self.space.dofs
+
+
+def test_the_loop_asks_a_rule_that_is_not_kervs() -> None:
+    target = MockTarget(POSITION_GRIPPER, chunk=4)
+    prompt = torch.randn(1, 5, target.width, generator=torch.Generator().manual_seed(0)).double()
+    drafted = [7] * 15
+    chunk = Decoder(target, Parts(Anything(POSITION_GRIPPER), proposer=Shifted(drafted, 0))).decode_prompt(prompt)
+    assert chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted) == 14
+    assert set(chunk.tokens[1:-1]) <= {6, 7, 8}

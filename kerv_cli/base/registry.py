@@ -67,11 +67,6 @@ def nothing(settings: Any) -> tuple[str, ...]:
     return ()
 
 
-def reads(*kinds: str) -> Callable[[Any], tuple[str, ...]]:
-    """`Part.needs` of a part that needs these artifacts, whatever its settings."""
-    return lambda settings: kinds
-
-
 @dataclass(frozen=True)
 class Part:
     """One choice among the parts of a kind.
@@ -123,6 +118,20 @@ def register(part: Part) -> Part:
         raise UsageError(f"{part.kind} '{part.name}' is registered twice: {there.build} and {part.build}")
     _PARTS[part.kind][part.name] = part
     return part
+
+
+def add(
+    kind: str,
+    name: str,
+    build: str = "",
+    settings: type = NoSettings,
+    needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = (),
+    check: Callable[[Any], None] | None = None,
+    colour: int | None = None,
+    **traits: Any,
+) -> None:
+    """Registers a part of these fields. needs: a tuple where the settings do not matter."""
+    register(Part(kind, name, build, settings, needs if callable(needs) else lambda _: needs, check, colour, traits))
 
 
 def load(name: str) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from kerv_cli.base.registry import PREFILL, Part, register
+from kerv_cli.base.registry import PREFILL, add
 
 _NOTHING = "kerv_cli.methods.ar:nothing"
 
@@ -13,7 +13,7 @@ def nothing(settings: Any, context: Any) -> None:
     """Choices that stand for the absence of a part."""
 
 
-register(Part("proposer", "none", _NOTHING, colour=0x6E7B8B, traits={"when": PREFILL}))
-register(Part("rectifier", "reinfer", _NOTHING))  # the target decodes on
-register(Part("boundary", "always", _NOTHING))  # the method has one proposer
-register(Part("skip", "none", _NOTHING))
+add("proposer", "none", _NOTHING, colour=0x6E7B8B, when=PREFILL)
+add("rectifier", "reinfer", _NOTHING)  # the target decodes on
+add("boundary", "always", _NOTHING)  # the method has one proposer
+add("skip", "none", _NOTHING)

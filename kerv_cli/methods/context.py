@@ -5,12 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kerv_cli.base.errors import UsageError
-
-if TYPE_CHECKING:
-    from kerv_cli.methods.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -24,10 +21,9 @@ class Context:
     built: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def calibration(self) -> Calibration:
-        """The calibration of the target."""
-        loaded: Calibration = self.artifact("calibration")
-        return loaded
+    def calibration(self) -> Any:
+        """The target's `Calibration`; not by its type, which the parts that it is read for would import."""
+        return self.artifact("calibration")
 
     def check_radius(self, name: str, r: int) -> None:
         """Raises UsageError for a radius above the largest distance of two tokens. name: of the threshold's setting."""

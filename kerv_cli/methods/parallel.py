@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -46,4 +46,4 @@ class ParallelPass(Skip):
 
 
 _BUILD = "kerv_cli.methods.parallel:ParallelPass.build"
-register(Part("skip", "parallel", _BUILD, colour=0x17BECF, traits={"parallel": True}))  # a parallel target's decoding
+add("skip", "parallel", _BUILD, colour=0x17BECF, parallel=True)  # a parallel target's own decoding

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -44,4 +44,4 @@ class AlwaysSkip(Skip):
             chunk.skip(tokens, self.source.name)
 
 
-register(Part("skip", "always", "kerv_cli.methods.unverified:AlwaysSkip.build", traits={"takes_draft": True}))
+add("skip", "always", "kerv_cli.methods.unverified:AlwaysSkip.build", takes_draft=True)

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 
-register(
-    Part(
-        "environment",
-        "metaworld",
-        "kerv_cli.worlds.metaworld.spec:SPEC",
-        traits={"names": "kerv_cli.worlds.metaworld.tasks:NAMES"},
-    )
-)
+_NAMES = "kerv_cli.worlds.metaworld.tasks:NAMES"
+add("environment", "metaworld", "kerv_cli.worlds.metaworld.spec:SPEC", names=_NAMES)
 for _name, _made_by, _needed in (
     ("push", "push:Push", ("actions", "position")),
     ("actuation", "actuation:Actuation", ("actions",)),
@@ -21,5 +15,5 @@ for _name, _made_by, _needed in (
     ("camera", "camera:CameraJitter", ("model",)),
     ("object", "objects:Objects", ("model", "range")),
 ):
-    register(Part("stress", _name, f"kerv_cli.worlds.stress.{_made_by}", traits={"needed": _needed}))
-register(Part("stress", "none"))
+    add("stress", _name, f"kerv_cli.worlds.stress.{_made_by}", needed=_needed)
+add("stress", "none")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 
 
 @dataclass
@@ -33,7 +33,6 @@ class RayOptions:
     gpus: float = number(0.0, 0, 1024)  # per block
 
 
-register(Part("executor", "local", "kerv_cli.lab.executors.local:build", LocalOptions))
-for _name, _package, _options in (("slurm", "submitit", SlurmOptions), ("ray", "ray", RayOptions)):
-    _traits = {"package": _package, "extra": _name}
-    register(Part("executor", _name, f"kerv_cli.lab.executors.{_name}:build", _options, traits=_traits))
+add("executor", "local", "kerv_cli.lab.executors.local:build", LocalOptions)
+add("executor", "slurm", "kerv_cli.lab.executors.slurm:build", SlurmOptions, package="submitit", extra="slurm")
+add("executor", "ray", "kerv_cli.lab.executors.ray:build", RayOptions, package="ray", extra="ray")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import STATES, Part, reads, register
+from kerv_cli.base.registry import STATES, add
 
 _DRAFTER = "kerv_cli.methods.eagle.drafter:"
 
@@ -21,12 +21,6 @@ class DrafterProposerSettings:
     nodes: int = number(15, 1, MOST_TOKENS)  # tree nodes kept after reranking
 
 
-register(Part("artifact", "drafter", _DRAFTER + "ARTIFACT"))
-register(
-    Part(
-        *("proposer", "drafter", _DRAFTER + "DrafterProposer.build", DrafterProposerSettings),
-        needs=reads("drafter"),
-        colour=0x56B4E9,
-        traits={"when": STATES},
-    )
-)
+add("artifact", "drafter", _DRAFTER + "ARTIFACT")
+_build = (_DRAFTER + "DrafterProposer.build", DrafterProposerSettings)
+add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES)

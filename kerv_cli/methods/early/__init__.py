@@ -3,16 +3,11 @@ Registration."""
 
 from __future__ import annotations
 
-from kerv_cli.base.registry import PREFILL, Part, reads, register
+from kerv_cli.base.registry import PREFILL, add
 
 _DRAFTER = "kerv_cli.methods.early.drafter:"
 
-register(Part("artifact", "early", _DRAFTER + "ARTIFACT"))
-register(
-    Part(
-        *("proposer", "early", _DRAFTER + "EarlyProposer.build"),
-        needs=reads("early"),
-        colour=0xD4A6C8,
-        traits={"when": PREFILL, "chains": True},  # drafts whole chains, so that a merged draft can take it as a source
-    )
-)
+add("artifact", "early", _DRAFTER + "ARTIFACT")
+# chains: it drafts whole chains, so that a merged draft can take it as a source
+_build = _DRAFTER + "EarlyProposer.build"
+add("proposer", "early", _build, needs=("early",), colour=0xD4A6C8, when=PREFILL, chains=True)

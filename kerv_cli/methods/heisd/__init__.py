@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import STATES, Part, reads, register
+from kerv_cli.base.registry import STATES, add
 
 _RULES = "kerv_cli.methods.heisd.rules:"
 _BOUNDARY = "kerv_cli.methods.heisd.boundary:"
@@ -25,13 +25,8 @@ class HybridProposerSettings:
     neighbours: int = number(3, 1, MOST_TOKENS)
 
 
-register(
-    Part(
-        *("proposer", "hybrid", _RULES + "HybridProposer.build", HybridProposerSettings),
-        needs=reads("drafter", "datastore"),
-        traits={"when": STATES, "sides": True},
-    )
-)
+_hybrid = (_RULES + "HybridProposer.build", HybridProposerSettings, ("drafter", "datastore"))
+add("proposer", "hybrid", *_hybrid, when=STATES, sides=True)
 
 
 # --- which drafts are good enough (§2.1)
@@ -56,8 +51,8 @@ class HybridAcceptanceSettings:
     token_limit: int = number(15, 0, MOST_BINS)
 
 
-register(Part("acceptance", "sequence", _RULES + "ByGroup.build", SequenceAcceptanceSettings))
-register(Part("acceptance", "hybrid", _RULES + "ByProposer.build", HybridAcceptanceSettings))
+add("acceptance", "sequence", _RULES + "ByGroup.build", SequenceAcceptanceSettings)
+add("acceptance", "hybrid", _RULES + "ByProposer.build", HybridAcceptanceSettings)
 
 
 # --- which side of the hybrid proposer drafts (§4.4)
@@ -82,12 +77,10 @@ class RandomBoundarySettings:
     seed: int = number(0, 0, 2**32 - 1)
 
 
-_CHOOSES = {"chooses": True}
-for _side in ("retrieval", "drafter"):
-    register(Part("boundary", f"always_{_side}", _BOUNDARY + "Always.build", traits=_CHOOSES))
-_fused = (_BOUNDARY + "Fused.build", FusedBoundarySettings, reads("calibration"))
-register(Part("boundary", "fused", *_fused, traits=_CHOOSES))
-register(Part("boundary", "random", _BOUNDARY + "Random.build", RandomBoundarySettings, traits=_CHOOSES))
+for _name in ("always_retrieval", "always_drafter"):
+    add("boundary", _name, _BOUNDARY + "Always.build", chooses=True)
+add("boundary", "fused", _BOUNDARY + "Fused.build", FusedBoundarySettings, ("calibration",), chooses=True)
+add("boundary", "random", _BOUNDARY + "Random.build", RandomBoundarySettings, chooses=True)
 
 
 # --- what is executed without a verification (§4.3)
@@ -111,10 +104,4 @@ def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
     return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
 
 
-register(
-    Part(
-        *("skip", "similarity", _RULES + "VerifySkip.build", SimilaritySkipSettings),
-        needs=needs_of_similarity,
-        colour=0xF0E442,
-    )
-)
+add("skip", "similarity", _RULES + "VerifySkip.build", SimilaritySkipSettings, needs_of_similarity, colour=0xF0E442)

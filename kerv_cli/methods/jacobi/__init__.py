@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import STATES, Part, register
+from kerv_cli.base.registry import STATES, add
 
 
 @dataclass
@@ -17,4 +17,4 @@ class JacobiProposerSettings:
 
 
 _BUILD = "kerv_cli.methods.jacobi.proposer:JacobiProposer.build"
-register(Part("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, traits={"when": STATES}))
+add("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, when=STATES)

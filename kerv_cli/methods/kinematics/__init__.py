@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, Part, find, reads, register
+from kerv_cli.base.registry import PREFILL, NoSettings, add, find
 
 _PREDICTION = "kerv_cli.methods.kinematics.prediction:"
 _THRESHOLDS = "kerv_cli.methods.kinematics.thresholds:"
 
-register(Part("artifact", "calibration", "kerv_cli.methods.calibration:ARTIFACT"))
+add("artifact", "calibration", "kerv_cli.methods.calibration:ARTIFACT")
 
 # --- predictors, and proposers that draft by them (§3.1, §6)
 
@@ -23,16 +23,10 @@ for _name, _fitted, _colour in (
     ("damped", True, 0xA0522D),
     ("acceleration", True, 0x4C9F70),
 ):
-    register(Part("predictor", _name, _PREDICTION + "predictor_of", traits={"fitted": _fitted}))
-    register(
-        Part(
-            *("proposer", _name, _PREDICTION + "PredictionProposer.build"),
-            needs=reads("calibration") if _fitted else reads(),
-            colour=_colour,
-            traits={"when": PREFILL, "chains": True},
-        )
-    )
-register(Part("predictor", "draft", traits={"fitted": False}))  # of a rectifier only: the rejected draft's other tokens
+    add("predictor", _name, _PREDICTION + "predictor_of", fitted=_fitted)
+    _drafts = (_PREDICTION + "PredictionProposer.build", NoSettings, ("calibration",) if _fitted else ())
+    add("proposer", _name, *_drafts, colour=_colour, when=PREFILL, chains=True)
+add("predictor", "draft", fitted=False)  # of a rectifier only: the rejected draft's remaining tokens
 
 
 # --- what happens after a rejection (§3.1)
@@ -65,13 +59,8 @@ def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
     return ("calibration",) if find("predictor", settings.predictor).traits.get("fitted") else ()
 
 
-register(
-    Part(
-        *("rectifier", "compensate", _PREDICTION + "Compensation.build", CompensateSettings),
-        needs=needs_of_compensation,
-        check=check_compensate,
-    )
-)
+_compensation = (_PREDICTION + "Compensation.build", CompensateSettings)
+add("rectifier", "compensate", *_compensation, needs_of_compensation, check_compensate)
 
 
 # --- thresholds: r, in bins (§3.2)
@@ -114,6 +103,6 @@ def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...
 
 
 for _name, _class in (("kinematic", "Kinematic"), ("change", "Change")):
-    _build = f"{_THRESHOLDS}{_class}.build"
-    register(Part("threshold", _name, _build, KinematicThresholdSettings, needs_of_variability, check_radii))
-register(Part("threshold", "schedule", _THRESHOLDS + "Schedule.build", ScheduleThresholdSettings, check=check_radii))
+    _kinematic = (f"{_THRESHOLDS}{_class}.build", KinematicThresholdSettings, needs_of_variability, check_radii)
+    add("threshold", _name, *_kinematic)
+add("threshold", "schedule", _THRESHOLDS + "Schedule.build", ScheduleThresholdSettings, check=check_radii)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, Part, find, register
+from kerv_cli.base.registry import PREFILL, add, find
 
 
 @dataclass
@@ -36,12 +36,6 @@ def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
     return tuple(dict.fromkeys(kind for name in names for kind in find("proposer", name).needs(None)))
 
 
-register(
-    Part(
-        *("proposer", "merged", "kerv_cli.methods.merged.proposer:MergedProposer.build", MergedProposerSettings),
-        needs=needs_of_sources,
-        check=check_merged,
-        colour=0xCC79A7,
-        traits={"when": PREFILL},
-    )
-)
+_BUILD = "kerv_cli.methods.merged.proposer:MergedProposer.build"
+_parts = (_BUILD, MergedProposerSettings, needs_of_sources, check_merged)
+add("proposer", "merged", *_parts, colour=0xCC79A7, when=PREFILL)

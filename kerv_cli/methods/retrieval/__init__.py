@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, Part, reads, register
+from kerv_cli.base.registry import PREFILL, add
 
 _DATASTORE = "kerv_cli.methods.retrieval.datastore:"
 
@@ -28,15 +28,9 @@ class QdrantSearchSettings:
     url: str | None = None  # a server, e.g. http://localhost:6333; None: the engine in this process
 
 
-register(Part("artifact", "datastore", _DATASTORE + "ARTIFACT"))
-register(
-    Part(
-        *("proposer", "retrieval", _DATASTORE + "RetrievalProposer.build", RetrievalProposerSettings),
-        needs=reads("datastore"),
-        colour=0x009E73,
-        traits={"when": PREFILL, "chains": True},
-    )
-)
+add("artifact", "datastore", _DATASTORE + "ARTIFACT")
+_retrieval = (_DATASTORE + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
+add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
 # what searches (§4.1): every backend finds the same neighbours
-register(Part("datastore", "exact", "kerv_cli.methods.retrieval.search:exact_index"))
-register(Part("datastore", "qdrant", "kerv_cli.methods.retrieval.qdrant:qdrant_index", QdrantSearchSettings))
+add("datastore", "exact", "kerv_cli.methods.retrieval.search:exact_index")
+add("datastore", "qdrant", "kerv_cli.methods.retrieval.qdrant:qdrant_index", QdrantSearchSettings)

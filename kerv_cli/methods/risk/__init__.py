@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_DECODES, number
-from kerv_cli.base.registry import Part, find, reads, register
+from kerv_cli.base.registry import add, find
 
 _SCORES = "kerv_cli.methods.risk.scores:"
 
@@ -39,15 +39,10 @@ def needs_of_risk(settings: RiskSkipSettings) -> tuple[str, ...]:
     return (*certified, *find("score", settings.score, "skip.score").needs(None))
 
 
-register(Part("artifact", "risk", "kerv_cli.methods.risk.recording:ARTIFACT"))
-register(Part("artifact", "score", _SCORES + "ARTIFACT"))
-register(
-    Part(
-        *("skip", "risk", "kerv_cli.methods.risk.gate:RiskSkip.build", RiskSkipSettings, needs_of_risk, check_risk),
-        colour=0x3B6FB6,
-        traits={"takes_draft": True, "merges": True, "retrieves": True},
-    )
-)
+add("artifact", "risk", "kerv_cli.methods.risk.recording:ARTIFACT")
+add("artifact", "score", _SCORES + "ARTIFACT")
+_gate = ("kerv_cli.methods.risk.gate:RiskSkip.build", RiskSkipSettings, needs_of_risk, check_risk)
+add("skip", "risk", *_gate, colour=0x3B6FB6, takes_draft=True, merges=True, retrieves=True)
 for _name, _score, _needs in (
     ("odds", "Odds", ("early",)),
     ("entropy", "Entropy", ("early",)),
@@ -58,4 +53,4 @@ for _name, _score, _needs in (
     ("similarity", "Similarity", ("datastore",)),
     ("learned", "Learned", ("early", "score")),
 ):
-    register(Part("score", _name, _SCORES + _score, needs=reads(*_needs)))
+    add("score", _name, _SCORES + _score, needs=_needs)

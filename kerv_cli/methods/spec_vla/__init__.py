@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_BINS, number
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 
 _RULES = "kerv_cli.methods.spec_vla.rules:"
 
-register(Part("acceptance", "strict", _RULES + "strict"))  # a draft token must equal the target's: lossless
+add("acceptance", "strict", _RULES + "strict")  # a draft token must equal the target's: lossless
 
 
 @dataclass
@@ -20,7 +20,7 @@ class RelaxedAcceptanceSettings:
     strict_dofs: bool = True  # ours: the action space's strict DoFs must match; the paper has one r for all
 
 
-register(Part("acceptance", "relaxed", _RULES + "Relaxed.build", RelaxedAcceptanceSettings))
+add("acceptance", "relaxed", _RULES + "Relaxed.build", RelaxedAcceptanceSettings)
 
 
 # that r lies below the number of tokens is checked when a threshold is built
@@ -32,4 +32,4 @@ class FixedThresholdSettings:
     r: int = number(9, 0, MOST_BINS)
 
 
-register(Part("threshold", "fixed", _RULES + "fixed", FixedThresholdSettings))
+add("threshold", "fixed", _RULES + "fixed", FixedThresholdSettings)

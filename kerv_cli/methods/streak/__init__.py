@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 
 
 @dataclass
@@ -18,10 +18,5 @@ class StreakSkipSettings:
     tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
 
 
-register(
-    Part(
-        *("skip", "streak", "kerv_cli.methods.streak.skip:StreakSkip.build", StreakSkipSettings),
-        colour=0xE8C547,
-        traits={"takes_draft": True, "merges": True},
-    )
-)
+_BUILD = "kerv_cli.methods.streak.skip:StreakSkip.build"
+add("skip", "streak", _BUILD, StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
