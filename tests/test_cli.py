@@ -1,4 +1,4 @@
-"""The command line as a user meets it: a real process, its output, its exit code."""
+"""The command line as a user meets it: its output, its exit code; in a process of its own where that matters."""
 
 from __future__ import annotations
 
@@ -12,13 +12,23 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
+
+from kerv_cli.cli.app import app
 
 FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
 
-def kerv(*arguments: str, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
+def kerv(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command in this process, which has loaded the libraries already."""
+    run = CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+    return subprocess.CompletedProcess(arguments, run.exit_code, run.stdout, run.stderr)
+
+
+def process(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """The command as a shell starts it."""
     command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env={**os.environ, **env})
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, **env})
 
 
 def one_line(run: subprocess.CompletedProcess[str], code: int) -> str:
@@ -34,7 +44,7 @@ def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
     heavy = "{'torch', 'mujoco', 'hydra', 'pandas', 'rerun'}"
     code = f"import sys, kerv_cli.cli.app; print(sorted({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
-    run = kerv("--help")
+    run = process("--help")
     assert run.returncode == 0
     for command in ("demos", "train", "build", "calibrate", "rollout", "sweep", "report", "view", "doctor"):
         assert f"  {command} " in run.stdout
@@ -43,7 +53,7 @@ def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
 def test_help_is_fast() -> None:
     def seconds() -> float:
         began = time.perf_counter()
-        kerv("--help")
+        process("--help")
         return time.perf_counter() - began
 
     python = min(_python_start() for _ in range(3))
@@ -84,7 +94,7 @@ def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path
     assert "no target 'absent'" in one_line(kerv("rollout", *common, "policy.target=absent"), 2)
     weights = results / "artifacts/target/nano-state/model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-7])
-    assert "does not match its description" in one_line(kerv("rollout", *common, "policy.target=nano-state"), 1)
+    assert "does not match its description" in one_line(process("rollout", *common, "policy.target=nano-state"), 1)
     shutil.copytree(results / "artifacts/drafter/nano-state", results / "wrong")
     wrong = ["method=spec_vla", "policy.target=nano-vision", f"policy.drafter={results}/wrong"]
     assert "was trained for target" in one_line(kerv("rollout", *common, *wrong), 1)
@@ -92,14 +102,14 @@ def test_what_is_missing_or_damaged_gets_one_line_and_exit_code_1(policies: Path
 
 
 def test_an_empty_results_folder_says_what_to_run(tmp_path: Path) -> None:
-    assert "kerv sweep" in one_line(kerv("report", f"results={tmp_path}"), 2)
+    assert "kerv sweep" in one_line(process("report", f"results={tmp_path}"), 2)
     assert "kerv rollout" in one_line(kerv("view", f"results={tmp_path}"), 2)
 
 
 def test_no_graphics_gets_the_command_that_brings_them(policies: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     shutil.copytree(policies, results)
-    run = kerv(
+    run = process(
         "rollout",
         "task=reach-v3",
         *FAST,
@@ -163,7 +173,7 @@ def test_sweep_resumes_and_report_writes_tables(policies: Path, tmp_path: Path) 
 
 
 def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:
-    run = kerv("rollout", "method=spec_vla", "threshold.r=3", "--cfg")
+    run = process("rollout", "method=spec_vla", "threshold.r=3", "--cfg")
     assert run.returncode == 0
     assert "kind: drafter" in run.stdout
     assert "  r: 3" in run.stdout

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +11,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import load_file
+from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.cli.app import app
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.methods.artifacts import artifact_folder
 from kerv_cli.methods.early.drafter import (
@@ -328,9 +328,8 @@ def test_a_single_episode_cannot_be_held_out() -> None:
 def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results: Path) -> None:
     words = ["train", "drafter", "drafter=early", "demos=few", "policy.target=nano-vision", "policy.early=whole"]
     words += ["drafter.width=32", "drafter.rank=8", "train.batch=8", "train.steps=4", "train.held_out=0.34"]
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words, f"results={results}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
-    assert done.returncode == 0, done.stderr
+    done = CliRunner().invoke(app, [*words, f"results={results}"])
+    assert done.exit_code == 0, done.output
     assert "accepted_r9" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
     early, own = load_early(results / "artifacts/early/whole", target, description)

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 from examples.insertion import SPEC as INSERTION
+from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
+from kerv_cli.cli.app import app
 from kerv_cli.lab.identity import stress_of, work_of
 from kerv_cli.lab.policy import check
 from kerv_cli.lab.run import Runner, close_worlds
@@ -400,8 +402,8 @@ def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -
     assert run.returncode == 0, run.stderr
     rows = json.loads(run.stdout)["settings"]
     assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]
-    wrong = kerv("rollout", *WORDS, "world.stress.level=5", cwd=tmp_path)
-    assert (wrong.returncode, wrong.stderr) == (2, "kerv: world.stress.level=5: from 0 to 4\n")
+    wrong = CliRunner().invoke(app, ["rollout", *WORDS, "world.stress.level=5", f"results={tmp_path}"])
+    assert (wrong.exit_code, wrong.stderr) == (2, "kerv: world.stress.level=5: from 0 to 4\n")
 
 
 def test_the_plan_and_the_figures_say_which_stress_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -47,13 +47,19 @@ def episodes(cell: Cell) -> list[EpisodeRecord]:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> StudyData:
-    store = StudyStore(tmp_path_factory.mktemp("stress"), "stress")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stress")
+    store = StudyStore(folder, "stress")
     cells = plan(settings(), TASKS, {"target": "t"}, baseline="ar")
     for cell in cells:
         store.write_cell(cell, episodes(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
     store.write_plan(StudySettings("stress", "", "ar"), cells)
-    return load_study(store)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def data(results: Path) -> StudyData:
+    return load_study(StudyStore(results, "stress"))
 
 
 @pytest.fixture(scope="module")
@@ -115,14 +121,11 @@ def test_sums_count_every_stressed_world_once(table: pd.DataFrame) -> None:
     assert found["bold push"]["non_inferior"] is (found["bold push"]["difference_low"] > -0.03)
 
 
-def test_the_report_writes_the_sums_and_shows_them(data: StudyData, tmp_path: Path) -> None:
-    store = StudyStore(tmp_path, "stress")
-    for cell in data.plan.cells:
-        store.write_cell(cell, episodes(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
-    store.write_plan(StudySettings("stress", "", "ar"), list(data.plan.cells))
-    written = {path.name for path in report(tmp_path, "stress").files}
+def test_the_report_writes_the_sums_and_shows_them(results: Path) -> None:
+    written = {path.name for path in report(results, "stress").files}
     assert {"stress_summed.csv", "stress_summed.png", "stress.png"} <= written
-    assert "Summed over levels" in (store.root / "report.html").read_text(encoding="utf-8")
+    page = StudyStore(results, "stress").root / "report.html"
+    assert "Summed over levels" in page.read_text(encoding="utf-8")
 
 
 def test_the_sentence_says_who_falls_behind_where(data: StudyData, table: pd.DataFrame) -> None:

@@ -348,12 +348,16 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cells = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
     store.write_plan(threshold_settings(), cells)
     execute(cells[:-1], prepare, store)
-    report(folder, "threshold")
     return folder
 
 
-def test_report_writes_the_same_bytes_again(results: Path) -> None:
-    written = report(results).files
+@pytest.fixture(scope="module")
+def written(results: Path) -> list[Path]:
+    """The files of its report."""
+    return report(results).files
+
+
+def test_report_writes_the_same_bytes_again(results: Path, written: list[Path]) -> None:
     names = [path.relative_to(results).as_posix() for path in written]
     assert names == [
         "report/tables/threshold.csv",
@@ -376,6 +380,7 @@ def test_report_writes_the_same_bytes_again(results: Path) -> None:
     assert all(len(content) > 2000 for path, content in before.items() if path.suffix != ".csv")
 
 
+@pytest.mark.usefixtures("written")
 def test_the_page_stands_alone(results: Path) -> None:
     page = (results / "studies" / "threshold" / "report.html").read_text(encoding="utf-8")
     assert page.count("<svg") == 3

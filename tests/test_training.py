@@ -16,11 +16,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from torch import nn
+from typer.testing import CliRunner
 
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainSettings
+from kerv_cli.cli.app import app
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
@@ -259,33 +261,21 @@ def test_batched_greedy_decoding_is_the_decoders() -> None:
         assert decoder.decode_prompt(prompt).tokens == expected.tolist()
 
 
-def train(results: Path, *arguments: str) -> list[str]:
-    return [
-        sys.executable,
-        "-W",
-        "ignore",
-        "-m",
-        "kerv_cli.cli.app",
-        "train",
-        *arguments,
-        f"results={results}",
-        "demos=few",
-    ]
+def train(results: Path, *arguments: str) -> str:
+    """What the command prints."""
+    done = CliRunner().invoke(app, ["train", *arguments, f"results={results}", "demos=few"])
+    assert done.exit_code == 0, done.output
+    return done.stdout
 
 
 @pytest.mark.bits
 def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results: Path) -> None:
-    settings = [
-        "target=nano",
-        "target.observation=state",
-        "task=drawer-close",
-        "train.batch=8",
-        "train.validate_every=5",
-    ]
-    command = train(results, "target", *settings, "train.steps=25")
-    whole = subprocess.run([*command, "name=whole"], capture_output=True, text=True, timeout=200)
-    assert whole.returncode == 0, whole.stderr
-    killed = subprocess.Popen([*command, "name=cut"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    settings = ["target=nano", "target.observation=state", "task=drawer-close"]
+    settings += ["train.batch=8", "train.validate_every=5", "train.steps=25"]
+    train(results, "target", "name=whole", *settings)
+    words = ["train", "target", "name=cut", *settings, f"results={results}", "demos=few"]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words]
+    killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = results / "artifacts/target/cut"
     deadline = time.monotonic() + 100
     while not (folder / "resume.safetensors").exists() and time.monotonic() < deadline:
@@ -293,8 +283,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
     assert 5 <= read_state(folder / "resume.safetensors")[1].step <= 25
-    resumed = subprocess.run([*command, "name=cut"], capture_output=True, text=True, timeout=200)
-    assert resumed.returncode == 0, resumed.stderr
+    train(results, "target", "name=cut", *settings)
     a, b = (load_file(results / f"artifacts/target/{n}/model.safetensors") for n in ("whole", "cut"))
     assert a.keys() == b.keys()
     assert all(torch.equal(a[k], b[k]) for k in a)
@@ -303,18 +292,9 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
     settings = ["target=nano", "task=drawer-close", "train.batch=4", "train.steps=6", "train.scene_steps=2"]
     settings += ["train.validate_every=3", "train.closed_loop=1", "world.horizon=8"]
-    first = subprocess.run(
-        train(results, "target", "name=seen", *settings),
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert first.returncode == 0, first.stderr
-    assert "closed_loop_success" in first.stdout
+    assert "closed_loop_success" in train(results, "target", "name=seen", *settings)
     drafter = ["train.steps=4", "train.batch=4", "train.validate_every=2", "drafter.samples=20", "drafter.noise=0.1"]
-    second = subprocess.run(
-        train(results, "drafter", "policy.target=seen", *drafter), capture_output=True, text=True, timeout=300
-    )
-    assert second.returncode == 0, second.stderr
-    assert "acceptance_length_r9" in second.stdout
+    assert "acceptance_length_r9" in train(results, "drafter", "policy.target=seen", *drafter)
     described = json.loads((results / "artifacts/drafter/seen/drafter.json").read_text())
     target = json.loads((results / "artifacts/target/seen/target.json").read_text())
     assert described["target"] == target["sha256"]
