@@ -76,6 +76,7 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("few_validations")
 @pytest.mark.parametrize(("cover", "study"), [("three", "coverage_3"), ("half", "coverage_half")])
 def test_the_documented_commands_make_what_the_study_names(results: Path, cover: str, study: str) -> None:
     def kerv(*words: str) -> str:

@@ -94,6 +94,7 @@ def test_what_was_written_is_read_back(results: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("few_validations")
 def test_everything_trains_on_recorded_observations_of_an_openvla(results: Path) -> None:
     imported(write_checkpoint(results / "tiny"), results, name="rec", control_hz=20.0)
     common = ["policy.target=rec", "demos=back", f"results={results}"]

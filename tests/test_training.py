@@ -289,6 +289,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     assert all(torch.equal(a[k], b[k]) for k in a)
 
 
+@pytest.mark.usefixtures("few_validations")
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
     settings = ["target=nano", "task=drawer-close", "train.batch=4", "train.steps=6", "train.scene_steps=2"]
     settings += ["train.validate_every=3", "train.closed_loop=1", "world.horizon=8"]

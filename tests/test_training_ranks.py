@@ -11,9 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.settings import TrainSettings, WorldSettings
+from kerv_cli.cli.app import app
 from kerv_cli.training.dagger import TargetActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import sample_weights
@@ -61,12 +63,11 @@ def test_two_processes_train_what_one_does(results: Path) -> None:
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     script = Path(sys.executable).parent / "kerv"
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", str(script)]
-    outputs = {}
-    for name, command in (("one", [sys.executable, str(script)]), ("two", launcher)):
-        done = subprocess.run([*command, *words, f"name={name}"], env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        outputs[name] = done.stdout
-    assert outputs["two"].count("best checkpoint") == 1  # the first rank alone reports
+    alone = CliRunner().invoke(app, [*words, "name=one"])
+    assert alone.exit_code == 0, alone.output
+    done = subprocess.run([*launcher, *words, "name=two"], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("best checkpoint") == 1  # the first rank alone reports
     one, two = (pd.read_csv(results / "artifacts/target" / name / "log.csv") for name in ("one", "two"))
     assert list(one["step"]) == [2, 4]
     np.testing.assert_allclose(one.drop(columns="train_loss"), two.drop(columns="train_loss"), rtol=1e-3, atol=1e-4)
