@@ -11,10 +11,10 @@ from typing import Any
 
 import examples.insertion  # noqa: F401 - registers the environment with seven degrees of freedom
 import pytest
-from kerv_cli.methods.parts import PART_GROUPS
 
 from kerv_cli.base import registry
 from kerv_cli.base.config import Composer, conf_dir
+from kerv_cli.base.registry import PART_GROUPS
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

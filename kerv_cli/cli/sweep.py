@@ -66,15 +66,21 @@ def sweep(
     store = StudyStore(first.results, resolved.study.name)
     stock = Stock(store)
     covered = cover(wanted, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
+    _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
     if plan:
         _print_plan(covered, store, first.runtime.workers, as_json)
         return
     outcome = _run(resolved, covered, store, words)
     _tell(outcome, resolved, covered.cells, store, words, as_json)
-    for line in disagreements(outcome.done, Stock(store, others=False)) if resolved.rerun != "never" else ():
-        typer.echo(f"kerv: {line}", err=True)
+    if resolved.rerun != "never":
+        _warn(disagreements(outcome.done, Stock(store, others=False)))
     if outcome.failed:
         raise typer.Exit(1)
+
+
+def _warn(lines: Iterable[str]) -> None:
+    for line in lines:
+        typer.echo(f"kerv: warning: {line}", err=True)
 
 
 def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
@@ -175,8 +181,13 @@ def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> Non
     command, for the one that is named."""
     from kerv_cli.lab.run_file import sweep_command
     from kerv_cli.report.summary import not_in_turn, summary_table
+    from kerv_cli.report.tables import values_of
 
     console().print(summary_table(table))
+    codes, commits = values_of(table, "code"), values_of(table, "git_commit")
+    if len(codes) > 1:
+        names = ", ".join(sorted(commit[:12] for commit in commits))
+        typer.echo(f"its cells are of {len(codes)} states of the code, commits {names}")
     apart = not_in_turn(table)
     if apart:
         command = runnable(f"'{sweep_command(store.root, store.name, 'rerun=timed')}'", words)
