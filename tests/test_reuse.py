@@ -8,6 +8,8 @@ import shutil
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from studies_synthetic import (
     IDENTITY,
@@ -19,6 +21,7 @@ from studies_synthetic import (
     threshold_study,
 )
 
+from kerv_cli.base.files import sha256_of
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.lab import identity
 from kerv_cli.lab.execute import execute
@@ -227,3 +230,24 @@ def test_a_study_renamed_by_hand_is_the_study_of_its_new_name(store: StudyStore)
     store.root.rename(store.root.with_name("better"))
     assert load_study(StudyStore(store.root.parent.parent, "better")).plan.name == "better"
     assert not cover(threshold_study(["reach-v3"]), Stock(store)).reasons, "found in the other folder"
+
+
+def test_columns_that_a_cell_lacks_are_empty_and_further_ones_stay(store: StudyStore) -> None:
+    """As between two versions of kerv: one cell is older than a column, and has one of a newer version."""
+    cells = threshold_study(["reach-v3"])
+    swept(store, cells)
+    folder = store.cells / cells[0].id
+    table = pq.read_table(folder / "episodes.parquet").drop_columns(["audits", "audit_loss"])
+    table = table.append_column("of_a_newer_kerv", pa.array(range(table.num_rows)))
+    pq.write_table(table, folder / "episodes.parquet")
+    status = json.loads((folder / "status.json").read_text())
+    status["files"]["episodes.parquet"] = sha256_of(folder / "episodes.parquet")
+    del status["sha256"], status["format"]
+    (folder / "status.json").write_text(json.dumps(status))
+
+    episodes = load_study(store).episodes
+    assert episodes.loc[episodes["label"] == "ar", "audits"].isna().all()
+    assert episodes.loc[episodes["label"] == "ar", "of_a_newer_kerv"].tolist() == [0, 1, 2, 3]
+    assert episodes.loc[episodes["label"] == "naive_sd", "of_a_newer_kerv"].isna().all()
+    assert table_of(store)["successes"].notna().all()
+    assert not cover(cells, Stock(store)).reasons

@@ -122,7 +122,9 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{what} at {path} is damaged ({error}): delete it and train or copy it again") from error
+        raise CheckpointError(
+            f"{what} at {path} is damaged ({error}): move it aside and train or copy it again"
+        ) from error
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise CheckpointError(f"{what} at {path} has numbers in {name} that are not finite: train it again")

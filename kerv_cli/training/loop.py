@@ -196,7 +196,7 @@ class Loop:
         tensors, progress = read_state(path)
         if progress.identity != self.identity:
             raise CheckpointError(
-                f"{self.folder} holds a run with other settings or data: choose another name=, or delete that folder"
+                f"{self.folder} holds a run with other settings or data: choose another name=, or move it aside"
             )
         self.job.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
         self.ema = {k[4:]: v.to(self.ema[k[4:]].device) for k, v in tensors.items() if k.startswith("ema.")}
@@ -225,7 +225,7 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
     Raises:
         CheckpointError: the file is damaged, or holds numbers that are not finite.
     """
-    again = f"delete {path.parent} to begin again"
+    again = f"move {path.parent} aside to begin again"
     try:
         with safe_open(path, "pt") as file:
             state = json.loads((file.metadata() or {})["state"])

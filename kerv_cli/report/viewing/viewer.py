@@ -217,4 +217,4 @@ def _chunks(reader: RrdReader, path: Path) -> list[Any]:
 
 def _damaged(path: Path, error: Exception) -> str:
     reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")
-    return f"{path} is damaged ({reason}): delete it and record the episode again"
+    return f"{path} is damaged ({reason}): record the episode again"

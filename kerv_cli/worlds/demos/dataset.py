@@ -175,7 +175,9 @@ class DemoDataset:
         """
         entry = self.episodes[index]
         if sha256_of(entry.path) != entry.sha256:
-            raise CheckpointError(f"{entry.path} changed since it was recorded: delete it and run 'kerv demos' again")
+            raise CheckpointError(
+                f"{entry.path} changed since it was recorded: move it aside and run 'kerv demos' again"
+            )
         return load_episode(entry.path, self.manifest.actions, self.manifest.observation)
 
 
