@@ -174,6 +174,22 @@ def test_a_task_that_the_policy_never_saw_is_named(capsys: pytest.CaptureFixture
     assert capsys.readouterr().err == line
 
 
+@pytest.mark.parametrize(
+    ("words", "labels"),
+    [
+        (["proposer=hold", "acceptance=relaxed", "threshold.r=5"], ["ar proposer=hold acceptance=relaxed"]),
+        (["prefill_draft=hold"], ["ar prefill_draft=hold"]),
+        (["method=spec_vla", "threshold.r=3,5", "rectifier=compensate"], ["spec_vla rectifier=compensate r=3",
+                                                                         "spec_vla rectifier=compensate r=5"]),
+        (["method=ar,kerv"], ["ar", "kerv"]),
+    ],
+)  # fmt: skip
+def test_a_method_composed_on_the_command_line_is_called_what_it_is(words: list[str], labels: list[str]) -> None:
+    from kerv_cli.lab.resolve import resolve_rollout
+
+    assert list(resolve_rollout(words, multirun=True).settings) == labels
+
+
 # --- commands that are printed ---
 
 

@@ -12,6 +12,7 @@ from kerv_cli.base.config import MOST_POINTS, Composer, compose, expand, split_w
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.manifests import read
+from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.lab.effects import without_effect
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
@@ -68,7 +69,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     """The settings of `kerv rollout`: one, or with -m every point of the grid that comma lists form. Tasks are no axis
-    of the grid: every point runs on all of them. The first point without a drafter is the baseline.
+    of the grid: every point runs on all of them. The first point without a drafter is the baseline. A label is the
+    method's name, the parts that the command line puts in place of the method's, and the grid's values.
 
     Raises:
         UsageError: an unknown key or name, a value that cannot be, a grid over `results`.
@@ -84,7 +86,8 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
         composed = compose("rollout", [*shared, *point], RolloutSettings)
         composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
         values = [f"{key.rsplit('.', 1)[-1]}={_value(point, key)}" for key in varied]
-        label = " ".join([composed.method, *values])
+        parts = [word for word in point if _key(word) in METHOD_KINDS and _key(word) not in varied]
+        label = " ".join([composed.method, *parts, *values])
         settings[label], written[label] = composed, " ".join(point)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
     study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)

@@ -187,8 +187,8 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     """The JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
     path = folder / f"{kind}.json"
     if not path.is_file():
-        command = _TRAINED_BY.get(kind, f"train {kind}")
-        raise CheckpointError(f"no {kind} in {folder}: run 'kerv {command}', or name a folder that holds one")
+        remedy = f"run 'kerv {_TRAINED_BY[kind]}', or name" if kind in _TRAINED_BY else "name"
+        raise CheckpointError(f"no {kind} in {folder}: {remedy} a folder that holds one")
     found = os.stat(path)
     version = found.st_ino, found.st_size, found.st_mtime_ns
     description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]
