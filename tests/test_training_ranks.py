@@ -157,3 +157,16 @@ def test_a_target_of_another_frame_size_is_refused() -> None:
 def test_a_target_of_other_actions_is_refused() -> None:
     with pytest.raises(CheckpointError, match="target 'mt10-state'"):
         TargetActs.of("results", "mt10-state", spec_of("insert-peg"), WorldSettings())
+
+
+@pytest.mark.parametrize(
+    ("camera", "accepted"), [("corner4+gripperPOV:75", True), ("corner", False), ("corner4:60", False)]
+)
+def test_a_recording_may_show_further_views_than_the_target_sees(camera: str, accepted: bool) -> None:
+    settings = WorldSettings()
+    settings.camera.name = camera
+    if accepted:
+        assert TargetActs.of("results", "mt10-vision", SPEC, settings).sha256
+    else:
+        with pytest.raises(UsageError, match=r"or begin with corner4\+"):
+            TargetActs.of("results", "mt10-vision", SPEC, settings)

@@ -52,7 +52,10 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
         CheckpointError: as `check`.
     """
     if is_expert(settings):
-        return {"target": "", OBSERVATION: "state (privileged)"}
+        tasks = resolve_tasks(settings.task)
+        experts = spec_of(tasks[0]).experts
+        ours = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
+        return {"target": "", **({"expert": ours} if ours else {}), OBSERVATION: "state (privileged)"}
     profile = timing.identity_of(settings)
     artifacts = artifacts_of(settings)
     shown = shown_to(artifacts.description.settings)

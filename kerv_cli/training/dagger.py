@@ -83,7 +83,8 @@ class TargetActs:
 
     @classmethod
     def of(cls, results: str, name: str, spec: EnvironmentSpec, world: WorldSettings) -> TargetActs:
-        """The target of that name, for worlds of an environment.
+        """The target of that name, for worlds of an environment. The recording may show further views behind those
+        that the target sees, for a target that will see them.
 
         Raises:
             UsageError: no such target, frames of another camera, or as `check_world`. CheckpointError: it is damaged,
@@ -94,10 +95,10 @@ class TargetActs:
         description.check_world(name, spec.name, spec.actions, world.camera.size)
         views = [spec.camera_name(view) for view in description.cameras]
         camera = spec.camera_name(world.camera.name)
-        if views and camera not in views:
+        if views and not f"{camera}+".startswith(f"{views[0]}+"):
             raise UsageError(
-                f"policy.target={name} sees {views[0]}, the recording would show {camera}: set "
-                f"world.camera.name={views[0]}"
+                f"policy.target={name} sees {views[0]}, the recording would show {camera}: world.camera.name must be "
+                f"{views[0]}, or begin with {views[0]}+"
             )
         return cls(folder, description.sha256)
 

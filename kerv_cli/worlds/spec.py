@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 from kerv_cli.base.errors import UnknownName, UsageError
@@ -156,7 +156,8 @@ class EnvironmentSpec:
     with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras
     whose raw images are rotated by 180 degrees. suffix: ending of all full task names, which users may leave out.
     packages: those whose versions determine the physics. grip: actions of the strict DoFs that close and that open the
-    gripper; empty where there is none.
+    gripper; empty where there is none. experts: task -> name of its expert, where that is another than the simulator's
+    own: it determines what a recording holds and what policy=expert does.
     """
 
     name: str
@@ -174,6 +175,7 @@ class EnvironmentSpec:
     packages: tuple[str, ...] = ()
     grip: tuple[float, float] | tuple[()] = ()
     seeds: Seeds = Seeds()
+    experts: Mapping[str, str] = field(default_factory=dict)
 
     def full_name(self, task: str) -> str | None:
         """The task's full name; None when it is none of this environment's."""

@@ -259,6 +259,9 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
         # recordings from before there were actors lack them and may resume
         del settings["policy"], settings["expert_share"]
     spec = config.spec
+    experts = {task: spec.experts[task] for task in config.tasks if task in spec.experts}
+    if experts:
+        settings["experts"] = experts
     versions = {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()}
     identity = {
         "format": FORMAT,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
+from kerv_cli.worlds.metaworld.experts import OURS, VERSION
 from kerv_cli.worlds.metaworld.tasks import DIFFICULTIES, SUFFIX, SUITES, TASKS
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -41,4 +42,5 @@ SPEC = EnvironmentSpec(
     suffix=SUFFIX,
     packages=("metaworld", "mujoco"),
     grip=(1.0, -1.0),
+    experts=dict.fromkeys(OURS, VERSION),
 )

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds.camera import CameraConfig, load_mujoco
+from kerv_cli.worlds.metaworld.experts import OURS
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.world import MujocoWorld
 
@@ -119,7 +120,7 @@ class MetaWorld(MujocoWorld):
 
 
 class MetaWorldExpert:
-    """Meta-World's scripted controller of one task."""
+    """Meta-World's scripted controller of one task, or ours where there is one (`experts.OURS`)."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
         """Raises UnknownName for a task that does not exist."""
@@ -128,7 +129,7 @@ class MetaWorldExpert:
         from metaworld.policies import ENV_POLICY_MAP
 
         self._limits = spec.actions.low, spec.actions.high
-        self._policy: Any = ENV_POLICY_MAP[name]()
+        self._policy: Any = {**ENV_POLICY_MAP, **OURS}[name]()
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
         """The expert's action (4,), clipped: raw outputs reach 25, so clip before any use."""
