@@ -25,7 +25,7 @@ def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, Com
     following = torch.cat([prompt[:, 1:], target.embed(torch.tensor([[7]]))], 1)
     observe(drafter, state, following, hidden, 0)
     found = draft_tree(drafter, target, state, depth, top_k, nodes)
-    tree = found if isinstance(found, TokenTree) else found.placed(found.numbers.numpy())[0]
+    tree = found if isinstance(found, TokenTree) else found.assemble(found.numbers.numpy())[0]
     return drafter, target, state, tree
 
 

@@ -113,13 +113,13 @@ class Strict:
     space: ActionSpace
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """The same for all."""
+        """This rule, whatever the proposer."""
         return self
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """As `Acceptance.limits`: all zero."""
+        """Zero for every DoF (D,)."""
         return (0,) * self.space.dofs
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """As `Acceptance.judge`: by distance."""
+        """The longest path within the limits, by `accept_by_distance`."""
         return accept_by_distance(tree, target_tokens, start, self.limits(r))

@@ -41,19 +41,19 @@ def attention_mask(
     stop = cached + tokens
     slots = cache.buffer.shape[-2] if cache is not None and fixed else stop
     if isinstance(seen, Tensor):
-        there = like.new_zeros(tokens, slots)
-        there[:, stop - seen.shape[1] : stop].masked_fill_(~seen, -torch.inf)
-        there[:, stop:] = -torch.inf
-        return there
+        mask = like.new_zeros(tokens, slots)
+        mask[:, stop - seen.shape[1] : stop].masked_fill_(~seen, -torch.inf)
+        mask[:, stop:] = -torch.inf
+        return mask
     plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
     if plain and not fixed:
         return None
     if seen is None:
         seen = np.tri(tokens, dtype=bool)
-    mask = np.zeros((tokens, slots), dtype=np.float32)
-    mask[:, stop - seen.shape[1] : stop][~seen] = -np.inf
-    mask[:, stop:] = -np.inf
-    return upload(mask, like.device).to(like.dtype)
+    rows = np.zeros((tokens, slots), dtype=np.float32)
+    rows[:, stop - seen.shape[1] : stop][~seen] = -np.inf
+    rows[:, stop:] = -np.inf
+    return upload(rows, like.device).to(like.dtype)
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

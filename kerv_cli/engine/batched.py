@@ -60,7 +60,7 @@ class BatchDecoder:
         self._caches: dict[int, Cache] = {}
 
     def lane(self) -> Lane:
-        """A new place in the batch."""
+        """The state of one more episode of the batch."""
         return Lane(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()
@@ -69,14 +69,14 @@ class BatchDecoder:
         chunks = [self._chunk(prompt, lane) for prompt, lane in zip(self._prompts(observations), lanes, strict=True)]
         self._complete(chunks)
         records = [self._record(chunk) for chunk in chunks]
-        due = []
-        for place, lane in enumerate(lanes):
+        samples = []
+        for i, lane in enumerate(lanes):
             lane.decodes += 1
             if self.every and lane.decodes % self.every == 0:
-                due.append(place)
-        for place, wanted in zip(due, self._autoregressive([chunks[place] for place in due]), strict=True):
-            gap = deviation(self.target.actions, records[place].actions, wanted) if wanted is not None else 0.0
-            records[place] = replace(records[place], deviation=gap)
+                samples.append(i)
+        for i, actions in zip(samples, self._autoregressive([chunks[i] for i in samples]), strict=True):
+            gap = deviation(self.target.actions, records[i].actions, actions) if actions is not None else 0.0
+            records[i] = replace(records[i], deviation=gap)
         return records
 
     def _prompts(self, observations: Sequence[Observation]) -> list[Tensor]:
@@ -105,27 +105,27 @@ class BatchDecoder:
         target, length = self.target, prompt.shape[1]
         cache = self._cache(len(prompt))
         hidden = target.forward(prompt, torch.arange(length, device=prompt.device), cache)
-        found = [target.head(hidden[:, -1]).argmax(-1)]
+        columns = [target.head(hidden[:, -1]).argmax(-1)]
         for at in range(length, length + self._size - 1):
-            x = target.embed(found[-1][:, None])
+            x = target.embed(columns[-1][:, None])
             hidden = target.forward(x, torch.tensor([at], device=prompt.device), cache)
-            found.append(target.head(hidden[:, 0]).argmax(-1))
-        tokens: list[list[int]] = torch.stack(found, 1).tolist()
+            columns.append(target.head(hidden[:, 0]).argmax(-1))
+        tokens: list[list[int]] = torch.stack(columns, 1).tolist()
         return tokens
 
     def _autoregressive(self, chunks: Sequence[Chunk]) -> list[np.ndarray | None]:
         """The actions (H, D) that autoregressive decoding would have chosen for each chunk; None where it decoded
         them."""
-        found: list[np.ndarray | None] = [None] * len(chunks)
+        actions: list[np.ndarray | None] = [None] * len(chunks)
         if self.skip is None:
-            return found
+            return actions
         space = self.target.actions
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
-            places = [place for place, chunk in enumerate(chunks) if chunk.prompt_length == length]
-            wanted = self._tokens(torch.cat([chunks[place].prompt for place in places]))
-            for place, tokens in zip(places, wanted, strict=True):
-                found[place] = space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
-        return found
+            group = [i for i, chunk in enumerate(chunks) if chunk.prompt_length == length]
+            rows = self._tokens(torch.cat([chunks[i].prompt for i in group]))
+            for i, tokens in zip(group, rows, strict=True):
+                actions[i] = space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
+        return actions
 
     def _record(self, chunk: Chunk) -> DecodeRecord:
         actions, predicted = self.decoder.actions_of(chunk)
@@ -136,16 +136,16 @@ class BatchDecoder:
         return self.decoder.steps * self.target.actions.dofs
 
     def _cache(self, rows: int) -> Cache:
-        """An empty cache for so many rows. The last one is kept: episodes end one by one."""
+        """An empty cache of so many rows. Only the latest size stays allocated, as episodes end one by one."""
         if rows not in self._caches:
             self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self._size)}
         self._caches[rows].length = 0
         return self._caches[rows]
 
 
-def _one_by_one(chunks: Sequence[Chunk], found: Sequence[Sequence[int]]) -> None:
-    """Commits tokens as autoregressive decoding does."""
-    for chunk, tokens in zip(chunks, found, strict=True):
+def _one_by_one(chunks: Sequence[Chunk], rows: Sequence[Sequence[int]]) -> None:
+    """Commits each chunk's row of N tokens as autoregressive decoding does, a round for each."""
+    for chunk, tokens in zip(chunks, rows, strict=True):
         for start, token in enumerate(tokens):
             mode = "decode" if start else "prefill"
             chunk.commit(Round(mode, "none", start, (), (token,), 0, 1, 0, ()), [token])

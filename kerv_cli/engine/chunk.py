@@ -64,15 +64,15 @@ def _event() -> torch.cuda.Event:
     return event
 
 
-def steps_of(asked: int, trained: int) -> int:
-    """Control steps of a chunk: as many as asked for, 0 for as many as the target was trained for.
+def steps_of(chunk: int, trained: int) -> int:
+    """Control steps of a chunk: `chunk`, or, where that is 0, as many as the target was trained for.
 
     Raises:
         UsageError: more than it was trained for.
     """
-    if not 0 <= asked <= trained:
-        raise UsageError(f"chunk={asked}: the target was trained for {trained} control steps")
-    return asked or trained
+    if not 0 <= chunk <= trained:
+        raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
+    return chunk or trained
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,8 @@ class Chunk:
         self.rounds: list[Round] = []
         self.rejection = Rejection()
         self.hidden = torch.empty(0)
-        self.asked: list[tuple[Tensor, Callable[[np.ndarray], None]]] = []  # (n,) to read beside the next target tokens
+        # vectors (n,) that the host reads in the same copy as the next forward's target tokens, and their receivers
+        self.reads: list[tuple[Tensor, Callable[[np.ndarray], None]]] = []
         self.forwards = 0
         self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
         self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
@@ -169,9 +170,9 @@ class Chunk:
         self.rejection = rejection or Rejection()
         if played.drafted:
             both = np.array((played.drafted, played.target_tokens[: len(played.drafted)]))
-            drafted, wanted = self.space.values_of(both)
+            drafted, targets = self.space.values_of(both)
             moving = ~self.space.strict_tokens(self.size)[played.start : played.start + len(drafted)]
-            self._differences += np.abs(drafted - wanted)[moving].tolist()
+            self._differences += np.abs(drafted - targets)[moving].tolist()
 
     def skip(self, tokens: Sequence[int], proposer: str) -> None:
         """Takes all N tokens from `proposer`, without a verification."""

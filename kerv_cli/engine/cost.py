@@ -33,11 +33,11 @@ class Profile:
 
     def seconds(self, kind: str, rows: int) -> float:
         """Of one phase of so many rows."""
-        known, times = self.phases[kind]
-        if len(known) > 1 and rows > known[-1]:
-            slope = (times[-1] - times[-2]) / (known[-1] - known[-2])
-            return times[-1] + slope * (rows - known[-1])
-        return float(np.interp(rows, known, times))
+        measured, times = self.phases[kind]
+        if len(measured) > 1 and rows > measured[-1]:
+            slope = (times[-1] - times[-2]) / (measured[-1] - measured[-2])
+            return times[-1] + slope * (rows - measured[-1])
+        return float(np.interp(rows, measured, times))
 
     def decode(self, tokens: int) -> float:
         """Of an autoregressive decode of N tokens."""
@@ -116,13 +116,13 @@ def sequence_of(row: Mapping[str, Any], size: int, tokens: int) -> DecodeSequenc
         if played["mode"] == PARALLEL:
             forwards.append(Forward("prefill", 0, tokens, 0))
             continue
-        left, most = tokens - start - 1, size - start - 1  # tokens that a draft may have here, and had in the record
-        if left < 1:
+        depth, most = tokens - start - 1, size - start - 1  # tokens that a draft may have here, and had in the record
+        if depth < 1:
             nodes = 0
         elif nodes >= most:
-            nodes = math.ceil(nodes * left / most)
+            nodes = math.ceil(nodes * depth / most)
         kind = "prefill" if start == 0 else "verify"
-        accepted = min(int(played["accepted"]), left) if nodes else 0
+        accepted = min(int(played["accepted"]), depth) if nodes else 0
         forwards.append(Forward(kind, start, nodes, accepted, str(played["proposer"]) if nodes else ""))
     drafted = any(f.proposer == DRAFTER for f in forwards)
     host = sum(float(row[name]) for name in (_HOST if drafted else DECODE_TIMES))
@@ -130,7 +130,7 @@ def sequence_of(row: Mapping[str, Any], size: int, tokens: int) -> DecodeSequenc
 
 
 def sequence_of_record(decode: DecodeRecord) -> DecodeSequence:
-    """The same of a decode that was just made, uncut."""
+    """The forwards and host seconds of a decode that was just recorded, whole."""
     times = {name: decode.phases.get(name.removeprefix("seconds."), 0.0) for name in DECODE_TIMES}
     size = decode.size or len(decode.tokens)
     return sequence_of({"rounds": [vars(played) for played in decode.rounds], **times}, size, size)
@@ -140,12 +140,12 @@ def predicted(decode: DecodeSequence, profile: Profile) -> float:
     """Seconds of the decode by the cost model: the profile's times of its forwards, the drafter's passes
     and the states it is fed, and the recorded host seconds."""
     seconds = profile.seconds("encode", 1) + decode.host
-    for place, forward in enumerate(decode.forwards):
+    for i, forward in enumerate(decode.forwards):
         rows = forward.drafted + (profile.prompt if forward.kind == "prefill" else 1)
         seconds += profile.seconds(forward.kind, rows)
         if forward.proposer == DRAFTER:
             seconds += profile.drafting(min(forward.drafted, profile_depth(forward)))
-        if decode.drafts and place + 1 < len(decode.forwards):
+        if decode.drafts and i + 1 < len(decode.forwards):
             first = forward.kind == "prefill"
             seconds += profile.seconds("feed", profile.prompt if first else forward.accepted + 1)
     return seconds

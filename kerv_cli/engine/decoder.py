@@ -43,8 +43,8 @@ class Parts:
 
 @dataclass(frozen=True)
 class Verified:
-    """A forward's draft, read. tree: of n nodes. rows: (n,) the forwarded row of each. target_tokens: 1 + n, as
-    `accept_by_distance` takes them."""
+    """A forward's draft and target tokens, on the host. tree: of n nodes. rows: (n,) the forwarded row of each.
+    target_tokens: 1 + n, as `accept_by_distance` takes them."""
 
     tree: TokenTree
     rows: Sequence[int]
@@ -139,9 +139,9 @@ class Decoder:
         chunk = Chunk(prompt, self.steps, self.target.actions, self.cache, self.situation, limits, choice)
         clock.lap("propose")
         if parts.skip is not None:
-            taken = parts.skip.take(chunk)
+            skipped = parts.skip.take(chunk)
             clock.lap(parts.skip.phase)
-            if taken:
+            if skipped:
                 return chunk
         self.prefill(chunk, clock)
         if parts.proposer is not None and chunk.left > 1:
@@ -161,7 +161,7 @@ class Decoder:
         prompt, target, parts, length = chunk.prompt, self.target, self.parts, chunk.prompt_length
         draft: TokenTree | Unread = EMPTY
         if parts.prefill_draft is not None and chunk.size > 1:
-            # one token less than the chunk has, as in a round: the bonus fills the last place
+            # one token less than the chunk has, as in a round: the bonus is its last token
             draft = parts.prefill_draft.propose(chunk, chunk.size - 1)
             clock.lap("propose")
         if parts.proposer is not None and chunk.size > 1 and isinstance(parts.proposer, Asks):
@@ -191,7 +191,7 @@ class Decoder:
         draft: TokenTree | Unread = EMPTY
         proposer = self.parts.proposer
         if proposer is not None and chunk.left > 1:
-            # one token less than is left: the bonus fills the last place whether or not everything is accepted
+            # one token less than the chunk lacks: the bonus is its last token whether or not everything is accepted
             draft = proposer.propose(chunk, chunk.left - 1)
             clock.lap("propose")
         hidden, verified = self.verify(chunk, draft)
@@ -209,23 +209,24 @@ class Decoder:
             clock.lap("propose")
 
     def decode_alone(self, chunk: Chunk, clock: Clock) -> None:
-        """All tokens that are left, one forward each, without a proposer. Each goes from the device into the next
+        """The chunk's remaining tokens, one forward each, without a proposer. Each goes from the device into the next
         forward; all are read behind the last one."""
         target, first = self.target, chunk.prompt_length + len(chunk.tokens) - 1
         positions = torch.arange(first, first + chunk.left, device=target.device).split(1)
-        found = [upload(chunk.tokens[-1:], target.device)]
+        tokens = [upload(chunk.tokens[-1:], target.device)]
         for position in positions:
-            hidden = target.forward(target.embed(found[-1][None]), position, chunk.cache, None)
-            found.append(target.head(hidden)[0].argmax(-1))
+            hidden = target.forward(target.embed(tokens[-1][None]), position, chunk.cache, None)
+            tokens.append(target.head(hidden)[0].argmax(-1))
             clock.lap("verify")
-        tokens = torch.cat(found[1:]).tolist()
+        numbers = torch.cat(tokens[1:]).tolist()
         clock.lap("verify")
-        for token in tokens:
+        for token in numbers:
             self.accept(chunk, EMPTY, [token], None)
         clock.lap("accept")
 
     def verify(self, chunk: Chunk, draft: TokenTree | Unread) -> tuple[Tensor, Verified]:
-        """Forwards the last committed token and the draft's n rows -> hidden (1, 1 + n, E), and what was read."""
+        """Forwards the last committed token and the draft's n rows -> hidden (1, 1 + n, E), and the draft with its
+        target tokens on the host."""
         device, last = self.target.device, chunk.tokens[-1]
         at = chunk.prompt_length + len(chunk.tokens) - 1
         if isinstance(draft, Unread):
@@ -249,27 +250,27 @@ class Decoder:
 
     def read(self, chunk: Chunk, draft: TokenTree | Unread, argmax: Tensor) -> Verified:
         """argmax (1 + n,) behind the last token before the draft and behind each of its rows -> the tree and its target
-        tokens. Here, and here alone, a round waits for the device."""
-        asked, chunk.asked = chunk.asked, []
-        if isinstance(draft, TokenTree) and not asked:
+        tokens. A round waits for the device nowhere else."""
+        reads, chunk.reads = chunk.reads, []
+        if isinstance(draft, TokenTree) and not reads:
             return Verified(draft, range(len(draft)), argmax.tolist())
-        own = [draft.numbers] if isinstance(draft, Unread) else []
-        found, *numbers = read(argmax, *own, *(tensor for tensor, _ in asked))
-        for (_, receive), answer in zip(asked, numbers[len(own) :], strict=True):
-            receive(answer)
-        tokens = found.astype(np.int64).tolist()
+        drafts = [draft.numbers] if isinstance(draft, Unread) else []
+        targets, *vectors = read(argmax, *drafts, *(tensor for tensor, _ in reads))
+        for (_, receive), vector in zip(reads, vectors[len(drafts) :], strict=True):
+            receive(vector)
+        tokens = targets.astype(np.int64).tolist()
         if isinstance(draft, TokenTree):
             return Verified(draft, range(len(draft)), tokens)
-        tree, rows = draft.placed(numbers[0])
+        tree, rows = draft.assemble(vectors[0])
         return Verified(tree, rows, [tokens[0], *(tokens[1 + row] for row in rows)])
 
     def keep(self, chunk: Chunk, hidden: Tensor, start: int, before: int, rows: list[int]) -> Tensor:
         """Commits the cache's entries of a forward that began at slot `start`: `before` tokens and the draft's `rows`
         -> their states (1, before + rows, E). A chain's rows lie where they belong."""
-        kept = before + len(rows)
+        length = before + len(rows)
         if rows == list(range(len(rows))):
-            chunk.cache.length = start + kept
-            return hidden[:, :kept]
+            chunk.cache.length = start + length
+            return hidden[:, :length]
         slots = upload([before + row for row in rows], hidden.device)
         chunk.cache.compact(start + before, start + slots)
         return torch.cat([hidden[:, :before], hidden[:, slots]], 1)
@@ -277,7 +278,7 @@ class Decoder:
     def accept(
         self, chunk: Chunk, tree: TokenTree, target_tokens: Sequence[int], proposer: Proposer | None
     ) -> tuple[int, ...]:
-        """Commits the best accepted path and, where a place is left, the bonus -> the path's nodes."""
+        """Commits the best accepted path and, where the chunk has room, the bonus -> the path's nodes."""
         start = len(chunk.tokens)
         if not len(tree) or proposer is None:
             token = target_tokens[0]
@@ -287,15 +288,15 @@ class Decoder:
         accepted = acceptance.judge(tree, target_tokens, start, r)
         path, rejected = accepted.path, accepted.rejected
         behind = [] if rejected is None else tree.down_from(rejected)
-        judged = path if rejected is None else (*path, rejected)
-        seen = [target_tokens[tree.parents[i] + 1] for i in judged]
+        nodes = path if rejected is None else (*path, rejected)
+        targets = [target_tokens[tree.parents[i] + 1] for i in nodes]
         bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
         played = Round(
             mode="verify",
             proposer=proposer.name,
             start=start,
-            drafted=tuple(tree.tokens[i] for i in judged),
-            target_tokens=tuple(seen) if rejected is not None else (*seen, *bonus),
+            drafted=tuple(tree.tokens[i] for i in nodes),
+            target_tokens=tuple(targets) if rejected is not None else (*targets, *bonus),
             accepted=len(path),
             committed=len(path) + len(bonus),
             tree_size=len(tree),
@@ -310,7 +311,7 @@ class Decoder:
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):
             return
-        # where the target's token filled the last place nothing is missing, if it may be used
+        # where the target's token is the last of the chunk nothing is missing, if it may be used
         if chunk.left or not rectifier.uses_target_token:
             rectifier.close(chunk)
 

@@ -15,7 +15,7 @@ class ActionHistory:
     def __init__(self, dofs: int, window: int = WINDOW) -> None:
         self.dofs = dofs
         self._actions: deque[np.ndarray] = deque(maxlen=window)
-        self._stacked = np.zeros((0, dofs))  # the same, for the readers of one decode; never written to
+        self._stacked = np.zeros((0, dofs))  # these actions as one array, which nobody writes to
         self._stacked.flags.writeable = False
 
     def append(self, action: np.ndarray) -> None:
@@ -39,5 +39,5 @@ class ActionHistory:
         """
         if pending is None or not len(pending):
             return self._stacked
-        known = np.concatenate([self._stacked, np.asarray(pending, dtype=np.float64)])
-        return known[-(self._actions.maxlen or 0) :]
+        steps = np.concatenate([self._stacked, np.asarray(pending, dtype=np.float64)])
+        return steps[-(self._actions.maxlen or 0) :]

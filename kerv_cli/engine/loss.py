@@ -1,4 +1,4 @@
-"""How far a draft is from what the target wanted: the loss of executing it unverified (docs/methods.md §4.6)."""
+"""How far a draft is from the target's tokens: the loss of executing it unverified (docs/methods.md §4.6)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from kerv_cli.engine.transfer import upload
 BAD = 0.5  # a draft with a larger loss is one that should have been verified
 
 
-def chunk_loss(space: ActionSpace, drafted: Sequence[int], wanted: Sequence[int], scale: float) -> float:
+def chunk_loss(space: ActionSpace, drafted: Sequence[int], targets: Sequence[int], scale: float) -> float:
     """ℓ in [0, 1] of a draft's tokens against the target's, from a chunk's first token on: 1 where a strict DoF's token
     differs, else the mean absolute difference in normalised action units ÷ `scale`, at most 1."""
-    tokens, others = np.array(drafted), np.array(wanted)
+    tokens, others = np.array(drafted), np.array(targets)
     if (tokens != others)[space.strict_tokens(len(tokens))].any():
         return 1.0
     off = np.abs(space.values_of(tokens) - space.values_of(others)).mean()
@@ -65,11 +65,11 @@ def auc(scores: np.ndarray, bad: np.ndarray) -> float:
 
 @torch.inference_mode()
 def target_tokens(target: Target, chunk: Chunk, chain: Sequence[int]) -> list[int]:
-    """The target's argmax token at every place of the chunk, given the chain's tokens before it: one forward. The
+    """The target's argmax token at every index of the chunk, given the chain's tokens before it: one forward. The
     chunk's cache is overwritten; a prefill afterwards begins it anew."""
     device, length = chunk.prompt.device, chunk.prompt_length
-    shown = target.embed(upload([list(chain[: chunk.size - 1])], device))
-    x = torch.cat([chunk.prompt, shown], 1)
+    drafted = target.embed(upload([list(chain[: chunk.size - 1])], device))
+    x = torch.cat([chunk.prompt, drafted], 1)
     chunk.cache.length = 0
     hidden = target.forward(x, torch.arange(x.shape[1], device=device), chunk.cache, None)
     tokens: list[int] = target.head(hidden[0, length - 1 :]).argmax(-1).tolist()

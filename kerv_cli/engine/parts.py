@@ -29,7 +29,7 @@ class Threshold(Protocol):
 
 
 class Fixed:
-    """The same r in every decode (Spec-VLA)."""
+    """One radius r for all decodes (Spec-VLA)."""
 
     def __init__(self, r: int) -> None:
         self.r = r

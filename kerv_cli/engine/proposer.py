@@ -17,7 +17,7 @@ class DraftsChunks(Protocol):
 
     @property
     def name(self) -> str:
-        """As in the record, e.g. `early`."""
+        """Its name in the record, e.g. `early`."""
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
@@ -32,7 +32,7 @@ class Proposer(Protocol):
 
     @property
     def name(self) -> str:
-        """As in the record, e.g. `drafter`."""
+        """Its name in the record, e.g. `drafter`."""
 
     @property
     def needs_states(self) -> bool:
@@ -60,7 +60,7 @@ class Asks(Protocol):
     """A proposer that needs numbers of the encoded prompt on the host."""
 
     def ask(self, chunk: Chunk) -> None:
-        """Called before the prefill: adds to `chunk.asked` what is to be read with its tokens."""
+        """Called before the prefill: adds to `chunk.reads` the vectors to be read with its tokens."""
 
 
 class Stateless:

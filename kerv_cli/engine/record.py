@@ -130,9 +130,8 @@ class DecodeRecord:
 
     @property
     def score(self) -> float | None:
-        """Of the draft, where a gate told one."""
-        known = self.trust is not None and math.isfinite(self.trust.score)
-        return self.trust.score if self.trust is not None and known else None
+        """Of the draft, where a gate computed one."""
+        return self.trust.score if self.trust is not None and math.isfinite(self.trust.score) else None
 
     @property
     def loss(self) -> float | None:

@@ -27,8 +27,8 @@ def read(*parts: Tensor) -> list[np.ndarray]:
     if len(parts) > 1:
         mixed = len({part.dtype for part in parts}) > 1
         together = torch.cat([part.double() for part in parts] if mixed else list(parts))
-    numbers, found, start = together.cpu().numpy(), [], 0
+    numbers, vectors, start = together.cpu().numpy(), [], 0
     for part in parts:
-        found.append(numbers[start : start + part.shape[0]])
+        vectors.append(numbers[start : start + part.shape[0]])
         start += part.shape[0]
-    return found
+    return vectors

@@ -62,11 +62,11 @@ class TokenTree:
 
     def down_from(self, node: int) -> list[int]:
         """`node` and the nodes below it along first children, down to a leaf."""
-        found = [node]
+        nodes = [node]
         for i in range(node + 1, len(self)):
-            if self.parents[i] == found[-1]:
-                found.append(i)
-        return found
+            if self.parents[i] == nodes[-1]:
+                nodes.append(i)
+        return nodes
 
     def path_to(self, node: int) -> list[int]:
         """Nodes from depth 0 down to `node`; empty for the root."""
@@ -100,15 +100,15 @@ def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
 def visible_in_prefill(tree: TokenTree, prompt: int) -> np.ndarray:
     """(P + n, P + n) bool for [prompt, nodes…]: causal in the prompt; a node sees the prompt and its path."""
     n = len(tree)
-    seen = np.tri(prompt + n, dtype=bool)
-    seen[prompt:, prompt:] = tree.ancestors()
-    return seen
+    visible = np.tri(prompt + n, dtype=bool)
+    visible[prompt:, prompt:] = tree.ancestors()
+    return visible
 
 
 def visible_in_verification(tree: TokenTree) -> np.ndarray:
     """(1 + n, 1 + n) bool for [last committed token, nodes…]: a node sees that token, its ancestors and itself."""
     n = len(tree)
-    seen = np.zeros((1 + n, 1 + n), dtype=bool)
-    seen[:, 0] = True
-    seen[1:, 1:] = tree.ancestors()
-    return seen
+    visible = np.zeros((1 + n, 1 + n), dtype=bool)
+    visible[:, 0] = True
+    visible[1:, 1:] = tree.ancestors()
+    return visible

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Request:
-    """The target that an artifact is wanted for. search: settings of a datastore's search."""
+    """The target to check or load an artifact for. search: settings of a datastore's search."""
 
     description: TargetDescription
     search: Any = None
@@ -30,7 +30,7 @@ class Request:
 
 
 NOUNS = {"early": "early drafter", "score": "learned score"}
-"""Kinds of artifacts that messages call otherwise."""
+"""Kind of artifact -> its name in messages, where that is another."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class MadeFrom:
     hashes: Mapping[str, str]
 
     def check_same(self, used: Mapping[str, str]) -> None:
-        """Refuses the artifact beside other sources than its own. used: kind -> hash of what is in use; a source of a
-        kind that is not in use does not matter.
+        """Refuses the artifact where its sources are not the policy's. used: kind -> hash of the policy's target and
+        artifacts; a source of a kind that the policy does not use does not matter.
 
         Raises:
-            CheckpointError: one of its sources is in use with another hash.
+            CheckpointError: the policy uses another artifact of the same kind as one of its sources.
         """
         for kind, digest in self.hashes.items():
             if used.get(kind, digest) != digest:
@@ -61,7 +61,7 @@ class MadeFrom:
 
 
 def no_sources(path: Path) -> MadeFrom:
-    """Of a kind that is made from target and demonstrations alone."""
+    """`Artifact.sources` of a kind that is made from target and demonstrations alone: none."""
     return MadeFrom("", "", "", {})
 
 
@@ -111,7 +111,7 @@ class MadeFor:
 
 
 class Artifacts:
-    """The artifacts of one policy, found, checked and loaded on demand.
+    """The artifacts of one policy, checked and loaded on demand.
 
     results, policy, search: as in RolloutSettings. device, dtype: of what is loaded, as `runtime.set_up` gives them.
     """
@@ -124,7 +124,7 @@ class Artifacts:
 
     @functools.cached_property
     def description(self) -> TargetDescription:
-        """The target's, read without its weights."""
+        """The target's description; its weights are not loaded."""
         from kerv_cli.targets.checkpoint import read_target
 
         return read_target(self.folder)
@@ -145,12 +145,12 @@ class Artifacts:
             CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
                 one among `kinds`.
         """
-        request, wanted = Request(self.description, self.search), tuple(kinds)
-        found = {"target": self.description.sha256}
-        found |= {kind: _kind(kind).check(self.place(kind), request) for kind in wanted}
-        for kind in wanted:
-            _kind(kind).sources(self.place(kind)).check_same(found)
-        return found
+        request, kinds = Request(self.description, self.search), tuple(kinds)
+        hashes = {"target": self.description.sha256}
+        hashes |= {kind: _kind(kind).check(self.place(kind), request) for kind in kinds}
+        for kind in kinds:
+            _kind(kind).sources(self.place(kind)).check_same(hashes)
+        return hashes
 
     def load(self, kind: str) -> Any:
         """The artifact, for the loaded target; one object per process.
@@ -176,8 +176,8 @@ class _Owner:
 
 
 def _kind(name: str) -> Artifact:
-    found: Artifact = load(find("artifact", name).build)
-    return found
+    artifact_kind: Artifact = load(find("artifact", name).build)
+    return artifact_kind
 
 
 @functools.lru_cache(maxsize=16)
@@ -189,9 +189,9 @@ def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
 
 
 @functools.lru_cache(maxsize=64)
-def _artifact(kind: str, place: Path, digest: str, owner: _Owner) -> Any:
+def _artifact(kind: str, path: Path, digest: str, owner: _Owner) -> Any:
     from kerv_cli.targets.checkpoint import read_target
 
     description = read_target(owner.folder)
     target = _target(owner.folder, description.sha256, owner.device, owner.dtype)
-    return _kind(kind).load(place, Request(description, owner.search, target))
+    return _kind(kind).load(path, Request(description, owner.search, target))

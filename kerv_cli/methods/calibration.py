@@ -208,8 +208,8 @@ def load_calibration(path: Path, description: TargetDescription) -> Calibration:
         CheckpointError: missing, damaged, of another format, target, action space or chunk length.
     """
     loaded = read_calibration(path)
-    own = MadeFor(description.sha256, description.actions, description.chunk)
-    loaded.target.check_same(own, str(path), "made", "run 'kerv calibrate'")
+    present = MadeFor(description.sha256, description.actions, description.chunk)
+    loaded.target.check_same(present, str(path), "made", "run 'kerv calibrate'")
     return loaded
 
 

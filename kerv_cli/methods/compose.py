@@ -24,19 +24,19 @@ _BATCHED = {
 def check(method: Mapping[str, Any], chunk: int, trained: int, parallel: bool = False) -> None:
     """Refuses parts that do not belong together, and numbers out of range, before anything heavy is loaded.
 
-    method: kind -> settings, for every kind of METHOD_KINDS. chunk: asked for; trained: H of the target. parallel:
-    whether the target decodes all tokens at once.
+    method: kind -> settings, for every kind of METHOD_KINDS. chunk: H of the method, 0 for the target's.
+    trained: H of the target. parallel: whether the target decodes all tokens at once.
 
     Raises:
         UnknownName: no such part. UsageError: a composition that cannot work, or a number out of range.
     """
-    chosen = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
-    for kind, part in chosen.items():
+    parts = {kind: part_of(kind, method[kind].kind) for kind in METHOD_KINDS}
+    for kind, part in parts.items():
         if not isinstance(method[kind], part.settings):
             raise UsageError(f"{kind}.kind={part.name}: choose {kind}={part.name}, each has settings of its own")
         part.check_settings(method[kind], kind)
     steps_of(chunk, trained)
-    proposer, boundary, draft = chosen["proposer"], chosen["boundary"], chosen["prefill_draft"]
+    proposer, boundary, draft = parts["proposer"], parts["boundary"], parts["prefill_draft"]
     if bool(proposer.traits.get("sides")) != bool(boundary.traits.get("chooses")):
         raise UsageError(
             f"proposer={proposer.name} with boundary={boundary.name}: a boundary chooses between the two sides of "
@@ -47,34 +47,34 @@ def check(method: Mapping[str, Any], chunk: int, trained: int, parallel: bool = 
             f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
             f"proposer={draft.name}"
         )
-    check_parallel(chosen, parallel)
-    skip = chosen["skip"].traits
+    check_parallel(parts, parallel)
+    skip = parts["skip"].traits
     joined = bool(skip.get("merges")) and draft.name == "merged"
     retrieved = bool(skip.get("retrieves")) and draft.name == "none" and proposer.name in ("hybrid", "retrieval")
     if skip.get("takes_draft") and not draft.traits.get("chains") and not joined and not retrieved:
         raise UsageError(
-            f"skip={chosen['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before "
+            f"skip={parts['skip'].name} with prefill_draft={draft.name}: it executes what one source drafts before "
             "the prefill, e.g. prefill_draft=early"
         )
 
 
-def check_parallel(chosen: Mapping[str, Part], parallel: bool) -> None:
+def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
     """A parallel target has one way to decode, and no other target has it.
 
     Raises:
-        UsageError: the method and the target differ, or a part would never be asked.
+        UsageError: the method and the target differ, or a part would never be used.
     """
-    asked = bool(chosen["skip"].traits.get("parallel"))
-    if asked and not parallel:
+    has_pass = bool(parts["skip"].traits.get("parallel"))
+    if has_pass and not parallel:
         raise UsageError(
             "skip=parallel: this target decodes token by token; policy=parallel is the shipped one that does not, "
             "kerv train target target.parallel=true trains one"
         )
-    if parallel and not asked:
+    if parallel and not has_pass:
         raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
-    idle = [kind for kind in ("prefill_draft", "proposer") if chosen[kind].name != "none"]
-    if asked and idle:
-        raise UsageError(f"skip=parallel with {idle[0]}={chosen[idle[0]].name}: nothing is drafted, leave it out")
+    idle = [kind for kind in ("prefill_draft", "proposer") if parts[kind].name != "none"]
+    if has_pass and idle:
+        raise UsageError(f"skip=parallel with {idle[0]}={parts[idle[0]].name}: nothing is drafted, leave it out")
 
 
 def check_batch(parts: Mapping[str, Any], method: str, batch: int) -> None:
@@ -106,8 +106,8 @@ def is_parallel(target: Any) -> bool:
 
 def needs(method: Mapping[str, Any]) -> tuple[str, ...]:
     """The kinds of artifacts that a method's parts read, each once, in the order of its parts."""
-    wanted = (need for kind in METHOD_KINDS for need in part_of(kind, method[kind].kind).needs(method[kind]))
-    return tuple(dict.fromkeys(wanted))
+    kinds = (need for kind in METHOD_KINDS for need in part_of(kind, method[kind].kind).needs(method[kind]))
+    return tuple(dict.fromkeys(kinds))
 
 
 def compose(

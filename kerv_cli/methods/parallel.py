@@ -31,14 +31,14 @@ class ParallelPass(Skip):
         return cls(context.target)
 
     def take(self, chunk: Chunk) -> bool:
-        """As `Skip.take`; always."""
+        """Commits all tokens after one pass of the target; always True."""
         chunk.cache.length = 0
         hidden = self.target.parallel_pass(chunk.prompt, chunk.cache)
         chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
 
     def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
-        """As `TakesMany.take_many`."""
+        """Commits the tokens of several chunks after one pass over prompt (B, P, E)."""
         hidden = self.target.parallel_pass(prompt, cache(len(chunks)))
         rows = self.target.head(hidden[:, : chunks[0].size]).argmax(-1).tolist()
         for chunk, tokens in zip(chunks, rows, strict=True):

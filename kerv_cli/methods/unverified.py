@@ -30,7 +30,7 @@ class AlwaysSkip(Skip):
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> bool:
-        """As `Skip.take`."""
+        """Fills the chunk with the source's draft -> whether it had one of all N tokens."""
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
             return False
@@ -38,7 +38,7 @@ class AlwaysSkip(Skip):
         return True
 
     def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
-        """As `TakesMany.take_many`, where the source is an `EarlyProposer`."""
+        """Fills chunks with the drafts of one pass over prompt (B, P, E), where the source is an `EarlyProposer`."""
         source: Any = self.source
         for chunk, tokens in zip(chunks, source.tokens_of(chunks, prompt), strict=True):
             chunk.skip(tokens, self.source.name)

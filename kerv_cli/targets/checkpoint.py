@@ -32,7 +32,7 @@ target's own folder."""
 
 @dataclass(frozen=True)
 class Description:
-    """The fields that every JSON beside weights has. sha256: of the weights' file."""
+    """The fields that the JSON of every artifact with weights has. sha256: of the weights' file."""
 
     format: int
     kind: str
@@ -75,16 +75,15 @@ class TargetDescription(Description):
             raise UsageError(f"world.camera.size={size}: the policy was trained on {trained} pixels")
         self.actions.check_same(actions, f"target '{name}'", f"environment {environment}")
 
-    def check_autoregressive(self, asked: str, why: str) -> None:
-        """Refuses a target that decodes in parallel. asked: what wants another one; why: what it would lack.
+    def check_autoregressive(self, what: str, why: str) -> None:
+        """Refuses a target that decodes in parallel. what: the setting that needs another one. why: what this one
+        lacks.
 
         Raises:
             UsageError: it is parallel.
         """
         if self.parallel:
-            raise UsageError(
-                f"{asked}: the target decodes all tokens at once, {why}; choose one that is autoregressive"
-            )
+            raise UsageError(f"{what}: the target decodes all tokens at once, {why}; choose one that is autoregressive")
 
 
 T = TypeVar("T", bound=Description)
@@ -189,8 +188,8 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     if not path.is_file():
         remedy = f"run 'kerv {_TRAINED_BY[kind]}', or name" if kind in _TRAINED_BY else "name"
         raise CheckpointError(f"no {kind} in {folder}: {remedy} a folder that holds one")
-    found = os.stat(path)
-    version = found.st_ino, found.st_size, found.st_mtime_ns
+    status = os.stat(path)
+    version = status.st_ino, status.st_size, status.st_mtime_ns
     description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]
     return description
 

@@ -31,13 +31,13 @@ TREE = (-1, 0, 0, 1, 1, 2, 4)
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation, seed: int = 0) -> list[Finding]:
     """One finding per check. observation: one that the target can encode."""
-    found = run([("members", lambda: _members(target))])
-    if not found[0].ok:
-        return found
+    findings = run([("members", lambda: _members(target))])
+    if not findings[0].ok:
+        return findings
     trial = Trial(target, observation, seed)
-    found += run([("encode", trial.encode), ("embed and head", trial.embed_and_head)])
-    if not all(finding.ok for finding in found):
-        return found
+    findings += run([("encode", trial.encode), ("embed and head", trial.embed_and_head)])
+    if not all(finding.ok for finding in findings):
+        return findings
     checks: list[tuple[str, Callable[[], str]]] = [
         ("causality", trial.causality),
         ("cache, token by token", trial.token_by_token),
@@ -49,7 +49,7 @@ def check_target(target: Target, observation: Observation, seed: int = 0) -> lis
         ("batch", trial.batch),
         ("greedy chunk", trial.chunk),
     ]
-    return found + run(checks)
+    return findings + run(checks)
 
 
 def _members(target: Any) -> str:
@@ -119,13 +119,13 @@ class Trial:
         x = torch.cat([self.prompt, self.target.embed(tokens)], 1) if tokens.shape[1] else self.prompt
         return self.target.forward(x, torch.arange(x.shape[1], device=x.device))
 
-    def same(self, got: Tensor, wanted: Tensor, what: str) -> None:
+    def same(self, hidden: Tensor, expected: Tensor, what: str) -> None:
         """Compares hidden states (…, E) by their logits.
 
         Raises:
             Failed: they differ by more than rounding.
         """
-        a, b = self.target.head(got).double(), self.target.head(wanted).double()
+        a, b = self.target.head(hidden).double(), self.target.head(expected).double()
         gap = float((a - b).abs().max() / b.std().clamp_min(1e-9))
         self.worst = max(self.worst, gap)
         if not gap <= TOLERANCE.get(self.prompt.dtype, 2e-4):
@@ -142,7 +142,7 @@ class Trial:
         self.same(self.plain(self.tokens[:, :4])[:, : length + 4], whole[:, : length + 4], "a token sees later ones")
         return self.says()
 
-    def cached(self, cuts: Sequence[int]) -> tuple[Any, list[Tensor]]:
+    def cached(self, lengths: Sequence[int]) -> tuple[Any, list[Tensor]]:
         """Prompt, then the tokens in pieces of these lengths -> the cache and the pieces' hidden states."""
         cache, length = self.target.new_cache(1, self.capacity), self.prompt.shape[1]
         if cache.capacity < self.capacity or cache.length:
@@ -151,11 +151,11 @@ class Trial:
         if cache.length != length:
             raise Failed(f"the cache has length {cache.length} after a prompt of {length} tokens")
         hidden, first = [], 0
-        for cut in cuts:
-            positions = torch.arange(length + first, length + first + cut, device=self.prompt.device)
-            piece = self.target.embed(self.tokens[:, first : first + cut])
+        for tokens in lengths:
+            positions = torch.arange(length + first, length + first + tokens, device=self.prompt.device)
+            piece = self.target.embed(self.tokens[:, first : first + tokens])
             hidden.append(self.target.forward(piece, positions, cache))
-            first += cut
+            first += tokens
         return cache, hidden
 
     def token_by_token(self) -> str:
@@ -176,15 +176,15 @@ class Trial:
         drafted = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random).to(
             self.prompt.device
         )
-        seen = np.eye(1 + len(TREE), dtype=bool)
+        visible = np.eye(1 + len(TREE), dtype=bool)
         depths: list[int] = []
         for node, parent in enumerate(TREE):
-            seen[node + 1] |= seen[parent + 1]
+            visible[node + 1] |= visible[parent + 1]
             depths.append(0 if parent < 0 else depths[parent] + 1)
         at = self.prompt.shape[1] + before
         positions = torch.tensor([at, *(at + 1 + depth for depth in depths)], device=self.prompt.device)
         x = self.target.embed(torch.cat([self.tokens[:, start : start + 1], drafted], 1))
-        return drafted, self.target.forward(x, positions, cache, seen)
+        return drafted, self.target.forward(x, positions, cache, visible)
 
     def path(self, node: int) -> list[int]:
         """Nodes from the root to `node`."""
@@ -195,46 +195,46 @@ class Trial:
         cache, _ = self.cached([1, 1])
         drafted, hidden = self.grown(cache, 2, 2)
         for node in range(len(TREE)):
-            own = torch.cat([self.tokens[:, :3], drafted[:, self.path(node)]], 1)
+            tokens = torch.cat([self.tokens[:, :3], drafted[:, self.path(node)]], 1)
             self.same(
-                hidden[:, node + 1], self.plain(own)[:, -1], f"node {node} of a tree sees others than its ancestors"
+                hidden[:, node + 1], self.plain(tokens)[:, -1], f"node {node} of a tree sees others than its ancestors"
             )
         return self.says()
 
     def commit(self) -> str:
-        """A path is kept and decoding goes on behind it."""
+        """Decoding goes on behind a committed path."""
         cache, _ = self.cached([1, 1])
         drafted, _ = self.grown(cache, 2, 2)
-        kept = self.path(6)
+        path = self.path(6)
         start = self.prompt.shape[1] + 2
-        slots = torch.tensor([start, *(start + 1 + node for node in kept)], device=self.prompt.device)
+        slots = torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device)
         cache.compact(start, slots)
-        if cache.length != start + 1 + len(kept):
+        if cache.length != start + 1 + len(path):
             raise Failed(f"compact({start}, {len(slots)} slots) leaves length {cache.length}, not {start + len(slots)}")
         position = torch.tensor([cache.length], device=self.prompt.device)
         hidden = self.target.forward(self.target.embed(self.tokens[:, 3:4]), position, cache)
-        own = torch.cat([self.tokens[:, :3], drafted[:, kept], self.tokens[:, 3:4]], 1)
-        self.same(hidden, self.plain(own)[:, -1:], "a token behind a committed path")
+        tokens = torch.cat([self.tokens[:, :3], drafted[:, path], self.tokens[:, 3:4]], 1)
+        self.same(hidden, self.plain(tokens)[:, -1:], "a token behind a committed path")
         return self.says()
 
     def prefill_draft(self) -> str:
         """Prompt and a tree in one forward, as methods that draft before the prefill do."""
-        length, seen = self.prompt.shape[1], np.zeros((self.prompt.shape[1] + len(TREE),) * 2, dtype=bool)
-        seen[:length, :length] = np.tri(length, dtype=bool)
-        seen[length:, :length] = True
+        length, visible = self.prompt.shape[1], np.zeros((self.prompt.shape[1] + len(TREE),) * 2, dtype=bool)
+        visible[:length, :length] = np.tri(length, dtype=bool)
+        visible[length:, :length] = True
         depths: list[int] = []
         for node, parent in enumerate(TREE):
-            seen[length + node, [length + a for a in self.path(node)]] = True
+            visible[length + node, [length + a for a in self.path(node)]] = True
             depths.append(0 if parent < 0 else depths[parent] + 1)
         drafted = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random).to(
             self.prompt.device
         )
         positions = torch.tensor([*range(length), *(length + d for d in depths)], device=self.prompt.device)
         x = torch.cat([self.prompt, self.target.embed(drafted)], 1)
-        hidden = self.target.forward(x, positions, self.target.new_cache(1, self.capacity), seen)
+        hidden = self.target.forward(x, positions, self.target.new_cache(1, self.capacity), visible)
         for node in (1, 3, 6):
-            wanted = self.plain(drafted[:, self.path(node)])[:, -1]
-            self.same(hidden[:, length + node], wanted, f"node {node} of a tree in the prefill")
+            expected = self.plain(drafted[:, self.path(node)])[:, -1]
+            self.same(hidden[:, length + node], expected, f"node {node} of a tree in the prefill")
         return self.says()
 
     def again(self) -> str:

@@ -35,13 +35,13 @@ from kerv_cli.targets.compact.trunk import LayerStack
 
 
 class DraftsStates(Protocol):
-    """What a drafter is to a decode: our own, or one of the public layout (`public.py`)."""
+    """A drafter that a decode can use: ours, or one of the public layout (`public.py`)."""
 
     def new_cache(self, batch: int, capacity: int) -> AnyCache:
         """An empty cache for `capacity` positions."""
 
-    def draft_position(self, place: int) -> int:
-        """Rotary position of a drafted token at this place of the sequence; the same, but for public conventions."""
+    def draft_position(self, index: int) -> int:
+        """Rotary position of the drafted token at `index` of the sequence: `index`, but for public conventions."""
 
     def __call__(
         self,
@@ -51,7 +51,7 @@ class DraftsStates(Protocol):
         cache: Any = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """As `Drafter.forward`."""
+        """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E)."""
 
 
 class Drafter(LayerStack):
@@ -67,9 +67,9 @@ class Drafter(LayerStack):
         """A fresh drafter of the target's width, heads and feed-forward width."""
         return cls(settings, target.width, target.heads, target.feed_forward)
 
-    def draft_position(self, place: int) -> int:
-        """As `DraftsStates.draft_position`."""
-        return place
+    def draft_position(self, index: int) -> int:
+        """`index` itself."""
+        return index
 
     def forward(
         self,
@@ -122,29 +122,29 @@ def draft_tree(
     first = drafter.draft_position(base)
     hidden = state.hidden.expand(1, width, -1)
     level = torch.arange(width, device=device)
-    own = torch.eye(max(width, top_k), dtype=torch.bool, device=device)
-    seen = own[:width, :width]  # of the nodes that were forwarded, level by level
+    itself = torch.eye(max(width, top_k), dtype=torch.bool, device=device)
+    seen = itself[:width, :width]  # of the nodes that were forwarded, level by level
     for reached in range(1, depth):
         following = target.embed(tokens[None])
         position = torch.full((width,), first + reached - 1, device=device)
         hidden = drafter(following, hidden, position, state.cache, seen.numpy() if device.type == "cpu" else seen)
         logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
-        child_values, child_tokens = (found.flatten() for found in logp.topk(top_k, -1))
+        child_values, child_tokens = (best.flatten() for best in logp.topk(top_k, -1))
         values, flat = child_values.topk(top_k)
         # every child competes for a place in the tree, only the best top_k are expanded further
         parents.append(level[:, None].expand(-1, top_k).flatten())
         every.append(child_tokens)
         cumulative.append(child_values)
         level, offset, width = offset + flat, offset + child_tokens.shape[0], top_k
-        tokens, chosen = child_tokens[flat], flat // top_k
-        hidden = hidden[:, chosen]
-        seen = torch.cat([seen[chosen], own[:top_k, :top_k]], 1)
+        tokens, rows = child_tokens[flat], flat // top_k
+        hidden = hidden[:, rows]
+        seen = torch.cat([seen[rows], itself[:top_k, :top_k]], 1)
     state.cache.length = base
-    found = torch.cat(every), torch.cat(parents), torch.cat(cumulative)
+    children = torch.cat(every), torch.cat(parents), torch.cat(cumulative)
     if device.type == "cpu":
-        every_token, every_parent, every_score = (numbers.tolist() for numbers in found)
+        every_token, every_parent, every_score = (numbers.tolist() for numbers in children)
         return _best_of(every_token, every_parent, every_score, nodes)
-    return _keep_best(*found, nodes, depth)
+    return _keep_best(*children, nodes, depth)
 
 
 def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> Tensor:
@@ -252,8 +252,8 @@ def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> Draf
     """
     description = read_description(folder, "drafter", DrafterDescription)
     made_for, again = MadeFor(description.target, description.actions), "run 'kerv train drafter'"
-    own = MadeFor(target_sha256, actions)
-    made_for.check_same(own, f"the drafter in {folder}", "trained", again)
+    present = MadeFor(target_sha256, actions)
+    made_for.check_same(present, f"the drafter in {folder}", "trained", again)
     return description
 
 

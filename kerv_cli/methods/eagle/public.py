@@ -45,9 +45,9 @@ class Convention:
 
     def check(self) -> Convention:
         """This convention. Raises UnknownName for a choice that does not exist."""
-        for what, name, known in (("positions", self.positions, POSITIONS), ("mask", self.mask, MASKS)):
-            if name not in known:
-                raise UnknownName(what, name, known)
+        for what, name, names in (("positions", self.positions, POSITIONS), ("mask", self.mask, MASKS)):
+            if name not in names:
+                raise UnknownName(what, name, names)
         return self
 
 
@@ -81,9 +81,9 @@ class PublicDrafter(nn.Module):
         weight = self.fc.weight
         return DraftCache(self.shape.language, batch, capacity, weight, weight.is_cuda if fixed is None else fixed)
 
-    def draft_position(self, place: int) -> int:
-        """Rotary position of a drafted token at this place of the sequence."""
-        return place - self.shape.skipped * (self.shape.convention.positions == "text")
+    def draft_position(self, index: int) -> int:
+        """Rotary position of the drafted token at `index` of the sequence."""
+        return index - self.shape.skipped * (self.shape.convention.positions == "text")
 
     def forward(
         self,
@@ -141,14 +141,14 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
             f"{pickled} is pickled and can run code when it is opened: convert it where you trust it: "
             f"{conversion(str(pickled), str(folder / SINGLE))}"
         )
-    known = {name: value[name] for name in Language.__dataclass_fields__ if name in value}
-    language = read(Language, known, str(folder / "config.json"))
+    fields = {name: value[name] for name in Language.__dataclass_fields__ if name in value}
+    language = read(Language, fields, str(folder / "config.json"))
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")
     shards = open_shards(folder)
     bias = "fc.bias" in shards.shapes
-    own = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
-    check_layout(own, layout_of(language, bias), folder)
+    layout = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
+    check_layout(layout, layout_of(language, bias), folder)
     skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
     shape = PublicShape(language, bias, convention.check(), skipped.stop - skipped.start)
     return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}
@@ -168,8 +168,8 @@ def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> Pub
         CheckpointError: the weights are damaged or of another shape.
     """
     tensors = load_tensors(folder / WEIGHTS, "drafter")
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    check_layout(found, layout_of(shape.language, shape.bias), folder)
+    layout = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    check_layout(layout, layout_of(shape.language, shape.bias), folder)
     drafter = PublicDrafter(shape)
     drafter.load_state_dict(tensors)
     return drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)

@@ -26,7 +26,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import TokenTree
-from kerv_cli.engine.unread import Placed, Unread
+from kerv_cli.engine.unread import TreeRows, Unread
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
 from kerv_cli.methods.context import Context
 from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
@@ -39,13 +39,13 @@ SURE = 0.05
 
 
 def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.ndarray]:
-    """history (m, D), oldest first -> its newest `length` actions (length, D) and which of them are known (length,),
-    both float32; at an episode's start the missing actions are zeros in front."""
-    actions, known = np.zeros((length, dofs), np.float32), np.zeros(length, np.float32)
+    """history (m, D), oldest first -> its newest `length` actions (length, D) and which of them were executed
+    (length,), 1 or 0, both float32; at an episode's start the missing actions are zeros in front."""
+    actions, valid = np.zeros((length, dofs), np.float32), np.zeros(length, np.float32)
     newest = history[max(0, len(history) - length) :]
     if len(newest):
-        actions[-len(newest) :], known[-len(newest) :] = newest, 1.0
-    return actions, known
+        actions[-len(newest) :], valid[-len(newest) :] = newest, 1.0
+    return actions, valid
 
 
 class Block(nn.Module):
@@ -95,7 +95,7 @@ class EarlyDrafter(Packable):
         return cls(settings, target.actions, target.chunk, target.pooled_width)
 
     def pack_weights(self) -> PackedEarly | None:
-        """As `Packable.pack_weights`; None in other number formats than float32."""
+        """The packed weights of a float32 drafter; None in other number formats."""
         return PackedEarly(self) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
@@ -108,11 +108,11 @@ class EarlyDrafter(Packable):
         """Mean square of the standardised features (1, F): 1 on average over the training observations."""
         return float(((features.float() - self.mean) * self.scale).square().mean())
 
-    def forward(self, features: Tensor, history: Tensor, known: Tensor) -> Tensor:
-        """pooled prompts (B, F), history (B, h, D) normalised, known (B, h) -> logits (B, N, V)."""
+    def forward(self, features: Tensor, history: Tensor, valid: Tensor) -> Tensor:
+        """pooled prompts (B, F), history (B, h, D) normalised, valid (B, h) -> logits (B, N, V)."""
         if self.packed is not None and len(features) == 1:
-            return self.packed(torch.cat([features[0], history.flatten(), known[0]]))[None]
-        x = torch.cat([(features - self.mean) * self.scale, history.flatten(1), known], -1)
+            return self.packed(torch.cat([features[0], history.flatten(), valid[0]]))[None]
+        x = torch.cat([(features - self.mean) * self.scale, history.flatten(1), valid], -1)
         x = self.enter(x)
         for block in self.blocks:
             x = block(x)
@@ -122,16 +122,17 @@ class EarlyDrafter(Packable):
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
         """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
         radius: r in bins, see `choose`."""
-        numbers, logits = self.unread(features, history, radius)
+        numbers, logits = self.on_device(features, history, radius)
         return EarlyDraft.of(read(numbers)[0], logits)
 
     @torch.inference_mode()
-    def unread(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
-        """As `drafted`, but left on the device: N tokens and the odds (N + 1,) float64, logits (N, V)."""
+    def on_device(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
+        """The draft of `drafted` without a wait for the device: N tokens and the odds (N + 1,) float64, logits
+        (N, V)."""
         weight = self.head.weight
-        shown = padded(history, self.settings.history, self.actions.dofs)
-        actions, known = (upload(x, weight.device).to(weight.dtype)[None] for x in shown)
-        logits = self(features.to(weight.dtype), actions, known)
+        inputs = padded(history, self.settings.history, self.actions.dofs)
+        actions, valid = (upload(x, weight.device).to(weight.dtype)[None] for x in inputs)
+        logits = self(features.to(weight.dtype), actions, valid)
         tokens, odds = choose_with_odds(logits, radius, self.strict)
         return torch.cat([tokens[0].double(), odds.double()]), logits[0]
 
@@ -139,9 +140,9 @@ class EarlyDrafter(Packable):
     def tokens_of(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> list[list[int]]:
         """features (B, F) and the executed actions of B episodes, as in `drafted` -> their drafts of all N tokens."""
         weight = self.head.weight
-        shown = [padded(history, self.settings.history, self.actions.dofs) for history in histories]
-        actions, known = (torch.from_numpy(np.stack(x)).to(weight) for x in zip(*shown, strict=True))
-        tokens: list[list[int]] = choose(self(features.to(weight), actions, known), radius, self.strict).tolist()
+        inputs = [padded(history, self.settings.history, self.actions.dofs) for history in histories]
+        actions, valid = (torch.from_numpy(np.stack(x)).to(weight) for x in zip(*inputs, strict=True))
+        tokens: list[list[int]] = choose(self(features.to(weight), actions, valid), radius, self.strict).tolist()
         return tokens
 
 
@@ -176,9 +177,9 @@ class PackedEarly(Packed):
         self.head, self.head_bias = FastLinear(early.head.weight), early.head.bias
         self.shape = early.tokens, early.settings.rank
 
-    def __call__(self, shown: Tensor) -> Tensor:
-        """shown (F + h (D + 1),): pooled prompt, past actions and which of them are known -> logits (N, V)."""
-        x = self.enter.added_to_vector(self.enter_bias, shown)
+    def __call__(self, inputs: Tensor) -> Tensor:
+        """inputs (F + h (D + 1),): pooled prompt, past actions and which of them are valid -> logits (N, V)."""
+        x = self.enter.added_to_vector(self.enter_bias, inputs)
         for block in self.blocks:
             x = block(x)
         spread = self.spread.of_vector(x, self.norm.of_vector(x)).add_(self.spread_bias)
@@ -196,7 +197,7 @@ class EarlyDraft:
 
     @classmethod
     def of(cls, numbers: np.ndarray, logits: Tensor) -> EarlyDraft:
-        """numbers: as `EarlyDrafter.unread`."""
+        """numbers: as `EarlyDrafter.on_device`."""
         return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]), logits)
 
     @property
@@ -217,9 +218,9 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
 
 
 def choose_with_odds(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
-    """As `choose`, and the odds (B,): probability that each token lies within `radius` of the target's, the strict ones
-    exactly on it, if the tokens were independent. They are not, and training on soft labels keeps probabilities low:
-    use it to compare chunks, not as a probability."""
+    """The tokens of `choose`, and the odds (B,): probability that each token lies within `radius` of the target's, the
+    strict ones exactly on it, if the tokens were independent. They are not, and training on soft labels keeps
+    probabilities low: use it to compare chunks, not as a probability."""
     probability = logits.float().softmax(-1)
     below = F.pad(probability, (radius + 1, radius)).cumsum(-1)  # one sum for both radii
     near, best = _between(below, radius, radius, logits.shape[-1]), logits.argmax(-1)
@@ -239,8 +240,8 @@ def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
 class EarlyProposer(ChainProposer):
     """The early drafter's chunk (docs/methods.md §5), drafted once per observation.
 
-    waits: whether a draft is read before it is verified; otherwise with the target's tokens, which on a CPU gains
-    nothing.
+    waits: whether the host reads a draft before its verification; otherwise it reads it together with the target's
+    tokens, which on a CPU gains nothing.
     """
 
     name = "early"
@@ -264,31 +265,31 @@ class EarlyProposer(ChainProposer):
     def _inputs(self, chunk: Chunk) -> tuple[Tensor, np.ndarray, int]:
         return self.target.pooled(chunk.prompt), chunk.situation.history.values(), max(chunk.limits, default=0)
 
-    def unread(self, chunk: Chunk) -> Tensor | None:
-        """The draft on the device, (N + 1,) as `EarlyDrafter.unread`; None where it was read. The reader calls
-        `take`."""
+    def on_device(self, chunk: Chunk) -> Tensor | None:
+        """The draft on the device, (N + 1,) as `EarlyDrafter.on_device`; None where the host has it. Who
+        reads the vector hands it to `take`."""
         if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
             return None
-        numbers, self._logits = self.early.unread(*self._inputs(chunk))
+        numbers, self._logits = self.early.on_device(*self._inputs(chunk))
         return numbers
 
     def take(self, chunk: Chunk, numbers: np.ndarray) -> None:
-        """What `unread` gave, read."""
+        """Takes the vector of `on_device`, read by the host."""
         self._drafted = chunk, EarlyDraft.of(numbers, self._logits)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """The drafted chain."""
-        numbers = self.unread(chunk)
+        numbers = self.on_device(chunk)
         if numbers is None:
             return super().propose(chunk, depth)
         start = len(chunk.tokens)
 
-        def placed(found: np.ndarray) -> Placed:
-            self.take(chunk, found)
+        def assemble(vector: np.ndarray) -> TreeRows:
+            self.take(chunk, vector)
             tree = TokenTree.chain(self.chains(chunk, depth)[0])
             return tree, range(len(tree))
 
-        return Unread(numbers[start : min(chunk.size, start + depth)].long(), numbers, placed)
+        return Unread(numbers[start : min(chunk.size, start + depth)].long(), numbers, assemble)
 
     def distance(self, chunk: Chunk) -> float:
         """How far the observation is from those that the drafter was trained on; see `EarlyDrafter.distance`."""
@@ -343,25 +344,25 @@ def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:
     again = "run 'kerv train drafter drafter=early'"
     if not (folder / "early.json").is_file():
         raise CheckpointError(f"no early drafter in {folder}: {again}")
-    own = read_description(folder, "early", EarlyDescription)
-    made_for = MadeFor(own.target, own.actions, own.chunk)
-    wanted = MadeFor(target.sha256, target.actions, target.chunk)
-    made_for.check_same(wanted, f"the early drafter in {folder}", "trained", again)
-    return own
+    early = read_description(folder, "early", EarlyDescription)
+    made_for = MadeFor(early.target, early.actions, early.chunk)
+    present = MadeFor(target.sha256, target.actions, target.chunk)
+    made_for.check_same(present, f"the early drafter in {folder}", "trained", again)
+    return early
 
 
 def load_early(
     folder: Path, target: ReadableTarget, description: TargetDescription
 ) -> tuple[EarlyDrafter, EarlyDescription]:
-    """The early drafter of `target`, ready for inference, and its own description; errors as `read_early`."""
-    own = read_early(folder, description)
-    early = EarlyDrafter.beside(own.settings, target)
-    return load_packed(early, folder, "early", target.device, target.dtype), own
+    """The early drafter of `target`, ready for inference, and its description; errors as `read_early`."""
+    early_description = read_early(folder, description)
+    early = EarlyDrafter.beside(early_description.settings, target)
+    return load_packed(early, folder, "early", target.device, target.dtype), early_description
 
 
 def _load(folder: Path, request: Request) -> EarlyDrafter:
-    drafted_for: Any = request.target
-    return load_early(folder, drafted_for, request.description)[0]
+    target: Any = request.target
+    return load_early(folder, target, request.description)[0]
 
 
 ARTIFACT = Artifact(

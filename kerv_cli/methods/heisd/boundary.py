@@ -119,13 +119,13 @@ class Seeded:
     seed = 0
 
     def numbers(self, task: str, seed: int) -> np.random.Generator:
-        """As `Boundary.numbers`."""
+        """The generator of an episode; depends on the boundary's seed, task and episode seed alone."""
         return np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
 
 
 @dataclass(frozen=True)
 class Always(Seeded):
-    """The same side for every chunk."""
+    """One side for all chunks."""
 
     mode: Mode
 
@@ -135,7 +135,7 @@ class Always(Seeded):
         return cls("retrieval" if settings.kind == "always_retrieval" else "drafter")
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """As `Boundary.choose`."""
+        """`mode`, whatever the path."""
         return Choice(self.mode)
 
 
@@ -152,7 +152,7 @@ class Random(Seeded):
         return cls(settings.p, settings.seed)
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """As `Boundary.choose`."""
+        """Retrieval with probability p, else the drafter."""
         return Choice("retrieval" if rng.random() < self.p else "drafter")
 
 
@@ -172,7 +172,7 @@ class Fused(Seeded):
         return cls(ranges, settings.alpha, settings.window, settings.f_star)
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """As `Boundary.choose`."""
+        """The side by F of the path's newest `window` positions (m, 3), metres, and F."""
         points = np.asarray(path)[-self.window :]
         if len(points) < LEAST:
             return Choice("drafter")

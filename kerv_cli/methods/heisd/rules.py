@@ -34,7 +34,7 @@ class HybridProposer:
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
         self.sides: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
         self.nodes = max(drafter.nodes, retrieval.nodes)
-        self.chosen = drafter
+        self.side = drafter
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
@@ -44,33 +44,33 @@ class HybridProposer:
     @property
     def name(self) -> str:
         """Name of the side that drafts this chunk."""
-        return self.chosen.name
+        return self.side.name
 
     def begin(self, chunk: Chunk) -> None:
         """Takes the side that the boundary chose for this chunk."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
-        self.chosen = self.sides[chunk.choice.mode]
-        self.chosen.begin(chunk)
+        self.side = self.sides[chunk.choice.mode]
+        self.side.begin(chunk)
 
     def ask(self, chunk: Chunk) -> None:
-        """As `Asks.ask`: what the side that the boundary chose asks."""
+        """Before the prefill: adds what the boundary's side has to read to `chunk.reads`."""
         side = self.sides[chunk.choice.mode] if chunk.choice is not None else None
         if isinstance(side, Asks):
             side.ask(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
-        """The chosen side's tree."""
-        return self.chosen.propose(chunk, depth)
+        """The tree of the boundary's side."""
+        return self.side.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Tells the chosen side."""
-        self.chosen.committed(chunk, first, hidden, target_tokens)
+        """Tells the side that drafts."""
+        self.side.committed(chunk, first, hidden, target_tokens)
 
 
 def retrieval_of(context: Context) -> RetrievalProposer:
-    """The retrieval of the method's proposer, where that retrieves; else one of its own."""
-    own: Proposer | None = context.built["proposer"]
-    side = own.sides["retrieval"] if isinstance(own, HybridProposer) else own
+    """The retrieval of the method's proposer, where that retrieves; else a new one of the nearest neighbour."""
+    proposer: Proposer | None = context.built["proposer"]
+    side = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
     return side if isinstance(side, RetrievalProposer) else RetrievalProposer.of_nearest(context)
 
 
@@ -88,11 +88,11 @@ class ByGroup(Strict):
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """As `Acceptance.limits`: `token_limit` whatever r, for strict DoFs 0."""
+        """Largest accepted distance per DoF, bins (D,): `token_limit` whatever r, for strict DoFs 0."""
         return tuple(0 if strict else self.token_limit for strict in self.space.is_strict)
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """As `Acceptance.judge`: by group."""
+        """The longest path of whole groups, by `accept_by_group`."""
         limits, bounds = self.limits(r), self.space.bounds
         return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
 
@@ -111,15 +111,15 @@ class ByProposer:
         return cls(ByGroup(space, settings.group_limit, settings.token_limit), Relaxed(space, settings.strict_dofs))
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
-        """As `Acceptance.of_drafts_from`."""
+        """The rule for drafts of `proposer`."""
         return self.retrieved if proposer == "retrieval" else self.others
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """As `Acceptance.limits`, of drafts that are not retrieved."""
+        """Largest accepted distance per DoF of drafts that are not retrieved, bins (D,)."""
         return self.others.limits(r)
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """As `Acceptance.judge`, of drafts that are not retrieved."""
+        """The longest accepted path of a draft that is not retrieved."""
         return self.others.judge(tree, target_tokens, start, r)
 
 
@@ -165,28 +165,28 @@ class VerifySkip(Skip):
         return cls(settings, retrieval, SkipLevels(*levels))
 
     def begin(self, task: str, seed: int) -> None:
-        """As `Skip.begin`."""
+        """An episode begins."""
         self.in_a_row = 0
         self.ended.clear()
 
     def finish(self, success: bool) -> None:
         """An episode ended."""
         span = self.levels.high - self.levels.low
-        moved = self.s_min + span * (-self.settings.down if success else self.settings.up)
-        self.s_min = min(self.levels.high, max(self.levels.low, moved))
+        s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
+        self.s_min = min(self.levels.high, max(self.levels.low, s_min))
 
     def take(self, chunk: Chunk) -> bool:
         """Fills the chunk with the best neighbour's tokens if it may be executed unverified -> whether it did."""
         if chunk.choice is not None and chunk.choice.mode != "retrieval":
             self.in_a_row = 0
             return False
-        found = self.retrieval.neighbours(chunk)
-        seed = int(found.seeds[0])
-        if found.similarity[0] < self.s_min or self.in_a_row >= self.settings.max_skips or seed in self.ended:
+        neighbours = self.retrieval.neighbours(chunk)
+        seed = int(neighbours.seeds[0])
+        if neighbours.similarity[0] < self.s_min or self.in_a_row >= self.settings.max_skips or seed in self.ended:
             self.in_a_row = 0
             return False
         self.in_a_row += 1
-        if found.left[0] <= chunk.steps:
+        if neighbours.left[0] <= chunk.steps:
             self.ended.add(seed)
-        chunk.skip(found.chunks[0].tolist(), self.retrieval.name)
+        chunk.skip(neighbours.chunks[0].tolist(), self.retrieval.name)
         return True

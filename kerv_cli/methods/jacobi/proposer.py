@@ -34,8 +34,8 @@ class JacobiProposer:
 
     def begin(self, chunk: Chunk) -> None:
         """Makes the first guess."""
-        known = chunk.rejection.target[: chunk.left]
-        self.guess = [*known, *[chunk.space.tokens // 2] * (chunk.left - len(known))]
+        tokens = chunk.rejection.target[: chunk.left]
+        self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.left - len(tokens))]
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         """The present guess as a chain."""

@@ -56,7 +56,7 @@ class Noise:
 
     @classmethod
     def uniform(cls, dofs: int, q: float, r: float = 1.0, damping: float = 1.0) -> Noise:
-        """The same q, r and damping for all DoFs."""
+        """One q, r and damping for all DoFs."""
         return cls((q,) * dofs, (r,) * dofs, (damping,) * dofs)
 
 
@@ -151,8 +151,8 @@ class Predictor:
     def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
         """(B, m, D) with m ≥ `minimum` -> (B, steps, D)."""
         if not 0 <= steps <= self.horizon or histories.shape[-1] != self.dofs:
-            asked = f"{steps} steps of {histories.shape[-1]} DoFs"
-            raise ValueError(f"{self.name}: {asked}; weights are for {self.horizon} of {self.dofs}")
+            request = f"{steps} steps of {histories.shape[-1]} DoFs"
+            raise ValueError(f"{self.name}: {request}; weights are for {self.horizon} of {self.dofs}")
         past = histories[:, -self.window :]
         table = self.tables[past.shape[1]][:, :steps]
         predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
@@ -312,7 +312,7 @@ class Compensation:
 
     @property
     def uses_target_token(self) -> bool:
-        """As `Rectifier.uses_target_token`."""
+        """Whether the target's token at the rejected position stays committed."""
         return self.settings.use_target_token
 
     def reset(self) -> None:

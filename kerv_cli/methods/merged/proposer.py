@@ -13,7 +13,7 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import DraftsChunks, Stateless
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
-from kerv_cli.engine.unread import Placed, Unread
+from kerv_cli.engine.unread import TreeRows, Unread
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.merged import MergedProposerSettings
@@ -38,18 +38,18 @@ class MergedProposer(Stateless):
 
         def source(name: str) -> DraftsChunks:
             part = find("proposer", name)
-            own: Any = part.settings(kind=name)
-            if isinstance(own, RetrievalProposerSettings):
-                own = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
-            built: DraftsChunks = part.built(own, context)
-            return built
+            source_settings: Any = part.settings(kind=name)
+            if isinstance(source_settings, RetrievalProposerSettings):
+                source_settings = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
+            proposer: DraftsChunks = part.built(source_settings, context)
+            return proposer
 
         sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
         return cls(sources, settings.nodes, fallback)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
-        return self._unread(chunk, depth) or self._tree(chunk, depth)
+        return self._on_device(chunk, depth) or self._tree(chunk, depth)
 
     def _tree(self, chunk: Chunk, depth: int) -> TokenTree:
         sources = list(self.sources)
@@ -64,33 +64,33 @@ class MergedProposer(Stateless):
             tree = merge(chains)
         return tree
 
-    def _unread(self, chunk: Chunk, depth: int) -> Unread | None:
-        """An early draft that was not read, and all other chains beside it, whether they will be wanted or not: which
-        of them are nodes of the tree is known once the draft is read. None where there is none, or no room."""
+    def _on_device(self, chunk: Chunk, depth: int) -> Unread | None:
+        """The early draft on the device with the chains of all other sources behind it; the host decides which of them
+        become nodes when it reads the draft. None where the early draft is on the host, or the rows have no room."""
         early = next((source for source in self.sources if isinstance(source, EarlyProposer)), None)
-        if early is None or (numbers := early.unread(chunk)) is None:
+        if early is None or (numbers := early.on_device(chunk)) is None:
             return None
         start, device = len(chunk.tokens), numbers.device
-        own = numbers[start : min(chunk.size, start + depth)].long()
+        draft = numbers[start : min(chunk.size, start + depth)].long()
         others = [s for s in (*self.sources, *self.fallback) if s is not early]
-        beside = [chain for source in others for chain in source.chains(chunk, depth) if chain]
-        lengths = [own.shape[0], *(len(chain) for chain in beside)]
+        chains = [chain for source in others for chain in source.chains(chunk, depth) if chain]
+        lengths = [draft.shape[0], *(len(chain) for chain in chains)]
 
-        def placed(found: np.ndarray) -> Placed:
-            early.take(chunk, found)
+        def assemble(vector: np.ndarray) -> TreeRows:
+            early.take(chunk, vector)
             tree = self._tree(chunk, depth)
-            return tree, rows_of(tree, [early.chains(chunk, depth)[0], *beside])
+            return tree, rows_of(tree, [early.chains(chunk, depth)[0], *chains])
 
         if sum(lengths) > max(self.nodes, chunk.size):
             early.take(chunk, read(numbers)[0])
             return None
-        if not beside:
-            return Unread(own, numbers, placed)
+        if not chains:
+            return Unread(draft, numbers, assemble)
         depths = np.concatenate([np.arange(length) for length in lengths])
         chain_of = np.repeat(np.arange(len(lengths)), lengths)
         visible = (chain_of[:, None] == chain_of) & (depths[:, None] >= depths)
-        tokens = torch.cat([own, upload([token for chain in beside for token in chain], device)])
-        return Unread(tokens, numbers, placed, upload(visible, device), upload(depths, device))
+        tokens = torch.cat([draft, upload([token for chain in chains for token in chain], device)])
+        return Unread(tokens, numbers, assemble, upload(visible, device), upload(depths, device))
 
 
 def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
@@ -100,11 +100,11 @@ def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
     for chain in reversed(chains):
         first -= len(chain)
         node: int | None = ROOT
-        for place, token in enumerate(chain):
+        for index, token in enumerate(chain):
             node = children.get((ROOT if node is None else node, token))
             if node is None:
                 break
-            rows[node] = first + place
+            rows[node] = first + index
     total = sum(len(chain) for chain in chains)
     return [total + row for row in rows]
 

@@ -85,12 +85,12 @@ class Manifest:
 
     @property
     def content(self) -> str:
-        """SHA-256 over keys, chunks and target: the same after a rebuild from the same target and demonstrations."""
+        """SHA-256 over keys, chunks and target; a rebuild from the same target and demonstrations keeps it."""
         return content_of(self.key, self.chunk, self.target, self.files)
 
 
 def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> np.ndarray:
-    """As `pooled_key`, on the host."""
+    """prompt (B, P, E) -> keys (B, d) float32 of length 1, on the host; errors as `pooled_key`."""
     return pooled_key(prompt, target, segments).cpu().numpy()
 
 
@@ -100,11 +100,11 @@ def pooled_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
     Raises:
         UnknownName: a segment that this target's prompt does not have.
     """
-    known = target.segments
+    parts = target.segments
     for name in segments:
-        if name not in known:
-            raise UnknownName("part of the prompt", name, known)
-    pooled = [_unit(prompt[:, known[name]].float().mean(1)) for name in segments]
+        if name not in parts:
+            raise UnknownName("part of the prompt", name, parts)
+    pooled = [_unit(prompt[:, parts[name]].float().mean(1)) for name in segments]
     return _unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1))
 
 
@@ -114,9 +114,9 @@ def _unit(vectors: Tensor) -> Tensor:
 
 def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
     """keys (n, d) along the directions projection (d, c) -> (n, c) float32 of length 1."""
-    inside = keys @ projection
-    found: np.ndarray = inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
-    return found.astype(np.float32)
+    vectors = keys @ projection
+    units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    return units.astype(np.float32)
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
@@ -126,9 +126,9 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
     Raises:
         CheckpointError: one is not.
     """
-    for task, used in seeds.items():
+    for task, numbers in seeds.items():
         training = spec_of(task).seeds.training
-        shared = [seed for seed in used if seed not in training]
+        shared = [seed for seed in numbers if seed not in training]
         if shared:
             raise CheckpointError(
                 f"{where} holds seed {shared[0]} of {task}: seeds from {training.stop} on are for selection and "
@@ -181,7 +181,7 @@ class Datastore:
         """
         manifest = read_manifest(folder)
         check_target(manifest, description, folder)
-        parts = _read(folder, manifest)
+        parts = _arrays(folder, manifest)
         index = None
         if search is not None:
             part = registry.find("datastore", search.kind, "datastore.kind")
@@ -190,7 +190,7 @@ class Datastore:
 
     @property
     def content(self) -> str:
-        """As `Manifest.content`."""
+        """SHA-256 over keys, chunks and target, see `Manifest.content`."""
         return self.manifest.content
 
     def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
@@ -198,7 +198,7 @@ class Datastore:
         return self.key_of(self.pooled(prompt, target).cpu().numpy())
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
-        """prompt (1, P, E) of the target -> what `key_of` makes the key from (p,) float32, on the device."""
+        """prompt (1, P, E) of the target -> pooled (p,) float32 for `key_of`, on the device."""
         return pooled_key(prompt, target, self.manifest.key)[0]
 
     def key_of(self, pooled: np.ndarray) -> np.ndarray:
@@ -221,7 +221,7 @@ class Datastore:
         return Neighbours(similarity, self.tokens[at].astype(np.int64), self.seeds[at], self.steps[at], self.left[at])
 
 
-def _read(folder: Path, manifest: Manifest) -> dict[str, Any]:
+def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
     """Reads a datastore's files and checks them against its manifest."""
     try:
         vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
@@ -260,9 +260,9 @@ def check_target(manifest: Manifest, description: TargetDescription, folder: Pat
     Raises:
         CheckpointError: another chunk length, action space or action statistics, other weights.
     """
-    own = MadeFor(description.sha256, description.actions, description.chunk)
+    present = MadeFor(description.sha256, description.actions, description.chunk)
     made_for = MadeFor(manifest.target, manifest.actions, manifest.chunk)
-    made_for.check_same(own, f"the datastore in {folder}", "built", AGAIN)
+    made_for.check_same(present, f"the datastore in {folder}", "built", AGAIN)
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
@@ -391,7 +391,7 @@ class RetrievalProposer(Stateless):
     def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
         self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
         self.waits = target.device.type == "cpu"
-        self._found: tuple[Chunk, Neighbours] | None = None
+        self._nearest: tuple[Chunk, Neighbours] | None = None
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> RetrievalProposer:
@@ -405,21 +405,21 @@ class RetrievalProposer(Stateless):
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
         """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
-        if self._found is None or self._found[0] is not chunk:
+        if self._nearest is None or self._nearest[0] is not chunk:
             self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
-        assert self._found is not None
-        return self._found[1]
+        assert self._nearest is not None
+        return self._nearest[1]
 
     def ask(self, chunk: Chunk) -> None:
-        """As `Asks.ask`: the search key."""
-        if not self.waits and (self._found is None or self._found[0] is not chunk):
-            pooled = self.datastore.pooled(chunk.prompt, self.target)
-            chunk.asked.append((pooled, lambda found: self._search(chunk, found)))
+        """Before the prefill: adds the pooled prompt, which the search key is made of, to `chunk.reads`."""
+        if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
+            vector = self.datastore.pooled(chunk.prompt, self.target)
+            chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
 
     def _search(self, chunk: Chunk, pooled: np.ndarray) -> None:
         key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
-        self._found = chunk, self.datastore.query(key, chunk.situation.task, self.count)
-        chunk.similarity = float(self._found[1].similarity[0])
+        self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+        chunk.similarity = float(self._nearest[1].similarity[0])
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
         """The neighbours' chunks as one tree, merged by kinematic group."""
@@ -429,5 +429,5 @@ class RetrievalProposer(Stateless):
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
         start = len(chunk.tokens)
-        found: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
-        return found
+        chains: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
+        return chains

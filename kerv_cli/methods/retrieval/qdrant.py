@@ -39,7 +39,7 @@ class Engine(Protocol):
 
 
 class QdrantIndex:
-    """Rows found by Qdrant.
+    """Searches rows with Qdrant.
 
     vectors (rows, d) float32, seeds (rows,), shards: task -> rows. digest: names the server's collection. url: the
     server; None: the engine in this process.
@@ -73,19 +73,19 @@ class QdrantIndex:
                 self.engine.put(first, self.vectors[rows], payloads)
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """See `Index`. Searches again, with a score bound instead of a limit, where rows beyond the limit may tie with
-        the k-th."""
-        sent, shard = key.tolist(), self.shards[task]
-        found = self.engine.search(sent, task, k + MARGIN, without, None)
-        rows = np.sort(np.array([row for row, _ in found], dtype=np.int64))
-        if len(found) < k + MARGIN:
+        """Rows that hold the k nearest, increasing, see `Index`. Searches again, with a score bound instead of a
+        limit, where rows beyond the limit may tie with the k-th."""
+        query, shard = key.tolist(), self.shards[task]
+        points = self.engine.search(query, task, k + MARGIN, without, None)
+        rows = np.sort(np.array([row for row, _ in points], dtype=np.int64))
+        if len(points) < k + MARGIN:
             return rows
         least = float(best(self.vectors, rows, key, k)[1][-1]) - slack(self.longest, key)
-        if found[-1][1] < least:
+        if points[-1][1] < least:
             return rows
         above = least - slack(self.longest, key) - 1e-9  # Qdrant leaves out what scores just as much
-        found = self.engine.search(sent, task, shard.stop - shard.start, without, above)
-        return np.sort(np.array([row for row, _ in found], dtype=np.int64))
+        points = self.engine.search(query, task, shard.stop - shard.start, without, above)
+        return np.sort(np.array([row for row, _ in points], dtype=np.int64))
 
 
 def qdrant_index(
@@ -110,7 +110,7 @@ class EmbeddedEngine:
 
         self.q, folder = q, tempfile.mkdtemp(prefix="kerv-qdrant-")
         vectors = q.EdgeVectorParams(size=width, distance=q.Distance.Dot)
-        with _kept(folder):
+        with _storage_errors(folder):
             # nothing needs to outlive the process, so there is no write-ahead log
             config = q.EdgeConfig(vectors=vectors, wal_enabled=False, max_search_threads=1)
             self.shard = q.EdgeShard.create(folder, config)
@@ -120,25 +120,25 @@ class EmbeddedEngine:
         self.close = weakref.finalize(self, _discard, self.shard, folder)
 
     def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
-        """As `Engine.put`."""
+        """Stores rows first, first + 1, …: vectors (n, d), one payload each."""
         points = [
             self.q.Point(first + i, vector, payload)
             for i, (vector, payload) in enumerate(zip(vectors.tolist(), payloads, strict=True))
         ]
-        with _kept(self.folder):
+        with _storage_errors(self.folder):
             self.shard.update(self.q.UpdateOperation.upsert_points(points))
 
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
     ) -> list[tuple[int, float]]:
-        """As `Engine.search`."""
+        """(row, score) of the task's best rows, arguments as in `Engine`."""
         q = self.q
         must = [q.FieldCondition("task", match=q.MatchValue(task))]
-        passed = [] if without is None else [q.FieldCondition("seed", match=q.MatchValue(without))]
+        excluded = [] if without is None else [q.FieldCondition("seed", match=q.MatchValue(without))]
         request = q.QueryRequest(
             limit=limit,
             query=q.Query.Nearest(key),
-            filter=q.Filter(must=must, must_not=passed),
+            filter=q.Filter(must=must, must_not=excluded),
             params=q.SearchParams(exact=True),
             score_threshold=above,
             with_payload=False,
@@ -147,7 +147,7 @@ class EmbeddedEngine:
 
 
 @contextmanager
-def _kept(folder: str) -> Iterator[None]:
+def _storage_errors(folder: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # the engine raises nothing more particular
@@ -166,7 +166,7 @@ class ServerEngine:
         from qdrant_client import QdrantClient, models
 
         self.url, self.collection, self.models = url, collection, models
-        with self._asked():
+        with self._errors():
             self.client = QdrantClient(url=url, timeout=TIMEOUT, check_compatibility=False)
             if not self.client.collection_exists(collection):
                 self._create(width)
@@ -187,37 +187,37 @@ class ServerEngine:
 
     def count(self) -> int:
         """Points in the collection."""
-        with self._asked():
+        with self._errors():
             return self.client.count(self.collection, exact=True).count
 
     def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
-        """As `Engine.put`."""
+        """Stores rows first, first + 1, …: vectors (n, d), one payload each."""
         ids = list(range(first, first + len(vectors)))
         batch = self.models.Batch(ids=ids, vectors=vectors.tolist(), payloads=payloads)
-        with self._asked():
+        with self._errors():
             self.client.upsert(self.collection, batch, wait=True)
 
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
     ) -> list[tuple[int, float]]:
-        """As `Engine.search`."""
+        """(row, score) of the task's best rows, arguments as in `Engine`."""
         m = self.models
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
-        passed = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
-        with self._asked():
-            answer = self.client.query_points(
+        excluded = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]
+        with self._errors():
+            response = self.client.query_points(
                 self.collection,
                 query=key,
-                query_filter=m.Filter(must=must, must_not=passed),
+                query_filter=m.Filter(must=must, must_not=excluded),
                 search_params=m.SearchParams(exact=True),
                 limit=limit,
                 score_threshold=above,
                 with_payload=False,
             )
-        return [(int(point.id), point.score) for point in answer.points]
+        return [(int(point.id), point.score) for point in response.points]
 
     @contextmanager
-    def _asked(self) -> Iterator[None]:
+    def _errors(self) -> Iterator[None]:
         from httpx import HTTPError, InvalidURL
         from qdrant_client.http.exceptions import ApiException
 

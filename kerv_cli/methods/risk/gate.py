@@ -68,13 +68,13 @@ class RiskSkip(Skip):
         return cls(settings, source, score, level, recording.manifest.scale)
 
     def begin(self, task: str, seed: int) -> None:
-        """As `Skip.begin`: which decodes are audited depends on task and seed alone."""
+        """An episode begins. Which decodes are audited depends on task and seed alone."""
         self.random = episode_numbers("audit", task, seed)
         self.audit.reset()
         self.decodes, self.suspicious = 0, False
 
     def take(self, chunk: Chunk) -> bool:
-        """As `Skip.take`."""
+        """Fills the chunk with the source's draft if it is trusted and not audited -> whether it did."""
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains and len(chains[0]) == chunk.size else ()
         score = self.score.of(Draft(chunk, self.source, self.chain)) if self.chain else -np.inf
@@ -88,7 +88,7 @@ class RiskSkip(Skip):
     def _reason(self, score: float) -> str:
         """Why this draft is verified, or TRUSTED. A random number is drawn for every decode, so that the audits of an
         episode do not depend on its scores."""
-        drawn = self.random.random() < self.settings.audit
+        audit = self.random.random() < self.settings.audit
         if not self.chain:
             return NO_DRAFT
         if self.audit.alarm:
@@ -99,16 +99,16 @@ class RiskSkip(Skip):
             return OPENING
         if self.suspicious:
             return DOUBT
-        return AUDIT if drawn else TRUSTED
+        return AUDIT if audit else TRUSTED
 
     def verified(self, chunk: Chunk) -> None:
-        """As `Skip.verified`: the loss, where the first verification judged this very draft."""
-        wanted = judged_tokens(chunk, self.chain) if self.chain else None
-        if wanted is not None:
-            self._judge(chunk, chunk_loss(chunk.space, self.chain[: len(wanted)], wanted, self.scale))
+        """The prefill verified the chunk: adds the loss, where the first verification judged this very draft."""
+        targets = judged_tokens(chunk, self.chain) if self.chain else None
+        if targets is not None:
+            self._judge(chunk, chunk_loss(chunk.space, self.chain[: len(targets)], targets, self.scale))
 
     def completed(self, chunk: Chunk) -> None:
-        """As `Skip.completed`: the loss against what is executed, for drafts that were not judged along their path."""
+        """The chunk is complete: adds the loss of a draft that no verification judged, against the chunk's actions."""
         if self.chain and chunk.trust is not None and chunk.trust.loss is None:
             self._judge(chunk, executed_loss(chunk, self.chain, self.scale))
 
@@ -124,7 +124,7 @@ class RiskSkip(Skip):
 
 
 class Evidence:
-    """Anytime-valid evidence about the mean of losses in [0, 1], from those seen so far: two e-processes, each a
+    """Anytime-valid evidence about the mean of losses in [0, 1], from those added so far: two e-processes, each a
     mixture of bets (Waudby-Smith and Ramdas 2024). Whoever stops when one reaches 1/δ errs with probability δ at most,
     whenever he looks.
 
@@ -136,7 +136,7 @@ class Evidence:
         self.reset()
 
     def reset(self) -> None:
-        """Nothing was seen."""
+        """No loss was added."""
         self._above = np.ones(len(BETS))
         self._below = np.ones(len(BETS))
 
@@ -159,9 +159,7 @@ class Evidence:
 
 class Audit:
     """Collects the losses of decodes that the gate would have skipped but that were verified. Raises an alarm when the
-    evidence that the risk is above ε reaches 1/δ, and ends it when the evidence since then that it is not does.
-
-    """
+    evidence that the risk is above ε reaches 1/δ, and ends it when the evidence since then that it is not does."""
 
     def __init__(self, epsilon: float, delta: float) -> None:
         self.evidence, self.level = Evidence(epsilon), 1 / delta

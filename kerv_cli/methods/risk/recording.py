@@ -34,9 +34,9 @@ ROW = [("source", pa.string()), ("task", pa.string()), ("seed", pa.int64()), ("i
 
 @dataclass(frozen=True)
 class RiskManifest:
-    """Description of a recording. sources: what drafted -> hash of its artifact, empty where it has none. scale: ε_a.
-    tasks: task -> seeds, all of them selection seeds. scores: columns. files: name -> SHA-256. made_from: what sources
-    and scores read, kind of artifact -> hash; absent from older recordings."""
+    """Description of a recording. sources: proposer of the drafts -> hash of its artifact, empty where it has none.
+    scale: ε_a. tasks: task -> seeds, all of them selection seeds. scores: columns. files: name ->
+    SHA-256. made_from: what sources and scores read, kind of artifact -> hash; absent from older recordings."""
 
     target: MadeFor
     sources: dict[str, str]
@@ -55,14 +55,14 @@ class RiskManifest:
 
     @property
     def artifacts(self) -> dict[str, str]:
-        """Kind -> hash of what was made use of. An older recording names what drafted alone, the early drafter."""
+        """Kind -> hash of the artifacts it was made from; an older recording names the early drafter alone."""
         return self.made_from or {name: digest for name, digest in self.sources.items() if digest}
 
     def read_by(self, source: str, scores: Sequence[str]) -> dict[str, str]:
         """Those of `artifacts` that a source's drafts and these scores read."""
         parts = [find("proposer", source), *(find("score", name) for name in scores)]
-        wanted = {kind for part in parts for kind in part.needs(None)}
-        return {kind: digest for kind, digest in self.artifacts.items() if kind in wanted}
+        kinds = {kind for part in parts for kind in part.needs(None)}
+        return {kind: digest for kind, digest in self.artifacts.items() if kind in kinds}
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class RiskRecording:
             CheckpointError: it was not recorded.
         """
         if source not in self.manifest.sources:
-            known = ", ".join(self.manifest.sources)
-            raise CheckpointError(f"the risk of drafts from {source} was not recorded, only of {known}: {AGAIN}")
+            names = ", ".join(self.manifest.sources)
+            raise CheckpointError(f"the risk of drafts from {source} was not recorded, only of {names}: {AGAIN}")
         columns = self._table.filter(pa.compute.equal(self._table["source"], source))
         tasks, seeds = (columns[name].to_numpy(zero_copy_only=False) for name in ("task", "seed"))
         _, numbers = np.unique(tasks, return_inverse=True)
@@ -105,14 +105,14 @@ class RiskRecording:
         """
         key = source, score, epsilon, delta
         if key not in self._certified:
-            found = self.losses(source)
-            if score not in found.scores:
+            losses = self.losses(source)
+            if score not in losses.scores:
                 raise CheckpointError(
-                    f"score {score} was not recorded, only {', '.join(found.scores)}: {AGAIN} scores=[…,{score}]"
+                    f"score {score} was not recorded, only {', '.join(losses.scores)}: {AGAIN} scores=[…,{score}]"
                 )
-            known = np.isfinite(found.scores[score])
-            values = np.where(known, found.scores[score], -math.inf)
-            self._certified[key] = certify(values, found.losses, found.episodes, epsilon, delta)
+            finite = np.isfinite(losses.scores[score])
+            values = np.where(finite, losses.scores[score], -math.inf)
+            self._certified[key] = certify(values, losses.losses, losses.episodes, epsilon, delta)
         return self._certified[key]
 
     def check_size(self, source: str, epsilon: float, delta: float) -> None:
@@ -168,19 +168,21 @@ def read_risk(folder: Path, request: Request) -> RiskManifest:
     path = folder / "risk.json"
     if not path.is_file():
         raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
-    manifest = _read(folder)
+    manifest = _manifest(folder)
     check_files(folder, manifest.files, AGAIN)
-    own = request.description
-    manifest.target.check_same(MadeFor(own.sha256, own.actions, own.chunk), f"the risk in {folder}", "recorded", AGAIN)
+    target = request.description
+    manifest.target.check_same(
+        MadeFor(target.sha256, target.actions, target.chunk), f"the risk in {folder}", "recorded", AGAIN
+    )
     return manifest
 
 
-def _read(folder: Path) -> RiskManifest:
+def _manifest(folder: Path) -> RiskManifest:
     return read_file(RiskManifest, folder / "risk.json", f"a recording of format {FORMAT}: {AGAIN}")
 
 
 def _sources(folder: Path) -> MadeFrom:
-    return MadeFrom(f"the risk in {folder}", "recorded", AGAIN, _read(folder).artifacts)
+    return MadeFrom(f"the risk in {folder}", "recorded", AGAIN, _manifest(folder).artifacts)
 
 
 def _check(folder: Path, request: Request) -> str:

@@ -55,15 +55,15 @@ class _OfEarly:
     def __init__(self, settings: Any, context: Context) -> None:
         draft = context.built.get("prefill_draft")
         of_merged = draft.sources if isinstance(draft, MergedProposer) else [draft]
-        own = [source for source in of_merged if isinstance(source, EarlyProposer)]
-        self.early = own[0] if own else EarlyProposer(context.artifact("early"), context.target)
+        early = [source for source in of_merged if isinstance(source, EarlyProposer)]
+        self.early = early[0] if early else EarlyProposer(context.artifact("early"), context.target)
 
 
 class Odds(_OfEarly):
     """score=odds: log of the early drafter's estimate that the whole draft is accepted."""
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`; nats, at most 0."""
+        """Logarithm of the estimate, nats, at most 0."""
         return math.log(max(self.early.drafted(draft.chunk).odds, LEAST_ODDS))
 
 
@@ -71,7 +71,7 @@ class Entropy(_OfEarly):
     """score=entropy: negative mean entropy of the early drafter's tokens, nats."""
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`."""
+        """Negative mean entropy, nats."""
         return -self.early.drafted(draft.chunk).entropy
 
 
@@ -80,7 +80,7 @@ class Familiarity(_OfEarly):
     from what the drafter was trained on, in standard deviations. It does not look at the draft."""
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`."""
+        """Negative mean square, at most 0."""
         return -float(self.early.distance(draft.chunk))
 
 
@@ -92,7 +92,7 @@ class Agreement:
         self.other = other
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`."""
+        """Negative mean difference; −∞ without a whole draft of the other source."""
         chains = self.other.chains(draft.chunk, draft.chunk.size)
         if not chains or len(chains[0]) < len(draft.tokens):
             return -math.inf
@@ -110,7 +110,7 @@ class Similarity:
         self.retrieval = RetrievalProposer.of_nearest(context)
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`."""
+        """Cosine of the best stored observation."""
         return float(self.retrieval.neighbours(draft.chunk).similarity[0])
 
 
@@ -123,7 +123,7 @@ class Steadiness:
         """Reads nothing but the draft."""
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`."""
+        """Negative mean change from action to action."""
         space, history = draft.chunk.space, draft.chunk.situation.history.values()
         values = space.values_of(np.array(draft.tokens)).reshape(-1, space.dofs)
         path = np.concatenate([history[-1:], values])
@@ -142,9 +142,9 @@ class Learned:
         self.inputs = [find("score", name).built(NoSettings(name), context) for name in self.model.inputs]
 
     def of(self, draft: Draft) -> float:
-        """As `Score.of`."""
-        known = [score.of(draft) for score in self.inputs]
-        return -self.model.expected_loss(self.target.pooled(draft.chunk.prompt), known)
+        """Negative expected loss, −1 to 0."""
+        values = [score.of(draft) for score in self.inputs]
+        return -self.model.expected_loss(self.target.pooled(draft.chunk.prompt), values)
 
 
 def agreement_hold(settings: Any, context: Context) -> Score:
@@ -188,14 +188,15 @@ class LearnedScore(nn.Module):
     @torch.inference_mode()
     def expected_loss(self, features: Tensor, scores: Sequence[float]) -> float:
         """features (1, F) and the values of `inputs` -> the expected loss in [0, 1]."""
-        known = upload(np.asarray([scores], dtype=np.float32), features.device).clamp_min(FLOOR)
-        return float(self(torch.cat([features.float(), known], 1)).sigmoid())
+        values = upload(np.asarray([scores], dtype=np.float32), features.device).clamp_min(FLOOR)
+        return float(self(torch.cat([features.float(), values], 1)).sigmoid())
 
 
 @dataclass(frozen=True)
 class ScoreDescription(Description):
-    """A learned score's JSON. target: hash of the weights whose prompts it reads. source: what drafted, by its hash.
-    made_from: artifacts that drafts and inputs read, kind -> hash; absent from older scores."""
+    """A learned score's JSON. target: hash of the weights whose prompts it reads. source: the proposer of
+    its drafts, and that artifact's hash. made_from: artifacts that drafts and inputs read, kind -> hash; absent from
+    older scores."""
 
     inputs: list[str]
     features: int
@@ -209,7 +210,7 @@ class ScoreDescription(Description):
 
     @property
     def artifacts(self) -> dict[str, str]:
-        """As `made_from`; an older score names what drafted alone, the early drafter."""
+        """Kind -> hash of the artifacts it was made from; an older score names its source alone, the early drafter."""
         return self.made_from or ({self.source: self.source_sha256} if self.source_sha256 else {})
 
 
@@ -219,9 +220,10 @@ def save_score(
     made_for: MadeFor,
     source: tuple[str, str],
     made_from: Mapping[str, str],
-    made: dict[str, Any],
+    provenance: dict[str, Any],
 ) -> str:
-    """Writes the score -> SHA-256 of its weights. source: name and hash of what drafted. made_from: kind -> hash."""
+    """Writes the score -> SHA-256 of its weights. source: name and hash of the drafts' proposer.
+    made_from: kind -> hash."""
     described = {
         "inputs": list(model.inputs),
         "features": model.features,
@@ -231,29 +233,29 @@ def save_score(
         "chunk": made_for.chunk,
         "actions": made_for.actions.as_dict(),
         "made_from": dict(made_from),
-        "provenance": made,
+        "provenance": provenance,
     }
     return save_module(folder, "score", model, described)
 
 
 def read_score(folder: Path, request: Request) -> ScoreDescription:
     """The description in `folder`; errors as `targets.checkpoint.read_description`, and for another target."""
-    own = read_description(folder, "score", ScoreDescription)
+    description = read_description(folder, "score", ScoreDescription)
     target = request.description
-    MadeFor(own.target, own.actions, own.chunk).check_same(
+    MadeFor(description.target, description.actions, description.chunk).check_same(
         MadeFor(target.sha256, target.actions, target.chunk), f"the score in {folder}", "trained", AGAIN
     )
-    return own
+    return description
 
 
 def _sources(folder: Path) -> MadeFrom:
-    own = read_description(folder, "score", ScoreDescription)
-    return MadeFrom(f"the score in {folder}", "trained", AGAIN, own.artifacts)
+    description = read_description(folder, "score", ScoreDescription)
+    return MadeFrom(f"the score in {folder}", "trained", AGAIN, description.artifacts)
 
 
 def _load(folder: Path, request: Request) -> LearnedScore:
-    own = read_score(folder, request)
-    model = LearnedScore(own.inputs, own.features)
+    description = read_score(folder, request)
+    model = LearnedScore(description.inputs, description.features)
     load_state(model, folder, "score")
     return model.eval()
 

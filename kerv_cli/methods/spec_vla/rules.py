@@ -23,7 +23,7 @@ class Relaxed(Strict):
         return cls(context.target.actions, settings.strict_dofs)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """As `Acceptance.limits`: r, for strict DoFs 0 where those must match."""
+        """Largest accepted distance per DoF, bins (D,): r, for strict DoFs 0 where those must match."""
         return tuple(0 if self.strict_dofs and strict else r for strict in self.space.is_strict)
 
 

@@ -21,7 +21,8 @@ class StreakSkip(Skip):
 
     def __init__(self, settings: StreakSkipSettings, source: DraftsChunks) -> None:
         self.settings, self.source = settings, source
-        self.allowed = self.left = 0  # after the last verification, and of these still
+        self.allowed = 0  # unverified decodes after the last verification
+        self.left = 0  # of these, how many are still to come
         self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
 
     @classmethod
@@ -30,33 +31,33 @@ class StreakSkip(Skip):
         return cls(settings, first_source(context.built["prefill_draft"]))
 
     def begin(self, task: str, seed: int) -> None:
-        """As `Skip.begin`."""
+        """An episode begins, with a verification."""
         self.allowed = self.left = 0
 
     def take(self, chunk: Chunk) -> bool:
-        """As `Skip.take`."""
+        """Fills the chunk with the source's draft while unverified decodes are left -> whether it did."""
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
-        taken = self.left > 0 and len(self.chain) == chunk.size
-        chunk.trust = Trust(math.nan, math.nan, TRUSTED if taken else STREAK)
-        if not taken:
+        trusted = self.left > 0 and len(self.chain) == chunk.size
+        chunk.trust = Trust(math.nan, math.nan, TRUSTED if trusted else STREAK)
+        if not trusted:
             return False
         self.left -= 1
         chunk.skip(self.chain, self.source.name)
         return True
 
     def verified(self, chunk: Chunk) -> None:
-        """As `Skip.verified`: doubles what is allowed, or ends it."""
+        """The prefill verified the chunk: allows twice as many unverified decodes, or none."""
         self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
         self.left = self.allowed
 
     def _agrees(self, chunk: Chunk) -> bool:
         """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's
         tokens on its own path, strict DoFs equal."""
-        wanted = judged_tokens(chunk, self.chain)
-        if wanted is None:
+        targets = judged_tokens(chunk, self.chain)
+        if targets is None:
             return False
         if chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted):
             return True
         scale = self.settings.tolerance
-        return scale > 0 and chunk_loss(chunk.space, self.chain[: len(wanted)], wanted, 2 * scale) <= 0.5
+        return scale > 0 and chunk_loss(chunk.space, self.chain[: len(targets)], targets, 2 * scale) <= 0.5

@@ -33,7 +33,7 @@ class Stack(Protocol):
     def compute(
         self, x: Tensor, positions: Tensor, cache: Cache | None, slots: Slots | None, mask: Tensor | None
     ) -> Tensor:
-        """As `LayerStack.compute`."""
+        """The layers at `slots` of the cache, see `LayerStack.compute`."""
 
 
 class CapturedCache(Cache):
@@ -44,7 +44,7 @@ class CapturedCache(Cache):
         self.captured: CapturedLayers | None = None
 
     def run(self, stack: Stack, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """As `CapturedLayers.__call__`; every forward over a cache is of the same stack."""
+        """The layers in a graph, see `CapturedLayers.__call__`; every forward over a cache is of one stack."""
         self.captured = self.captured or CapturedLayers(stack, self)
         return self.captured(x, positions, mask)
 
@@ -96,7 +96,7 @@ class _Step:
         return self.stack.compute(self.x, self.positions, self.cache, Slots.at(self.index), self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """As `CapturedLayers.__call__`."""
+        """Copies the inputs to the graph's buffers and replays it, see `CapturedLayers.__call__`."""
         tokens, start = x.shape[1], self.cache.length
         self.x.zero_()[:, :tokens].copy_(x)
         self.positions[:tokens].copy_(positions)

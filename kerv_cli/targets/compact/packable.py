@@ -42,13 +42,13 @@ class Packable(nn.Module):
         super()._load_from_state_dict(*arguments, **keywords)
 
     def train(self, mode: bool = True) -> Self:
-        """As `nn.Module.train`; training mode drops the packed weights."""
+        """Sets the mode of `nn.Module.train`; training mode drops the packed weights."""
         if mode:
             self.packed = None
         return super().train(mode)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """As `nn.Module.requires_grad_`; unfreezing drops the packed weights of all parts."""
+        """Freezes or unfreezes all parameters; unfreezing drops the packed weights of all parts."""
         for part in self.modules():
             if requires_grad and isinstance(part, Packable):
                 part.packed = None

@@ -120,7 +120,7 @@ class PackedLayer:
         return attended.transpose(1, 2).reshape(batch * tokens, self.width)
 
     def step(self, x: Tensor, turn: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
-        """As `__call__` for one token of one sequence, as a vector."""
+        """`__call__` for one token of one sequence, computed as a vector."""
         row = x.reshape(self.width)
         qkv = self.qkv.of_vector(row, self.norm.of_vector(row))
         qkv.view(torch.complex64).mul_(turn.view(-1))
@@ -148,7 +148,7 @@ class PackedLayers(PackedStack):
         self.rows, self.gain = RowNorm(stack.norm), gain_of(stack.norm)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """As `PackedStack`."""
+        """All layers: x (B, T, E) -> hidden states (B, T, E), before the norm."""
         turn = self.turns.index_select(0, positions).view(torch.complex64)
         start = cache.length if cache is not None else 0
         for i, layer in enumerate(self.layers):
@@ -156,7 +156,7 @@ class PackedLayers(PackedStack):
         return x
 
     def norm(self, x: Tensor) -> Tensor:
-        """As `PackedStack`."""
+        """The final RMSNorm with its gain."""
         return self.rows(x).mul_(self.gain)
 
 
@@ -280,7 +280,7 @@ class PackedPrompt(Packed):
         self.locate[-1] = (bias * 0.1 + target.centre.repeat(places), weight * 0.1)
 
     def __call__(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """As `CompactTarget.encode_batch`, for one observation."""
+        """One observation -> prompt embeddings (1, P, E) and positions of the places (1, K, 3), metres."""
         words, felt = self.words(inputs.words), inputs.proprioception
         hand = torch.addmm(self.hand[0], felt, self.hand[1])
         tokens, points = self.see(inputs.images)
@@ -294,8 +294,8 @@ class PackedPrompt(Packed):
     def see(self, images: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
         """Tokens (1, grid², E) and points (1, 2K) of every view."""
         assert images is not None
-        seen = [encoder(view) for encoder, view in zip(self.encoders, images.split(self.size, -1), strict=True)]
-        return [tokens for tokens, _ in seen], [points for _, points in seen]
+        views = [encoder(view) for encoder, view in zip(self.encoders, images.split(self.size, -1), strict=True)]
+        return [tokens for tokens, _ in views], [points for _, points in views]
 
 
 @singledispatch

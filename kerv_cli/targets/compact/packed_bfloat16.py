@@ -83,7 +83,7 @@ class BlockedLayer:
         return rows
 
     def step(self, rows: Tensor, turn: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
-        """As `__call__` for one token of one sequence, with fewer calls: behind cold caches each takes 10 µs."""
+        """`__call__` for one token of one sequence, with fewer calls: behind cold caches each takes 10 µs."""
         row = rows.view(self.width)
         qkv = self.qkv(self.normed(row)).float().view(3, 1, self.heads, 1, self.channels)
         torch.view_as_complex(qkv[:2].unflatten(-1, (-1, 2))).mul_(turn)
@@ -114,7 +114,7 @@ class BlockedLayers(PackedStack):
         self.rows, self.gain = RowNorm(norm), full_gain(norm)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """As `PackedStack`; x (B, T, E) bfloat16."""
+        """All layers: x (B, T, E) bfloat16 -> hidden states (B, T, E), before the norm."""
         rows = x.to(torch.float32, memory_format=torch.contiguous_format, copy=True)
         turn = self.turns.index_select(0, positions)
         start = cache.length if cache is not None else 0
@@ -124,5 +124,5 @@ class BlockedLayers(PackedStack):
         return rows.to(torch.bfloat16)
 
     def norm(self, x: Tensor) -> Tensor:
-        """As `PackedStack`."""
+        """The final RMSNorm with its gain."""
         return self.rows(x.float()).mul_(self.gain).to(torch.bfloat16)

@@ -202,9 +202,9 @@ class CompactTarget(Packable):
         it: measured as fast as a batch of eight, faster than a larger one."""
         if self.packed is not None:
             return torch.cat([self.encode(observation) for observation in observations])
-        found = [self.inputs(observation) for observation in observations]
-        images = [one.images for one in found if one.images is not None]
-        rows = (torch.cat([getattr(one, name) for one in found]) for name in ("proprioception", "states", "words"))
+        batch = [self.inputs(observation) for observation in observations]
+        images = [one.images for one in batch if one.images is not None]
+        rows = (torch.cat([getattr(one, name) for one in batch]) for name in ("proprioception", "states", "words"))
         return self.encode_batch(Inputs(torch.cat(images) if images else None, *rows))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
@@ -232,8 +232,8 @@ class CompactTarget(Packable):
         """Vision tokens (B, grid² x views, E) and the places' estimated positions (B, K, 3), metres."""
         assert inputs.images is not None
         images = inputs.images.split(self.settings.image_size, -1)
-        seen = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
-        tokens, points = torch.cat([one for one, _ in seen], 1), torch.cat([one for _, one in seen], -1)
+        views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
+        tokens, points = torch.cat([one for one, _ in views], 1), torch.cat([one for _, one in views], -1)
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
             features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
@@ -252,17 +252,17 @@ class CompactTarget(Packable):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """As `Target.forward`: hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
+        """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
         hidden: Tensor = self.trunk(x, positions, cache, seen)
         return hidden
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """prompt (B, P, E) -> hidden states (B, N, E) of all tokens, in one forward (docs/methods.md §6). No action
-        token is embedded: learned queries stand in their places and see the prompt and each other."""
+        token is embedded: learned queries stand at their positions and see the prompt and each other."""
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
-        seen = np.tri(x.shape[1], dtype=bool)
-        seen[prompt.shape[1] :] = True
-        return self(x, torch.arange(x.shape[1], device=x.device), cache, seen)[:, prompt.shape[1] :]
+        visible = np.tri(x.shape[1], dtype=bool)
+        visible[prompt.shape[1] :] = True
+        return self(x, torch.arange(x.shape[1], device=x.device), cache, visible)[:, prompt.shape[1] :]
 
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """tokens (B, N) -> logits (B, N, V) that predict them, and the positions of the places (B, K, 3), metres. A

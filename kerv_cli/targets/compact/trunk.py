@@ -87,7 +87,8 @@ class PackedStack(Packed, ABC):
 
     @abstractmethod
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
-        """As `LayerStack.run_layers`, but the cache's length stays; mask: from `attention_mask`."""
+        """x (B, T, E) -> hidden states (B, T, E) before the norm; the cache's length stays. mask: from
+        `attention_mask`."""
 
     @abstractmethod
     def norm(self, x: Tensor) -> Tensor:
@@ -144,7 +145,7 @@ class LayerStack(Packable):
     def compute(
         self, x: Tensor, positions: Tensor, cache: Cache | None, slots: Slots | None, mask: Tensor | None
     ) -> Tensor:
-        """As `run_layers` by the modules, written at `slots` of the cache, whose length stays; mask: from
+        """Runs the modules of the layers; keys and values go to `slots` of the cache, whose length stays; mask: from
         `attention_mask`."""
         rotary = self.rotary(positions)
         for i, layer in enumerate(self.layers):

@@ -127,9 +127,9 @@ class Shape:
             % language.key_value_heads,
             "fewer token ids than action bins": self.vocabulary <= self.bins,
         }
-        found = [what for what, is_wrong in wrong.items() if is_wrong]
-        if found:
-            raise CheckpointError(f"{where} describes {found[0]}: it is not a checkpoint of OpenVLA")
+        faults = [what for what, is_wrong in wrong.items() if is_wrong]
+        if faults:
+            raise CheckpointError(f"{where} describes {faults[0]}: it is not a checkpoint of OpenVLA")
         return self
 
 
@@ -146,8 +146,8 @@ def read_shape(folder: Path) -> Shape:
         raise CheckpointError(f"{path} has no text_config of a Llama: other language models are not supported")
     if text.get("rope_scaling"):
         raise CheckpointError(f"{path} asks for rope_scaling, which OpenVLA does not have: it cannot be loaded")
-    known = {f.name for f in fields(Language)}
-    language = read(Language, {k: v for k, v in text.items() if k in known}, f"{path}, text_config")
+    names = {f.name for f in fields(Language)}
+    language = read(Language, {k: v for k, v in text.items() if k in names}, f"{path}, text_config")
     towers = _towers(value, path)
     numbers = {"padding": value.get("pad_to_multiple_of", 64), "bins": value.get("n_action_bins", 256)}
     plain = {"towers": [asdict(t) for t in towers], "language": asdict(language), **numbers}
@@ -206,16 +206,16 @@ def read_statistics(folder: Path, name: str | None) -> Statistics:
         UsageError: several and no name. UnknownName: none of that name. CheckpointError: none, or damaged ones.
     """
     path = folder / STATISTICS
-    known = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
-    if not isinstance(known, dict) or not known:
+    statistics = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
+    if not isinstance(statistics, dict) or not statistics:
         raise CheckpointError(f"{folder} has neither {STATISTICS} nor norm_stats in {CONFIG}: actions have no units")
-    if name is None and len(known) > 1:
-        raise UsageError(f"{folder} has statistics of {', '.join(sorted(known))}: choose with statistics=NAME")
-    name = name or next(iter(known))
-    if name not in known:
-        raise UnknownName("statistics", name, known)
+    if name is None and len(statistics) > 1:
+        raise UsageError(f"{folder} has statistics of {', '.join(sorted(statistics))}: choose with statistics=NAME")
+    name = name or next(iter(statistics))
+    if name not in statistics:
+        raise UnknownName("statistics", name, statistics)
     try:
-        low, high, mask = _bounds(known[name]["action"])
+        low, high, mask = _bounds(statistics[name]["action"])
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"statistics {name} in {folder} are damaged: {error}") from error
     bounds = [(a, b) if normalised else (-1.0, 1.0) for a, b, normalised in zip(low, high, mask, strict=True)]
@@ -232,13 +232,13 @@ def _bounds(action: Mapping[str, Any]) -> tuple[list[float], list[float], list[b
 
 def action_space(shape: Shape, statistics: Statistics, like: ActionSpace | None, control_hz: float) -> ActionSpace:
     """The action space of a checkpoint. like: an environment's, whose names, groups, strict DoFs and control rate it
-    takes over; None for OpenVLA's own seven DoFs at `control_hz`.
+    takes over; None for OpenVLA's seven DoFs at `control_hz`.
 
     Raises:
         CheckpointError: the statistics are of another number of DoFs, or of DoFs that do not move.
     """
-    own = like or ActionSpace(DOFS, GROUPS, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
-    names = own.names
+    space = like or ActionSpace(DOFS, GROUPS, DOFS[-1:], control_hz, (-1.0,) * 7, (1.0,) * 7)
+    names = space.names
     if len(statistics.low) != len(names):
         raise CheckpointError(
             f"statistics {statistics.name} are of {len(statistics.low)} DoFs, the action space has {len(names)} "
@@ -247,4 +247,4 @@ def action_space(shape: Shape, statistics: Statistics, like: ActionSpace | None,
     still = [n for n, a, b in zip(names, statistics.low, statistics.high, strict=True) if not a < b]
     if still:
         raise CheckpointError(f"statistics {statistics.name} have q01 = q99 of {still[0]}: they are damaged")
-    return replace(own, low=statistics.low, high=statistics.high, bins=shape.bins, end_token=True)
+    return replace(space, low=statistics.low, high=statistics.high, bins=shape.bins, end_token=True)

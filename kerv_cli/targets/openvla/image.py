@@ -113,8 +113,8 @@ def pixels_of(image: np.ndarray, shape: Shape, normalisations: Sequence[Normalis
     """image (h, w, 3) uint8 -> (1, 6, s, s) float32: normalised for the first tower, then for the second."""
     parts = []
     for tower, normal in zip(shape.towers, normalisations, strict=True):
-        shown = cropped(image, tower.image) if crop else image
-        pixels = torch.from_numpy(np.array(resized(shown, tower.image), dtype=np.float32)) / 255
+        view = cropped(image, tower.image) if crop else image
+        pixels = torch.from_numpy(np.array(resized(view, tower.image), dtype=np.float32)) / 255
         mean, std = torch.tensor(normal.mean), torch.tensor(normal.std)
         parts.append(((pixels - mean) / std).permute(2, 0, 1))
     return torch.cat(parts)[None]

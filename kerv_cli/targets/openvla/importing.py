@@ -47,7 +47,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     shards = open_shards(source)
     check_layout(shards.shapes, layout(shape), source)
     parameters, hashes = check_finite(shards), shards.hashes()
-    chosen = OpenVLASettings(
+    target_settings = OpenVLASettings(
         checkpoint=str(source),
         statistics=statistics.name,
         files=shards.sizes(),
@@ -57,21 +57,21 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         prompt_tokens=settings.prompt_tokens,
         image_size=shape.towers[0].image,
     )
-    made = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
+    origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
     folder = artifact(settings.results, "target", settings.name)
     camera = spec.camera_name(settings.camera) if spec else settings.camera or "primary"
-    written = _description(chosen, spec, actions, camera, hashes)
-    write_json(folder / "target.json", {**written, "provenance": {**made, **provenance(settings.runtime.device)}})
+    description = _description(target_settings, spec, actions, camera, hashes)
+    write_json(folder / "target.json", {**description, "provenance": {**origin, **provenance(settings.runtime.device)}})
     prompt = shape.patches + len(prompter.ids("move"))
     figures = {"parameters": parameters, "prompt tokens": prompt, "action tokens": actions.tokens, "DoFs": actions.dofs}
     return folder, figures
 
 
 def _description(
-    chosen: OpenVLASettings, spec: EnvironmentSpec | None, actions: ActionSpace, camera: str, hashes: dict[str, str]
+    settings: OpenVLASettings, spec: EnvironmentSpec | None, actions: ActionSpace, camera: str, hashes: dict[str, str]
 ) -> dict[str, Any]:
     """The contents of target.json, but for the provenance."""
-    computed = {"prompt": chosen.prompt, "crop": chosen.crop, "int8": chosen.int8}
+    computed = {"prompt": settings.prompt, "crop": settings.crop, "int8": settings.int8}
     observation = spec.observation if spec else SEES_NOTHING_ELSE
     return {
         "format": FORMAT,
@@ -79,7 +79,7 @@ def _description(
         "sha256": digest_of(hashes, computed),
         "family": "openvla",
         "environment": spec.name if spec else "none",
-        "settings": asdict(chosen),
+        "settings": asdict(settings),
         "actions": actions.as_dict(),
         "observation": observation.as_dict(),
         "cameras": [camera],
@@ -88,7 +88,7 @@ def _description(
 
 
 def _environment(name: str | None) -> EnvironmentSpec | None:
-    known = specs()
-    if name is not None and name not in known:
-        raise UnknownName("environment", name, known)
-    return known[name] if name is not None else None
+    environments = specs()
+    if name is not None and name not in environments:
+        raise UnknownName("environment", name, environments)
+    return environments[name] if name is not None else None

@@ -53,13 +53,13 @@ class Shards:
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """Every tensor, backed by the file's memory map."""
         for file in self.files:
-            with _opened(self.folder / file) as handle:
+            with _open_tensors(self.folder / file) as handle:
                 for name in handle.keys():  # noqa: SIM118 - not a mapping
                     yield name, handle.get_tensor(name)
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_tensors(path: Path) -> Iterator[Any]:
     try:
         with safe_open(path, framework="pt", device="cpu") as handle:
             yield handle
@@ -86,7 +86,7 @@ def open_shards(folder: Path) -> Shards:
         raise CheckpointError(_no_weights(folder))
     tensors, shapes = {}, {}
     for file in files:
-        with _opened(folder / file) as handle:
+        with _open_tensors(folder / file) as handle:
             for name in handle.keys():  # noqa: SIM118 - not a mapping
                 tensors[name], shapes[name] = file, tuple(handle.get_slice(name).get_shape())
     if named is not None and named != tensors:
@@ -114,16 +114,16 @@ def conversion(source: str, target: str) -> str:
     )
 
 
-def check_layout(found: Mapping[str, Sizes], wanted: Mapping[str, Sizes], where: Path) -> None:
+def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], where: Path) -> None:
     """Compares the names and shapes of a folder with those that its config asks for.
 
     Raises:
         CheckpointError: tensors are missing, too many, or of another shape; the line lists the first of each.
     """
-    missing = [name for name in wanted if name not in found]
-    extra = [name for name in found if name not in wanted]
-    both = [name for name in wanted if name in found and tuple(found[name]) != tuple(wanted[name])]
-    misshapen = [f"{name} {_text(found[name])}, not {_text(wanted[name])}" for name in both]
+    missing = [name for name in expected if name not in shapes]
+    extra = [name for name in shapes if name not in expected]
+    both = [name for name in expected if name in shapes and tuple(shapes[name]) != tuple(expected[name])]
+    misshapen = [f"{name} {_text(shapes[name])}, not {_text(expected[name])}" for name in both]
     kinds = {"missing": missing, "unknown": extra, "of another shape": misshapen}
     wrong = [f"{len(names)} {kind}: {_listed(names)}" for kind, names in kinds.items() if names]
     if wrong:

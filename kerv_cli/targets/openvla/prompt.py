@@ -34,17 +34,17 @@ class Prompter:
             CheckpointError: no tokenizer, or that of another model. KervError: the package tokenizers is missing.
         """
         self.text, self.limit = PROMPTS[form], limit
-        self.tokenizer = _read(folder / TOKENIZER)
+        self.tokenizer = _tokenizer_of(folder / TOKENIZER)
         size = self.tokenizer.get_vocab_size(with_added_tokens=False)
-        known = {name: self.tokenizer.token_to_id(name) for name in (BEGIN, BOUNDARY)}
+        ids = {name: self.tokenizer.token_to_id(name) for name in (BEGIN, BOUNDARY)}
         if size != shape.vocabulary:
             raise CheckpointError(
                 f"{folder / TOKENIZER} has {size} ids, the weights are for {shape.vocabulary}: it is another model's"
             )
-        absent = [repr(name) for name, token in known.items() if token is None]
+        absent = [repr(name) for name, token in ids.items() if token is None]
         if absent:
             raise CheckpointError(f"{folder / TOKENIZER} has no token {absent[0]}: it is not a Llama tokenizer")
-        self.begin, self.boundary = known[BEGIN], known[BOUNDARY]
+        self.begin, self.boundary = ids[BEGIN], ids[BOUNDARY]
 
     def ids(self, instruction: str) -> list[int]:
         """The prompt's ids: begin of sequence, the text, the word boundary.
@@ -65,7 +65,7 @@ class Prompter:
         return ids
 
 
-def _read(path: Path) -> Any:
+def _tokenizer_of(path: Path) -> Any:
     if not path.is_file():
         raise CheckpointError(f"no {TOKENIZER} in {path.parent}: copy the one that was published with the checkpoint")
     try:

@@ -132,7 +132,7 @@ class OpenVLATarget:
     def forward(
         self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """As `Target.forward`."""
+        """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
         hidden: Tensor = self.model.language_model.model(x, positions, cache, seen)
         return hidden
 
