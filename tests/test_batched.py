@@ -37,7 +37,7 @@ from kerv_cli.lab.cells import CellRunner
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, blocks_of, make_cell
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.lab.together import Wanted, run_together
+from kerv_cli.lab.together import Request, run_together
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.unverified import AlwaysSkip
@@ -193,13 +193,13 @@ class Forwards(BatchDecoder):
 def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs: type[Stub]) -> None:
     decoder = Forwards(Decoder(target(), chunk=1))
     decoder.sizes = []
-    wanted = [Wanted((task, seed), task, seed) for task in ("a", "b", "c") for seed in range(1, 7)]
-    ended = list(run_together(decoder, wanted, 4, stubs))
-    assert sorted(one.wanted.key for one in ended) == sorted(one.key for one in wanted)
+    requests = [Request((task, seed), task, seed) for task in ("a", "b", "c") for seed in range(1, 7)]
+    ended = list(run_together(decoder, requests, 4, stubs))
+    assert sorted(one.request.key for one in ended) == sorted(one.key for one in requests)
     for one in ended:
         assert isinstance(one.result, EpisodeRecord)
-        assert (one.result.task, one.result.seed) == one.wanted.key
-        assert one.result.steps == one.wanted.seed
+        assert (one.result.task, one.result.seed) == one.request.key
+        assert one.result.steps == one.request.seed
         assert not one.result.timed
         assert one.result.wall_seconds > 0
     assert sum(decoder.sizes) == 3 * sum(range(1, 7))
@@ -210,16 +210,16 @@ def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs:
 
 
 def test_a_world_that_fails_ends_its_own_episode(stubs: type[Stub]) -> None:
-    wanted = [Wanted(seed, "a", seed) for seed in (10, 11, 12, 13, 15)]
+    requests = [Request(seed, "a", seed) for seed in (10, 11, 12, 13, 15)]
     decoder = BatchDecoder(Decoder(target(), chunk=1))
-    ended = {one.wanted.key: one.result for one in run_together(decoder, wanted, 2, stubs)}
+    ended = {one.request.key: one.result for one in run_together(decoder, requests, 2, stubs)}
     assert str(ended.pop(13)) == "the table broke"
     assert {seed: record.steps for seed, record in ended.items()} == {10: 3, 11: 4, 12: 5, 15: 1}
     assert sorted(stubs.opened) == sorted(stubs.closed)
 
 
 def test_stopping_early_closes_the_worlds(stubs: type[Stub]) -> None:
-    running = run_together(BatchDecoder(Decoder(target(), chunk=1)), [Wanted(0, "a", 1), Wanted(1, "b", 6)], 2, stubs)
+    running = run_together(BatchDecoder(Decoder(target(), chunk=1)), [Request(0, "a", 1), Request(1, "b", 6)], 2, stubs)
     next(running)
     running.close()
     assert sorted(stubs.opened) == sorted(stubs.closed) == ["a", "b"]
@@ -238,8 +238,8 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, po
         for task in tasks
         for record in run.run_task(settings(policies, *words), task, seeds)
     }
-    wanted = [Wanted(None, task, seed) for task in tasks for seed in seeds]
-    together = [ended.result for ended in run.run_batch(settings(policies, *words, "rollout.batch=3"), wanted)]
+    requests = [Request(None, task, seed) for task in tasks for seed in seeds]
+    together = [ended.result for ended in run.run_batch(settings(policies, *words, "rollout.batch=3"), requests)]
     assert len(together) == len(alone)
     for record in together:
         assert isinstance(record, EpisodeRecord)

@@ -35,22 +35,22 @@ def conf_dir() -> Path:
     Raises:
         UsageError: no configuration there.
     """
-    chosen = os.environ.get("KERV_CONF_DIR")
+    folder = os.environ.get("KERV_CONF_DIR")
     package = Path(__file__).resolve().parents[1]
-    places = [Path(chosen).resolve()] if chosen else [package.parent / "conf", package / "conf"]
-    for place in places:
-        if (place / "rollout.yaml").is_file():
-            return place
-    raise UsageError(f"no configuration in {' or '.join(map(str, places))}: set KERV_CONF_DIR to a folder like conf/")
+    folders = [Path(folder).resolve()] if folder else [package.parent / "conf", package / "conf"]
+    for path in folders:
+        if (path / "rollout.yaml").is_file():
+            return path
+    raise UsageError(f"no configuration in {' or '.join(map(str, folders))}: set KERV_CONF_DIR to a folder like conf/")
 
 
 def groups() -> dict[str, list[str]]:
     """Config groups and the names in them: {"method": ["ar", "spec_vla", …], …}."""
     root = conf_dir()
-    known = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
+    names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
     for group in PART_GROUPS:
-        known.setdefault(group, set()).update(_parts_of(group))
-    return {group: sorted(names) for group, names in sorted(known.items())}
+        names.setdefault(group, set()).update(_parts_of(group))
+    return {group: sorted(names[group]) for group in sorted(names)}
 
 
 def _parts_of(group: str) -> dict[str, registry.Part]:
@@ -70,20 +70,20 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
 
 
 class Composer(Generic[T]):
-    """Composes many settings of one command: what the same choices of groups compose to is composed once."""
+    """Composes many settings of one command: settings of the same choices of groups are composed once."""
 
     def __init__(self, command: str, schema: type[T]) -> None:
-        self.command, self.schema, self.known = command, schema, groups()
+        self.command, self.schema, self.groups = command, schema, groups()
         self._composed: dict[tuple[str, ...], tuple[Any, T]] = {}
 
     def compose(self, overrides: Sequence[str]) -> T:
-        """As the function `compose`."""
+        """The settings of these overrides; raises the errors of the function `compose`."""
         from hydra.errors import HydraException
         from omegaconf.errors import OmegaConfBaseException
 
         overrides, method = method_of_file(overrides)
         overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
-        _check(self.command, overrides, self.known)
+        _check(self.command, overrides, self.groups)
         words = [_task_list(word) for word in overrides]
         try:
             settings = self._settings([_parsed(word) for word in words])
@@ -121,7 +121,7 @@ class Composer(Generic[T]):
         from hydra.core.override_parser.types import OverrideType
 
         plain = override.type == OverrideType.CHANGE and override.package is None and not override.is_sweep_override()
-        return plain and override.key_or_group not in self.known
+        return plain and override.key_or_group not in self.groups
 
 
 def _is_scalar(nodes: Any, override: Any) -> bool:
@@ -157,11 +157,11 @@ def _check_ranges(settings: Any) -> None:
     """Checks every setting against its range, and what only a part knows about its settings."""
     check_settings(settings)
     for group in PART_GROUPS:
-        chosen = getattr(settings, group, None)
-        part = None if chosen is None else part_of(group, chosen.kind)
+        part_settings = getattr(settings, group, None)
+        part = None if part_settings is None else part_of(group, part_settings.kind)
         # another part's settings are refused by the method's check
-        if part is not None and part.check is not None and isinstance(chosen, part.settings):
-            part.check(chosen)
+        if part is not None and part.check is not None and isinstance(part_settings, part.settings):
+            part.check(part_settings)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -224,16 +224,16 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
     path = Path(files[-1].split("=", 1)[1]).expanduser()
     try:
         value = read_yaml(path.read_text(encoding="utf-8"))
-        chosen = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
-        parts = {key.removeprefix("override /"): name for choice in chosen for key, name in choice.items()}
+        choices = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
+        parts = {key.removeprefix("override /"): name for choice in choices for key, name in choice.items()}
         words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
     except OSError as error:
         raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
     except (ValueError, AttributeError, TypeError) as error:
         raise UsageError(f"method={path} is no method: see conf/method/kerv.yaml for one") from error
     rest = [word for word in overrides if word not in files]
-    given = {word.split("=", 1)[0] for word in rest}
-    return [*(word for word in words if word.split("=", 1)[0] not in given), *rest], path.stem
+    keys = {word.split("=", 1)[0] for word in rest}
+    return [*(word for word in words if word.split("=", 1)[0] not in keys), *rest], path.stem
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
@@ -283,7 +283,7 @@ def split_words(text: str) -> list[str]:
 
 
 def _count(override: Any) -> float:
-    """How many points an override stands for.
+    """Number of points that an override stands for.
 
     Raises:
         UsageError: a range without an end or with steps of 0, an interval, a glob.
@@ -326,22 +326,22 @@ def to_yaml(settings: Any) -> str:
     return OmegaConf.to_yaml(OmegaConf.structured(settings))
 
 
-def _check(command: str, overrides: Sequence[str], known: Mapping[str, Sequence[str]]) -> None:
+def _check(command: str, overrides: Sequence[str], names: Mapping[str, Sequence[str]]) -> None:
     """Refuses what Hydra would answer at length or not at all: words that are no overrides, unknown group choices,
-    several choices where one is wanted."""
+    several choices where the command takes one."""
     for word in overrides:
         key, equals, value = word.partition("=")
         if not equals or not key or key[0] == "~":  # nothing is taken away from settings
             raise UsageError(
                 f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys"
             )
-        if key not in known or value in known[key]:
+        if key not in names or value in names[key]:
             continue
         several = [name.strip() for name in value.split(",")]
-        if len(several) > 1 and set(several) <= set(known[key]):
+        if len(several) > 1 and set(several) <= set(names[key]):
             hint = "run each in turn with 'kerv rollout -m', or" if command == "rollout" else "this command takes one:"
             raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
-        raise UnknownName(key, value, known[key])
+        raise UnknownName(key, value, names[key])
 
 
 def spoken(command: str) -> str:

@@ -135,8 +135,8 @@ def _put_back(folder: Path) -> None:
 
 
 def visible(folder: Path) -> list[Path]:
-    """What lies in a folder, by name, without hidden names: temporaries and locks are no results. Empty where there is
-    no such folder."""
+    """Paths in a folder, by name, without hidden ones: temporaries and locks are no results. Empty where there is no
+    such folder."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
@@ -255,8 +255,8 @@ def sha256_of(path: Path) -> str:
         CheckpointError: the file is missing or unreadable.
     """
     try:
-        found = os.stat(path)
-        return _sha256(str(path), found.st_ino, found.st_size, found.st_mtime_ns)
+        stat = os.stat(path)
+        return _sha256(str(path), stat.st_ino, stat.st_size, stat.st_mtime_ns)
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
 

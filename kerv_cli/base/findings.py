@@ -1,4 +1,4 @@
-"""What a check found, for `kerv doctor`."""
+"""Results of checks, for `kerv doctor`."""
 
 from __future__ import annotations
 
@@ -24,12 +24,14 @@ class Failed(Exception):
 def run(checks: Iterable[tuple[str, Callable[[], str]]]) -> list[Finding]:
     """Runs checks in order -> one finding each. A check returns what it saw; `Failed`, a KervError and any exception of
     the code under test make it fail, and the next one runs."""
-    found = []
+    findings = []
     for what, check in checks:
         try:
-            found.append(Finding(what, True, check()))
+            findings.append(Finding(what, True, check()))
         except (Failed, KervError) as error:
-            found.append(Finding(what, False, str(error)))
+            findings.append(Finding(what, False, str(error)))
         except Exception as error:  # noqa: BLE001 - the code under test is anybody's
-            found.append(Finding(what, False, f"raises {type(error).__name__}: {' '.join(str(error).split())[:200]}"))
-    return found
+            findings.append(
+                Finding(what, False, f"raises {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+            )
+    return findings

@@ -37,19 +37,19 @@ def is_left_over(path: Path) -> bool:
 
 
 def left_over(root: Path) -> Iterator[Path]:
-    """What dead processes left anywhere below `root`; links are not followed."""
+    """Paths that dead processes left anywhere below `root`; links are not followed."""
     for folder, folders, files in os.walk(root):
-        found = [Path(folder, name) for name in (*folders, *files) if is_left_over(Path(folder, name))]
-        folders[:] = [name for name in folders if Path(folder, name) not in found]
-        yield from sorted(found)
+        paths = [Path(folder, name) for name in (*folders, *files) if is_left_over(Path(folder, name))]
+        folders[:] = [name for name in folders if Path(folder, name) not in paths]
+        yield from sorted(paths)
 
 
 def clean(folder: Path) -> list[Path]:
-    """Removes what dead processes left in `folder` itself -> those removed."""
-    found = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
-    for path in found:
+    """Removes the files and folders that dead processes left in `folder` itself -> their paths."""
+    paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
+    for path in paths:
         remove(path)
-    return sorted(found)
+    return sorted(paths)
 
 
 def remove(path: Path) -> None:

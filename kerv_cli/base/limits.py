@@ -95,10 +95,10 @@ def _check_value(name: str, value: Any, metadata: Any) -> None:
     if "limits" in metadata:
         least, most, above = metadata["limits"]
         if isinstance(value, str) or not (least <= value <= most and value > above):
-            raise UsageError(f"{name}={value}: {_wanted(least, most, above)}")
+            raise UsageError(f"{name}={value}: {_range_text(least, most, above)}")
 
 
-def _wanted(least: float, most: float, above: float) -> str:
+def _range_text(least: float, most: float, above: float) -> str:
     low = f"above {above:g}" if not math.isinf(above) else f"at least {least:g}" if not math.isinf(least) else ""
     if math.isinf(most):
         return low or "a number"

@@ -54,7 +54,7 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
     except ValidationError as error:
         first = error.errors()[0]
         if tolerant and any(one["type"] == _UNKNOWN for one in error.errors()):
-            return read(kind, _known(kind, value), what)
+            return read(kind, _without_unknown(kind, value), what)
         where = ".".join(map(str, first["loc"])) or "the whole"
         raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
     except KervError as error:  # what the dataclass itself refuses, and settings out of range
@@ -62,18 +62,18 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
     return checked
 
 
-def _known(hint: Any, value: Any) -> Any:
+def _without_unknown(hint: Any, value: Any) -> Any:
     """`value` without the keys that the dataclasses of this type do not have, at any depth."""
     inner = get_args(hint)
     if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
         hints = _hints(hint)  # type: ignore[arg-type]
-        return {name: _known(hints[name], one) for name, one in value.items() if name in hints}
+        return {name: _without_unknown(hints[name], one) for name, one in value.items() if name in hints}
     if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
-        return {key: _known(inner[-1], one) for key, one in value.items()}
+        return {key: _without_unknown(inner[-1], one) for key, one in value.items()}
     if isinstance(value, list | tuple) and get_origin(hint) in (list, tuple):
-        return [_known(inner[0], one) for one in value]
+        return [_without_unknown(inner[0], one) for one in value]
     either = next((one for one in inner if dataclasses.is_dataclass(one)), None)  # X | None
-    return value if either is None else _known(either, value)
+    return value if either is None else _without_unknown(either, value)
 
 
 _hints = functools.cache(get_type_hints)

@@ -21,9 +21,9 @@ def provenance(device: str = "cpu") -> dict[str, Any]:
 
 
 def stamp(device: str) -> dict[str, str]:
-    """The same for a table's row, flat, every value a string; with the host's name."""
-    known = {f"{name}_version": number for name, number in versions().items()}
-    return {"host": socket.gethostname(), "device_name": device_name(device), **known, "git_commit": git_commit()}
+    """Host, device, versions and commit for a table's row: flat, every value a string."""
+    numbers = {f"{name}_version": number for name, number in versions().items()}
+    return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 
 
 @functools.cache
@@ -64,5 +64,5 @@ def git_commit() -> str:
 
 
 def _git(*arguments: str) -> str:
-    done = subprocess.run(["git", "-C", str(_HERE), *arguments], capture_output=True, text=True, check=False)
-    return done.stdout.strip() if done.returncode == 0 else ""
+    process = subprocess.run(["git", "-C", str(_HERE), *arguments], capture_output=True, text=True, check=False)
+    return process.stdout.strip() if process.returncode == 0 else ""

@@ -157,10 +157,10 @@ def find(kind: str, name: str, what: str = "") -> Part:
     Raises:
         UnknownName: there is none; the message names the nearest ones.
     """
-    known = parts(kind)
-    if name not in known:
-        raise UnknownName(what or kind, name, known)
-    return known[name]
+    by_name = parts(kind)
+    if name not in by_name:
+        raise UnknownName(what or kind, name, by_name)
+    return by_name[name]
 
 
 def part_of(group: str, name: str) -> Part:

@@ -102,11 +102,11 @@ class ActionSpace:
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
         """Per DoF: the first DoF of its group, and one past the last."""
-        found, first = [], 0
+        ranges, first = [], 0
         for group in self.groups:
-            found += [(first, first + group.size)] * group.size
+            ranges += [(first, first + group.size)] * group.size
             first += group.size
-        return tuple(found)
+        return tuple(ranges)
 
     def dofs_of(self, name: str) -> slice:
         """The DoFs of a kinematic group.
@@ -163,7 +163,7 @@ class ActionSpace:
         return self.unnormalise(self.values_of(tokens))
 
     def fitted(self, actions: np.ndarray) -> ActionSpace:
-        """The same space, normalised by the 1st and 99th percentile of actions (n, D) in environment units. A DoF that
+        """This space, normalised by the 1st and 99th percentile of actions (n, D) in environment units. A DoF that
         never moves gets a unit range around its value."""
         low, high = np.percentile(actions, [1, 99], axis=0)
         still = high - low < 1e-6
@@ -249,5 +249,5 @@ class Observation:
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
-        """The same observation with these images."""
+        """A copy of the observation with these images."""
         return replace(self, images=images)

@@ -1,4 +1,4 @@
-"""What a frame shows: one camera, or several views side by side, named by the cameras joined with `+`.
+"""The views of a frame: one camera, or several views side by side, named by the cameras joined with `+`.
 
 `corner4+gripperPOV:75` is two cameras, the second with a field of view of its own; `corner4+corner4@4` is one, now and
 four control steps ago: a policy's history.
@@ -45,11 +45,11 @@ def frame_shape(name: str, size: int) -> tuple[int, int, int]:
 
 
 def _view(part: str, name: str) -> View:
-    found = _PART.fullmatch(part)
-    fovy = float(found["fovy"]) if found and found["fovy"] else None
-    if found is None or (fovy is not None and not 0 < fovy < 180):
+    match = _PART.fullmatch(part)
+    fovy = float(match["fovy"]) if match and match["fovy"] else None
+    if match is None or (fovy is not None and not 0 < fovy < 180):
         raise UsageError(
             f"camera name '{name}': '{part}' is no view; write NAME, NAME:DEGREES (above 0, below 180) or NAME@STEPS "
             "(1 to 999), joined with +, e.g. front+wrist:75+front@4"
         )
-    return View(found["camera"], fovy, int(found["delay"] or 0))
+    return View(match["camera"], fovy, int(match["delay"] or 0))

@@ -36,7 +36,7 @@ class Again:
 
 
 def plan_again(run: RunEntry, results: str) -> Again:
-    """What would run.
+    """The study, cells and store of a repetition; nothing is run.
 
     Raises:
         CheckpointError: the weights or the data that the run used are not there any more. UsageError: as
@@ -95,14 +95,14 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     from kerv_cli.training.runs import TargetRun, drafter_run
 
     path = run.folder / f"{run.kind}.json"
-    made = description_of(run).get("settings")
-    if not isinstance(made, dict):
+    training = description_of(run).get("settings")
+    if not isinstance(training, dict):
         command = "target" if run.kind == "target" else "drafter"
         raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
-    value: dict[str, Any] = made | {"results": results}
+    value: dict[str, Any] = training | {"results": results}
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
     settings = read(TrainDrafterSettings, value, str(path))
-    place: dict[str, Any] = {("drafter" if run.kind == "drafter" else "early"): name}
-    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, **place)))
+    weights: dict[str, Any] = {("drafter" if run.kind == "drafter" else "early"): name}
+    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, **weights)))

@@ -77,10 +77,10 @@ def _compare(a: Path, b: Path) -> None:
 
     documents: list[dict[str, Any]] = []
     for path in (a, b):
-        found = read_json(path)
-        if not isinstance(found, dict) or not {"phases", "target", "dtype"} <= set(found):
+        document = read_json(path)
+        if not isinstance(document, dict) or not {"phases", "target", "dtype"} <= set(document):
             raise CheckpointError(f"{path} is no result of 'kerv bench'")
-        documents.append(found)
+        documents.append(document)
     names = [f"{d['target']} {d['dtype']} ms" for d in documents]
     print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
 
@@ -91,10 +91,10 @@ def _replay(words: list[str], cfg: bool, as_json: bool) -> None:
     settings = composed("bench_replay", renamed(words), BenchReplaySettings, cfg)
     from kerv_cli.bench.replay_run import replay
 
-    done = replay(settings)
-    for table in done.tables():
+    result = replay(settings)
+    for table in result.tables():
         console().print(table)
-    for path in done.write(settings.results):
+    for path in result.write(settings.results):
         typer.echo(str(path))
     if as_json:
-        typer.echo(json.dumps(done.document(), allow_nan=False))
+        typer.echo(json.dumps(result.document(), allow_nan=False))

@@ -132,10 +132,10 @@ def runnable(message: str, words: Iterable[str]) -> str:
     """The message with every quoted command made complete: how kerv is called here, and those of the present command's
     settings without which it would work on another folder or another policy."""
 
-    def completed(found: re.Match[str]) -> str:
-        quote, name, rest = found.groups()
-        given = {word.split("=", 1)[0] for word in shlex.split(rest)}
-        carried = [shlex.quote(word) for word in words if _carries(word, name) and word.split("=", 1)[0] not in given]
+    def completed(match: re.Match[str]) -> str:
+        quote, name, rest = match.groups()
+        keys = {word.split("=", 1)[0] for word in shlex.split(rest)}
+        carried = [shlex.quote(word) for word in words if _carries(word, name) and word.split("=", 1)[0] not in keys]
         return f"{quote}{' '.join([called(), name, *rest.split(), *carried])}{quote}"
 
     return _QUOTED.sub(completed, message)
@@ -147,9 +147,9 @@ def _carries(word: str, command: str) -> bool:
     return takers is None or command in takers
 
 
-def in_same(place: Iterable[str]) -> str:
+def in_same(words: Iterable[str]) -> str:
     """` results=DIR` where these words name one, for commands to type next; else nothing."""
-    return "".join(f" {shlex.quote(word)}" for word in place if word.startswith("results="))
+    return "".join(f" {shlex.quote(word)}" for word in words if word.startswith("results="))
 
 
 def _refuse(message: str, code: int, error: BaseException | None) -> None:

@@ -1,4 +1,4 @@
-"""What can follow in a command line: groups, names, keys and tasks, of the command at hand only."""
+"""Completion of a command line: groups, names, keys and tasks, of the command at hand only."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ def groups_of(command: str) -> dict[str, list[str]]:
 
     from kerv_cli.base.config import conf_dir, groups
 
-    known = groups()
+    names_of = groups()
     files = ("rollout", "sweep") if command == "sweep" else (command,)
-    chosen: list[str] = []
+    used: list[str] = []
     for file in files:
         defaults = yaml.safe_load((conf_dir() / f"{file}.yaml").read_text(encoding="utf-8")).get("defaults", [])
-        chosen += [name for choice in defaults if isinstance(choice, dict) for name in choice]
-    return {name: known[name] for name in chosen if name in known}
+        used += [name for choice in defaults if isinstance(choice, dict) for name in choice]
+    return {name: names_of[name] for name in used if name in names_of}
 
 
 def _values(command: str, key: str) -> list[str]:
@@ -90,9 +90,9 @@ def _top(command: str) -> list[str]:
     """Groups and plain keys of the first level; a mapping is written with a dot behind it."""
     from kerv_cli.base import settings
 
-    own = [field.name for field in fields(getattr(settings, _SCHEMAS[command]))]
+    names = [field.name for field in fields(getattr(settings, _SCHEMAS[command]))]
     extra = _OF_THE_SWEEP if command == "sweep" else ("study",) if command == "report" else ()
-    return [*groups_of(command), *extra, *own]
+    return [*groups_of(command), *extra, *names]
 
 
 def _keys(command: str, typed: Sequence[str]) -> list[str]:
@@ -101,8 +101,8 @@ def _keys(command: str, typed: Sequence[str]) -> list[str]:
     from kerv_cli.base.config import keys_of
 
     composed = "rollout" if command == "sweep" else command
-    chosen = [word for word in typed if word.split("=", 1)[0] in groups_of(composed)]
-    return keys_of(composed, chosen, getattr(settings, _SCHEMAS[composed]))
+    choices = [word for word in typed if word.split("=", 1)[0] in groups_of(composed)]
+    return keys_of(composed, choices, getattr(settings, _SCHEMAS[composed]))
 
 
 BASH = """# completion of kerv for bash. '=' ends a word for bash and not for kerv, so the line is split at blanks here.
@@ -136,7 +136,7 @@ def script(shell: str) -> str:
     )  # fmt: skip
 
 
-def place(shell: str) -> Path:
+def script_path(shell: str) -> Path:
     """Where the shell finds the script by itself: bash with the package bash-completion, fish; zsh below ~/.zfunc."""
     home = Path.home()
     data = Path(os.environ.get("XDG_DATA_HOME", home / ".local/share"))

@@ -17,14 +17,14 @@ def completion(
     """Print a shell's completion script, or install it for this user."""
     from kerv_cli.base.errors import UnknownName
     from kerv_cli.base.files import atomic_path
-    from kerv_cli.cli.completing import SHELLS, place, script
+    from kerv_cli.cli.completing import SHELLS, script, script_path
 
     if shell not in SHELLS:
         raise UnknownName("shell", shell, SHELLS)
     if not install:
         typer.echo(script(shell))
         return
-    path = place(shell)
+    path = script_path(shell)
     with atomic_path(path) as temporary:
         temporary.write_text(script(shell) + "\n", encoding="utf-8")
     typer.echo(f"{path}: a new {shell} completes kerv")

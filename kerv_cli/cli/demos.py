@@ -69,7 +69,7 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
 
 
 def _actor(settings: DemosSettings, task: str) -> TargetActs | None:
-    """What moves the robot in the expert's place; None: the expert itself. task: one of those recorded."""
+    """The target that moves the robot instead of the expert; None: the expert. task: one of the recorded tasks."""
     from kerv_cli.base.settings import EXPERT, PolicySettings
     from kerv_cli.worlds import spec_of
 
@@ -101,8 +101,8 @@ def _export(words: list[str], cfg: bool) -> None:
         Path(settings.to).expanduser() if settings.to else results_dir(settings.results) / "lerobot" / settings.demos
     )
     with progress_bar("export") as advance:
-        made = export(dataset, folder, advance)
-    figures = {"episodes": len(made.episodes), "frames": made.rows, "tasks": len(made.tasks), "frames/s": made.rate}
+        info = export(dataset, folder, advance)
+    figures = {"episodes": len(info.episodes), "frames": info.rows, "tasks": len(info.tasks), "frames/s": info.rate}
     print_figures("LeRobot dataset", figures, folder)
 
 

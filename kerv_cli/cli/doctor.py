@@ -85,10 +85,10 @@ def _environment(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.worlds import specs
     from kerv_cli.worlds.conformance import check_environment
 
-    known = specs()
-    if settings.environment not in known:
-        raise UnknownName("environment", settings.environment, known)
-    return check_environment(known[settings.environment], settings.seed)
+    environments = specs()
+    if settings.environment not in environments:
+        raise UnknownName("environment", settings.environment, environments)
+    return check_environment(environments[settings.environment], settings.seed)
 
 
 def _versions() -> Finding:
@@ -153,8 +153,8 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
     for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
         try:
             described = read_target(find_target(settings.results, name))
-            found = described.provenance.get("parameters")
-            size = f"{found / 1e6:.1f} M parameters, " if isinstance(found, int | float) else ""
+            parameters = described.provenance.get("parameters")
+            size = f"{parameters / 1e6:.1f} M parameters, " if isinstance(parameters, int | float) else ""
             findings.append(Finding(f"policy {name}", True, f"{size}{described.sha256[:12]}"))
         except KervError as error:
             findings.append(Finding(f"policy {name}", False, str(error)))
@@ -202,27 +202,27 @@ def _stores(settings: DoctorSettings) -> list[StudyStore]:
 
 
 def _left(settings: DoctorSettings) -> Finding:
-    found = _left_over(settings)
-    says = f"{len(found)} files of killed commands, kerv doctor --repair removes them" if found else "nothing"
+    paths = _left_over(settings)
+    says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
     return Finding("left over", True, says)
 
 
 def _repair(settings: DoctorSettings) -> None:
-    """Lists and removes what `_left_over` finds; sets damaged cells aside."""
+    """Removes the files of `_left_over` and prints their names; sets damaged cells aside."""
     from kerv_cli.base.leftovers import remove
 
-    found = _left_over(settings)
-    for path in found:
+    paths = _left_over(settings)
+    for path in paths:
         remove(path)
         typer.echo(f"removed {path}")
-    kept = [path for path in found if path.exists()]
-    if kept:
-        raise StorageError(f"{kept[0]} cannot be removed: permission denied?")
+    remaining = [path for path in paths if path.exists()]
+    if remaining:
+        raise StorageError(f"{remaining[0]} cannot be removed: permission denied?")
     damages = [(store, name, error) for store in _stores(settings) for name, error in store.damages()]
     for store, name, error in damages:
         typer.echo(f"{str(error).split(': `')[0]}: it lies in {store.set_aside(name)} now, {store.how_to_run()}")
     aside = f", {len(damages)} damaged cells set aside" if damages else ""
-    typer.echo(f"{len(found)} left over files removed{aside}; everything else is complete or absent")
+    typer.echo(f"{len(paths)} left over files removed{aside}; everything else is complete or absent")
 
 
 def _display() -> Finding:

@@ -49,16 +49,16 @@ def report(
     if choose:
         _choose(settings, as_json)
         return
-    written = write_report(results_dir(settings.results), settings.only, publish, settings.against)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.against)
     if as_json:
-        tables = {name: rows_of(table) for name, table in written.tables.items()}
-        print_json({"files": written.files, "studies": tables})
+        tables = {name: rows_of(table) for name, table in output.tables.items()}
+        print_json({"files": output.files, "studies": tables})
         return
-    for name, table in written.tables.items():
+    for name, table in output.tables.items():
         tell_table(table, StudyStore(results_dir(settings.results), name), words)
-    if written.agreement is not None:
-        console().print(agreement_summary(written.agreement))
-    for path in written.files:
+    if output.agreement is not None:
+        console().print(agreement_summary(output.agreement))
+    for path in output.files:
         typer.echo(str(path))
 
 
@@ -77,12 +77,12 @@ def _choose(settings: ReportSettings, as_json: bool) -> None:
     answers = {}
     for name in names:
         data = load_study(StudyStore(results, name))
-        found = choices(study_table(data), per_task_table(data), data.plan.axis, settings.loss)
-        answers[name] = rows_of(choices_frame(found))
+        groups = choices(study_table(data), per_task_table(data), data.plan.axis, settings.loss)
+        answers[name] = rows_of(choices_frame(groups))
         if not as_json:
-            typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(found[0].front)}")
-            typer.echo(f"  {sentence(found[0], data.plan.axis, settings.loss, data.plan.baseline)}")
-            for choice in found[1:]:
+            typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
+            typer.echo(f"  {sentence(groups[0], data.plan.axis, settings.loss, data.plan.baseline)}")
+            for choice in groups[1:]:
                 typer.echo(f"  {short(choice)}")
     if as_json:
         print_json(answers)

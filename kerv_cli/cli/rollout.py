@@ -69,7 +69,7 @@ def rollout(
     cells = planned_cells(resolved)
     if plan:
         total = sum(len(cell.seeds) for cell in cells)
-        names = ", ".join(f"{label}{_stressed(asdict(own))}" for label, own in resolved.settings.items())
+        names = ", ".join(f"{label}{_stressed(asdict(settings))}" for label, settings in resolved.settings.items())
         tasks = resolve_tasks(first.task)
         if as_json:
             print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
@@ -82,7 +82,7 @@ def rollout(
 
 
 def _stressed(settings: Mapping[str, Any]) -> str:
-    """How a setting of plain RolloutSettings is called after its label: its stress; empty without one."""
+    """The stress in plain RolloutSettings, as text behind a setting's label; empty without one."""
     from kerv_cli.lab.identity import stress_of
 
     stress = stress_of(settings)
@@ -119,12 +119,12 @@ def warn_unseen(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> None:
     """Says on standard error which of these tasks a policy was not trained on."""
     from kerv_cli.lab.policy import unseen_tasks
 
-    told: set[str] = set()
+    lines: set[str] = set()
     for settings in resolved.settings.values():
-        missing = unseen_tasks(settings, tasks)
-        line = f"kerv: warning: policy {settings.policy.target} was never trained on {', '.join(missing)}"
-        if missing and line not in told:
-            told.add(line)
+        unseen = unseen_tasks(settings, tasks)
+        line = f"kerv: warning: policy {settings.policy.target} was never trained on {', '.join(unseen)}"
+        if unseen and line not in lines:
+            lines.add(line)
             typer.echo(line, err=True)
 
 
@@ -163,9 +163,10 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
         try:
             execute(cells, failure if here else failure.runner, store, runtime, on_event, reference_decode)
         except KeyboardInterrupt:
-            kept = sum(store.has_cell(cell.id) for cell in cells)
+            count = sum(store.has_cell(cell.id) for cell in cells)
             raise Interrupted(
-                f"interrupted: {kept} of {len(cells)} episodes are kept in {store.root}, the same command goes on there"
+                f"interrupted: {count} of {len(cells)} episodes are kept in {store.root}, "
+                "the same command goes on there"
             ) from None
         finally:
             close_worlds()
@@ -181,20 +182,20 @@ class _Remembering:
         self.error: KervError | None = None
 
     def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
-        run = self._kept(self.runner, cell)
-        return lambda seed: self._kept(run, seed)
+        run = self._call(self.runner, cell)
+        return lambda seed: self._call(run, seed)
 
     def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
-        """As `CellRunner.together`."""
+        """The episodes of `CellRunner.together`; keeps a KervError among them."""
         try:
-            for cell, seed, ended in self.runner.together(cells):
-                self.error = ended if isinstance(ended, KervError) else self.error
-                yield cell, seed, ended
+            for cell, seed, end in self.runner.together(cells):
+                self.error = end if isinstance(end, KervError) else self.error
+                yield cell, seed, end
         except KervError as error:
             self.error = error
             raise
 
-    def _kept(self, call: Callable[[A], B], argument: A) -> B:
+    def _call(self, call: Callable[[A], B], argument: A) -> B:
         try:
             return call(argument)
         except KervError as error:
@@ -237,9 +238,9 @@ def _single(data: StudyData) -> None:
     rows = [(name, *_figures(episodes[(episodes["task"] == name) | (name == "all")])) for name in names]
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
-    seen = cell.identity.get("observation", "")
+    observation = cell.identity.get("observation", "")
     stress = _stressed(cell.settings)
-    print_table(headers, rows, f"{cell.label}, observation {seen}{stress}, seeds {seeds}")
+    print_table(headers, rows, f"{cell.label}, observation {observation}{stress}, seeds {seeds}")
     decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
     seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
     if not is_timed(episodes):

@@ -43,9 +43,9 @@ def _split(words: list[str] | None, least: int = 0, most: int = 1000, what: str 
     from kerv_cli.base.errors import UsageError
     from kerv_cli.lab.resolve import study_name
 
-    given = words or []
-    results = [word.split("=", 1)[1] for word in given if word.startswith("results=")]
-    names = [study_name(word.removeprefix("study=")) for word in given if not word.startswith("results=")]
+    words = words or []
+    results = [word.split("=", 1)[1] for word in words if word.startswith("results=")]
+    names = [study_name(word.removeprefix("study=")) for word in words if not word.startswith("results=")]
     if not least <= len(names) <= most:
         raise UsageError(f"name {what}: 'kerv runs list' shows them")
     return names, results[-1] if results else "results"
@@ -62,17 +62,17 @@ def list_(overrides: Filters = None, as_json: AsJson = False) -> None:
     for word in words:
         if "=" not in word:
             raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
-    found = matching(find_runs(results), dict(word.split("=", 1) for word in words))
+    runs = matching(find_runs(results), dict(word.split("=", 1) for word in words))
     if as_json:
-        print_json([_plain(run) for run in found])
+        print_json([_plain(run) for run in runs])
         return
-    if not found:
+    if not runs:
         typer.echo(f"no runs in {results}" + (" that agree" if words else ""))
         return
     rows = [
         (run.id, run.kind, run.started.replace("T", " ")[:16], run.state, _few(run.methods), _few(run.tasks),
          run.episodes or "", _headline(run))
-        for run in found
+        for run in runs
     ]  # fmt: skip
     print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "figure"), rows)
 
@@ -117,8 +117,8 @@ def show(overrides: Words = None, as_json: AsJson = False) -> None:
         return
     typed = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
-    made = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
-    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed} | made).items():
+    parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed} | parts).items():
         typer.echo(f"{name:<9} {value}")
     if table is not None:
         console().print(summary_table(table))
@@ -133,11 +133,11 @@ def compare(overrides: Words = None, as_json: AsJson = False) -> None:
     from kerv_cli.report import compare as comparing
 
     names, results = _split(overrides, 2, 2, "two runs, ID or ID:SETTING")
-    found = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(results, *names)]
+    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(results, *names)]
     if as_json:
-        print_json([comparing.as_plain(comparison) for comparison in found])
+        print_json([comparing.as_plain(comparison) for comparison in comparisons])
         return
-    for comparison in found:
+    for comparison in comparisons:
         typer.echo(f"\n{comparison.first}  →  {comparison.second}")
         _print_differences(comparison.settings)
         _print_results(comparison)
@@ -153,11 +153,11 @@ def diff(overrides: Words = None, as_json: AsJson = False) -> None:
 
     names, results = _split(overrides, 2, 2, "two runs, ID or ID:SETTING")
     pairs = comparing.pairs_to_compare(results, *names)
-    found = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
+    by_pair = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
     if as_json:
-        print_json({name: [asdict(difference) for difference in rows] for name, rows in found.items()})
+        print_json({name: [asdict(difference) for difference in rows] for name, rows in by_pair.items()})
         return
-    for name, rows in found.items():
+    for name, rows in by_pair.items():
         typer.echo(f"\n{name}")
         _print_differences(rows)
 
@@ -229,14 +229,14 @@ def rm(overrides: Words = None, yes: Yes = False) -> None:
     from kerv_cli.lab.removal import check_removable, remove
 
     names, results = _split(overrides, 1)
-    found = [find_run(results, name, exact=yes) for name in names]
-    for run in found:
+    runs = [find_run(results, name, exact=yes) for name in names]
+    for run in runs:
         check_removable(run)
-    total = sum(disk_bytes(run.folder) for run in found)
-    what = f"{', '.join(run.id for run in found)} ({total / 1e6:.1f} MB)"
+    total = sum(disk_bytes(run.folder) for run in runs)
+    what = f"{', '.join(run.id for run in runs)} ({total / 1e6:.1f} MB)"
     if not yes and not typer.confirm(f"remove {what}?"):
         raise typer.Exit(1)
-    for run in found:
+    for run in runs:
         remove(run)
     typer.echo(f"removed {what}")
 
@@ -255,11 +255,11 @@ def export(
     from kerv_cli.report.export import export as hand_over
 
     names, results = _split(overrides, 1, 1)
-    place = folder or results_dir(results) / "exports" / to
-    written = hand_over(find_run(results, names[0]), to, place)
+    folder = folder or results_dir(results) / "exports" / to
+    run_names = hand_over(find_run(results, names[0]), to, folder)
     if as_json:
-        print_json({"folder": place, "written": written})
+        print_json({"folder": folder, "written": run_names})
         return
-    for name in written:
+    for name in run_names:
         typer.echo(name)
-    typer.echo(f"{len(written)} runs in {place}")
+    typer.echo(f"{len(run_names)} runs in {folder}")

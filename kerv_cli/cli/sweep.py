@@ -58,14 +58,14 @@ def sweep(
     print_notes(idle_overrides(resolved))
     check_executor(first.runtime)
     check_writable(first.results)
-    wanted = planned_cells(resolved)
+    cells = planned_cells(resolved)
     from kerv_cli.lab.reuse import Stock, cover, disagreements
     from kerv_cli.lab.run_file import interrupted_since
     from kerv_cli.lab.store import StudyStore
 
     store = StudyStore(first.results, resolved.study.name)
     stock = Stock(store)
-    covered = cover(wanted, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
+    covered = cover(cells, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
     _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
     if plan:
         _print_plan(covered, store, first.runtime.workers, as_json)
@@ -92,12 +92,12 @@ def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool
         by_label.setdefault(cell.label, []).append(cell)
     columns = ("setting", "to run", "reused", "tasks", "seeds", "repeats", "why")
     rows = []
-    for label, own in by_label.items():
-        to_run = [cell for cell in own if cell.id in covered.reasons]
-        seeds = seeds_text(seed for cell in own for seed in cell.seeds)
-        tasks, repeats = len({cell.task for cell in own}), len({cell.repeat for cell in own})
+    for label, cells in by_label.items():
+        to_run = [cell for cell in cells if cell.id in covered.reasons]
+        seeds = seeds_text(seed for cell in cells for seed in cell.seeds)
+        tasks, repeats = len({cell.task for cell in cells}), len({cell.repeat for cell in cells})
         why = "; ".join(dict.fromkeys(covered.reasons[cell.id] for cell in to_run))
-        rows.append((label, len(to_run), len(own) - len(to_run), tasks, seeds, repeats, why))
+        rows.append((label, len(to_run), len(cells) - len(to_run), tasks, seeds, repeats, why))
     time = estimate(covered, store, workers, SECONDS_PER_EPISODE)
     if as_json:
         settings = [dict(zip(columns, row, strict=True)) for row in rows]
@@ -129,14 +129,14 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
         runner = CellRunner(store.rollouts, save_recording, on_step=display.on_step if here else None)
         try:
             if resolved.until == "decided":
-                outcome = _until_decided(resolved, cells, store, lambda own: execute(
-                    own, runner, store, runtime, display, reference_decode))  # fmt: skip
+                outcome = _until_decided(resolved, cells, store, lambda part: execute(
+                    part, runner, store, runtime, display, reference_decode))  # fmt: skip
             else:
                 outcome = execute(cells, runner, store, runtime, display, reference_decode)
         except KeyboardInterrupt:
-            kept = sum(store.has_cell(cell.id) for cell in cells)
+            count = sum(store.has_cell(cell.id) for cell in cells)
             raise Interrupted(
-                f"interrupted: {kept} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
+                f"interrupted: {count} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
             ) from None
     if not outcome.failed:
         note_finished(store.root)
@@ -154,24 +154,24 @@ def _until_decided(
     study, margin = resolved.study, resolved.loss / 100
     blocks = decided.looks_of(cells, study.block)
     typer.echo(decided.rule(resolved.loss, len(blocks)), err=True)
-    known: dict[str, decided.Verdict] = {}
-    asked: list[Cell] = []
+    latest: dict[str, decided.Verdict] = {}
+    planned: list[Cell] = []
     total = Outcome()
-    left = [label for label in resolved.settings if label != study.baseline]
+    open_labels = [label for label in resolved.settings if label != study.baseline]
     for look, block in enumerate(blocks, 1):
-        asked += [cell for cell in block if cell.label in (study.baseline, *left)]
-        store.write_plan(study, asked)
-        found = run([cell for cell in block if cell.label in (study.baseline, *left)])
-        lists = total.done + found.done, total.reused + found.reused, total.failed + found.failed
-        total = Outcome(*lists, total.seconds + found.seconds)
-        if found.failed:
+        planned += [cell for cell in block if cell.label in (study.baseline, *open_labels)]
+        store.write_plan(study, planned)
+        outcome = run([cell for cell in block if cell.label in (study.baseline, *open_labels)])
+        lists = total.done + outcome.done, total.reused + outcome.reused, total.failed + outcome.failed
+        total = Outcome(*lists, total.seconds + outcome.seconds)
+        if outcome.failed:
             return total
-        told = decided.verdicts(load_study(store, asked), left, margin, look, len(blocks))
-        typer.echo(f"look {look} of {len(blocks)}: {decided.summary(told)}", err=True)
-        known |= {verdict.label: verdict for verdict in told}
-        decided.write_verdicts(store.root, known, resolved.loss, len(blocks))
-        left = [verdict.label for verdict in told if verdict.verdict == decided.OPEN]
-        if not left:
+        verdicts = decided.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
+        typer.echo(f"look {look} of {len(blocks)}: {decided.summary(verdicts)}", err=True)
+        latest |= {verdict.label: verdict for verdict in verdicts}
+        decided.write_verdicts(store.root, latest, resolved.loss, len(blocks))
+        open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decided.OPEN]
+        if not open_labels:
             break
     return total
 
@@ -202,9 +202,8 @@ def _tell(
 ) -> None:
     from kerv_cli.report.tables import load_study, rows_of, study_table
 
-    there = bool(outcome.done or outcome.reused)
-    ran = {cell.id for cell in [*outcome.done, *outcome.reused]}
-    table = study_table(load_study(store, [cell for cell in cells if cell.id in ran])) if there else None
+    complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
+    table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
     recordings = sorted(store.rollouts.glob("*.rrd"))
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:

@@ -41,7 +41,7 @@ class Together(Protocol):
 
 @dataclass(frozen=True)
 class CellResult:
-    """How a cell ended; plain values, because an exception may not survive pickling."""
+    """The end of a cell, complete or failed; plain values, because an exception may not survive pickling."""
 
     episodes: int = 0
     successes: int = 0
@@ -87,22 +87,22 @@ class BlockRun:
     def _take_turns(self) -> dict[str, CellResult]:
         results: dict[str, CellResult] = {}
         turns: dict[int, _Turn] = {}
-        for place, cell in enumerate(self.block.cells):
+        for index, cell in enumerate(self.block.cells):
             turn = _Turn(cell, self)
             result = turn.prepare()
             if result is None:
-                turns[place] = turn
+                turns[index] = turn
             else:
                 results[cell.id] = result
         order = 0
         for seed in self.block.seeds:
-            for place in self.block.order(seed):
-                if place not in turns:
+            for index in self.block.order(seed):
+                if index not in turns:
                     continue
-                result = turns[place].take(seed, order)
+                result = turns[index].take(seed, order)
                 order += 1
                 if result is not None:
-                    results[turns.pop(place).cell.id] = result
+                    results[turns.pop(index).cell.id] = result
                     if result.storage:
                         return results
         return results
@@ -117,11 +117,11 @@ class BlockRun:
             if not isinstance(self.prepare, Together):
                 raise TypeError(f"{type(self.prepare).__name__} runs one episode at a time, not {self.block.batch}")
             note_running(self.store.claims, self.block.cells[0], self.name)
-            for order, (cell, seed, ended) in enumerate(self.prepare.together(cells) if cells else ()):
+            for order, (cell, seed, end) in enumerate(self.prepare.together(cells) if cells else ()):
                 if cell.id in results:
                     continue  # another of its episodes failed
                 note_running(self.store.claims, cell, self.name)
-                result = turns[cell.id].add(seed, ended, order)
+                result = turns[cell.id].add(seed, end, order)
                 if result is not None:
                     results[cell.id] = result
                     if result.storage:
@@ -168,20 +168,20 @@ class _Turn:
         except Exception as error:  # noqa: BLE001 - as above
             return failed(error)
 
-    def add(self, seed: int, ended: EpisodeRecord | Exception, order: int) -> CellResult | None:
+    def add(self, seed: int, end: EpisodeRecord | Exception, order: int) -> CellResult | None:
         """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
         try:
-            if isinstance(ended, Exception):
-                raise ended
+            if isinstance(end, Exception):
+                raise end
             now = datetime.now(UTC).timestamp()
-            started = datetime.fromtimestamp(now - ended.wall_seconds, UTC).isoformat(timespec="milliseconds")
-            self.records.append(ended)
+            started = datetime.fromtimestamp(now - end.wall_seconds, UTC).isoformat(timespec="milliseconds")
+            self.records.append(end)
             self.circumstances.append(Circumstances(self.work.name, order, started))
-            self.seconds += ended.wall_seconds
+            self.seconds += end.wall_seconds
             if len(self.records) < len(self.cell.seeds):
                 return None
-            both = sorted(zip(self.records, self.circumstances, strict=True), key=lambda pair: pair[0].seed)
-            self.records, self.circumstances = [record for record, _ in both], [at for _, at in both]
+            pairs = sorted(zip(self.records, self.circumstances, strict=True), key=lambda pair: pair[0].seed)
+            self.records, self.circumstances = [record for record, _ in pairs], [at for _, at in pairs]
             return self._write()
         except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
             return failed(error)
@@ -199,10 +199,10 @@ class _Turn:
 
 
 def one_line(error: BaseException) -> str:
-    """An error in one line: the message of a KervError; type, message and place in the source of any other."""
+    """An error in one line: the message of a KervError; type, message and line of the source of any other."""
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
         return text
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {text[:200]}{place}"
+    line = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {text[:200]}{line}"

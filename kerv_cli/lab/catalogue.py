@@ -43,8 +43,8 @@ LAST = "last"
 @dataclass(frozen=True)
 class RunEntry:
     """One run. id: how commands name it. state: `complete`, `2 of 6 cells`, `step 300 of 600`, `begun`, `damaged`.
-    figures: its headline, by name. command: behind `kerv`, as far as it is known. sha256: by which others name it.
-    made_from: kind -> such a hash of what it was made from."""
+    figures: its headline, by name. command: words behind `kerv`; empty where no record has them. sha256: by which
+    others name it. made_from: kind -> that hash of each artifact that it was made from."""
 
     id: str
     kind: str
@@ -61,16 +61,16 @@ class RunEntry:
 
     @property
     def has_episodes(self) -> bool:
-        """Whether it is a sweep or a rollout."""
+        """Whether the run is a sweep or a rollout."""
         return self.kind in (SWEEP, ROLLOUT)
 
 
 def find_runs(results: str | Path) -> list[RunEntry]:
     """Every run of the results folder, the newest first."""
     root = Path(results).expanduser()
-    found = [_stored(store) for family in (STUDIES, ROLLOUTS) for store in stores(root, family)]
-    found += [run for kind in DESCRIPTIONS for run in _artifacts(root / "artifacts" / kind, kind)]
-    return sorted(found, key=lambda run: (run.started, run.id), reverse=True)
+    runs = [_study(store) for family in (STUDIES, ROLLOUTS) for store in stores(root, family)]
+    runs += [run for kind in DESCRIPTIONS for run in _artifacts(root / "artifacts" / kind, kind)]
+    return sorted(runs, key=lambda run: (run.started, run.id), reverse=True)
 
 
 def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
@@ -100,10 +100,10 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     Raises:
         UnknownName: no such filter or kind.
     """
-    known = ("kind", "method", "task", "state", "since")
+    filter_names = ("kind", "method", "task", "state", "since")
     for key in filters:
-        if key not in known:
-            raise UnknownName("filter", key, known)
+        if key not in filter_names:
+            raise UnknownName("filter", key, filter_names)
     if filters.get("kind", SWEEP) not in KINDS:
         raise UnknownName("kind of run", filters["kind"], KINDS)
     return [run for run in runs if _agrees(run, filters)]
@@ -131,7 +131,7 @@ def store_of(run: RunEntry) -> StudyStore:
     return StudyStore(run.folder.parent.parent, run.folder.name, run.folder.parent.name)
 
 
-def _stored(store: StudyStore) -> RunEntry:
+def _study(store: StudyStore) -> RunEntry:
     kind = SWEEP if store.family == STUDIES else ROLLOUT
     typed = invocations(store.root)
     name = store.name
@@ -139,7 +139,7 @@ def _stored(store: StudyStore) -> RunEntry:
         cells = unique_cells(store.read_plan().cells)
     except KervError:
         return RunEntry(name, kind, store.root, _changed(store.root / "plan.yaml"), "damaged")
-    status = [found for cell in cells if (found := _status(store, cell)) is not None]
+    status = [entries for cell in cells if (entries := _status(store, cell)) is not None]
     started = [s["started"] for s in status if s.get("started")] or [command.started for command in typed]
     episodes, successes = (sum(int(s[key]) for s in status) for key in ("episodes", "successes"))
     return RunEntry(
@@ -167,8 +167,8 @@ def _weights(cells: Sequence[Cell]) -> dict[str, str]:
 def _status(store: StudyStore, cell: Cell) -> dict[str, Any] | None:
     """The sums in a complete cell's status.json, unchecked: a list must be quick."""
     with contextlib.suppress(CheckpointError):
-        found: dict[str, Any] = read_json(store.cells / cell.id / "status.json")
-        return found
+        entries: dict[str, Any] = read_json(store.cells / cell.id / "status.json")
+        return entries
     return None
 
 
@@ -189,10 +189,10 @@ def _described(folder: Path, kind: str) -> dict[str, Any]:
 def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
     with contextlib.suppress(OSError):
         clean(folder)
-    for place in visible(folder):
+    for path in visible(folder):
         traces = (DESCRIPTIONS[kind], *_BEGUN.get(kind, ()))
-        if any((place / name).is_file() for name in traces):
-            yield _artifact(place, kind)
+        if any((path / name).is_file() for name in traces):
+            yield _artifact(path, kind)
 
 
 _BEGUN = {"demos": ("recording.json",), **dict.fromkeys(TRAINED, ("log.csv",))}
@@ -204,18 +204,18 @@ def _artifact(folder: Path, kind: str) -> RunEntry:
     run = RunEntry(f"{kind}/{folder.name}", kind, folder, changed, "damaged")
     try:
         value = _described(folder, kind)
-        made = dict(value.get("provenance") or {})
-        settings = dict(made.get("settings") or {})
+        provenance = dict(value.get("provenance") or {})
+        settings = dict(provenance.get("settings") or {})
         return replace(
             run,
             state=_trained_state(folder, settings) if kind in TRAINED else "complete" if value else "begun",
             methods=(kind,),
             tasks=tuple(settings.get("task") or value.get("tasks") or ()),
             episodes=int(value.get("episodes", 0)) if kind == "demos" else 0,
-            figures=_figures(value, made),
-            command=tuple(str(made.get("command", "")).split()[1:]),
+            figures=_figures(value, provenance),
+            command=tuple(str(provenance.get("command", "")).split()[1:]),
             sha256=_hash_of(folder / DESCRIPTIONS[kind], value),
-            made_from=_made_from(value, made),
+            made_from=_made_from(value, provenance),
         )
     except (KervError, OSError, ValueError, TypeError, AttributeError, KeyError):
         return run
@@ -232,22 +232,22 @@ def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
     if not (folder / "log.csv").is_file():
         return "complete"  # copied or imported: it has no log
     rows = _log(folder)
-    steps, done = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
-    return "complete" if done >= steps else f"step {done:.0f} of {steps}"
+    steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
+    return "complete" if step >= steps else f"step {step:.0f} of {steps}"
 
 
-def _figures(value: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, float]:
+def _figures(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, float]:
     counts = {name: float(value[name]) for name in ("episodes", "rows") if isinstance(value.get(name), int)}
-    return counts | {name: float(number) for name, number in dict(made.get("validation") or {}).items()}
+    return counts | {name: float(number) for name, number in dict(provenance.get("validation") or {}).items()}
 
 
-def _made_from(value: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, str]:
+def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, str]:
     """Kind -> hash, from wherever an artifact's description names it."""
-    named = dict(value.get("made_from") or {})
-    for kind, entry in (("target", value.get("target")), ("demos", value.get("demos") or made.get("demos"))):
+    hashes = dict(value.get("made_from") or {})
+    for kind, entry in (("target", value.get("target")), ("demos", value.get("demos") or provenance.get("demos"))):
         sha256 = entry.get("sha256") if isinstance(entry, Mapping) else entry
-        named |= {kind: str(sha256)} if sha256 else {}
-    return named | ({"init": str(made["init"])} if made.get("init") else {})
+        hashes |= {kind: str(sha256)} if sha256 else {}
+    return hashes | ({"init": str(provenance["init"])} if provenance.get("init") else {})
 
 
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:

@@ -22,7 +22,7 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.plan import Cell
 from kerv_cli.lab.policy import artifacts_of
 from kerv_cli.lab.run import Runner, is_recorded, run_batch
-from kerv_cli.lab.together import Wanted
+from kerv_cli.lab.together import Request
 
 _TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
 
@@ -53,7 +53,7 @@ class CellRunner:
         """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
         settings = settings_from(cell.settings)
         runner = (
-            _kept(json.dumps(cell.settings, sort_keys=True), cell.task) if self.keep else Runner(settings, cell.task)
+            _runner(json.dumps(cell.settings, sort_keys=True), cell.task) if self.keep else Runner(settings, cell.task)
         )
 
         def episode(seed: int) -> EpisodeRecord:
@@ -72,12 +72,12 @@ class CellRunner:
         it ends: its cell, its seed, and its record or the error that its world raised."""
         settings = settings_from(cells[0].settings)
         by_id = {cell.id: cell for cell in cells}
-        wanted = [Wanted((cell.id, seed), cell.task, seed) for cell in cells for seed in cell.seeds]
-        for ended in run_batch(settings, wanted):
-            name, seed = ended.wanted.key
+        requests = [Request((cell.id, seed), cell.task, seed) for cell in cells for seed in cell.seeds]
+        for end in run_batch(settings, requests):
+            name, seed = end.request.key
             if self.on_step is not None:
                 self.on_step(by_id[name], seed, settings.world.horizon)
-            yield by_id[name], seed, ended.result
+            yield by_id[name], seed, end.result
 
 
 def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
@@ -86,17 +86,17 @@ def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
     if hasattr(settings.boundary, "f_star"):
         limits["metric"] = float(settings.boundary.f_star)
     if hasattr(settings.skip, "s_min"):
-        given = settings.skip.s_min
-        if given is None:
+        s_min = settings.skip.s_min
+        if s_min is None:
             levels = artifacts_of(settings).load("calibration").skip
-            given = levels.tasks[task].s_min if levels is not None and task in levels.tasks else None
-        if given is not None:
-            limits["similarity"] = float(given)
+            s_min = levels.tasks[task].s_min if levels is not None and task in levels.tasks else None
+        if s_min is not None:
+            limits["similarity"] = float(s_min)
     return limits
 
 
 @functools.lru_cache(maxsize=64)
-def _kept(settings: str, task: str) -> Runner:
+def _runner(settings: str, task: str) -> Runner:
     """The process's runner of these settings (JSON) on a task."""
     return Runner(settings_from(json.loads(settings)), task)
 

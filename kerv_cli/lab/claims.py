@@ -62,7 +62,7 @@ def void(folder: Path) -> list[Path]:
     """The claims whose process has ended or whose time is up, and the notes that belong to no claim."""
     claims = sorted(folder.glob("*.json"))
     held = {path for path in claims if _is_held(path)}
-    blocks = {found.block for path in held if (found := _read(path)) is not None}
+    blocks = {holder.block for path in held if (holder := _read(path)) is not None}
     notes = [path for path in sorted(folder.glob("*.running")) if path.stem not in blocks]
     return [path for path in claims if path not in held] + notes
 
@@ -76,11 +76,11 @@ def clean_void(folder: Path) -> None:
 
 
 def _is_held(path: Path) -> bool:
-    folder, found = path.parent, _read(path)
-    if found is None:
+    folder, holder = path.parent, _read(path)
+    if holder is None:
         return False
-    young = max(_changed(path), _changed(folder / f"{found.block}.running")) > time.time() - 3600 * EXPIRES_HOURS
-    return young and (found.host != socket.gethostname() or is_alive(found.pid))
+    young = max(_changed(path), _changed(folder / f"{holder.block}.running")) > time.time() - 3600 * EXPIRES_HOURS
+    return young and (holder.host != socket.gethostname() or is_alive(holder.pid))
 
 
 def note_running(folder: Path, cell: Cell, block: str) -> None:
@@ -104,8 +104,8 @@ def running_cell(folder: Path, cells: Sequence[Cell], block: str) -> Cell | None
 def release(folder: Path, cells: Sequence[Cell], block: str) -> None:
     """Removes the claims and the note of this attempt at a block."""
     for path in (folder / f"{cell.id}.json" for cell in cells):
-        found = _read(path)
-        if found is not None and found.block == block:
+        holder = _read(path)
+        if holder is not None and holder.block == block:
             path.unlink(missing_ok=True)
     (folder / f"{block}.running").unlink(missing_ok=True)
 

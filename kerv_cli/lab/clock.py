@@ -16,7 +16,7 @@ CHUNK, POSITION = "chunk", "position"
 """Compensations: drop the new chunk's stale actions; show the decoder the end effector where it will be."""
 
 AHEAD = 64
-"""Control steps that are predicted at most; what lies further ahead is taken to be the same."""
+"""Control steps that are predicted at most; later ones repeat the last of them."""
 
 _LEAST = {"hold": 1, "linear": 2, "kalman": 2}  # actions that a prediction needs
 _RATIO = 10.0  # q / r of the filter; experts' actions are predicted best with it, up to five steps ahead
@@ -40,8 +40,8 @@ class RealClock:
         self.expected = 0
 
     def observed(self, observation: Observation, path: Sequence[np.ndarray]) -> Observation:
-        """What the decoder is shown: the observation, with `position` the end effector where it is expected to be when
-        the decode ends. path: its measured positions (3,) in the episode, metres, oldest first."""
+        """The observation to decode: with `position`, its end effector is moved to where it is predicted to be when the
+        decode ends. path: the measured positions (3,) in the episode, metres, oldest first."""
         if self.motion is None or not self.expected:
             return observation
         ahead = displacement(self.motion, np.asarray(path), self.expected)
@@ -72,12 +72,12 @@ class RealClock:
         actions, delay = decode.actions, decode.delay
         if delay is None or not delay.predicted or self.stream is None:
             return actions[delay.dropped :] if delay is not None else actions
-        known = self.space.normalise(np.array([*history[-self.stream.window :], *actions]))
+        recent = self.space.normalise(np.array([*history[-self.stream.window :], *actions]))
         first = delay.steps + 1 - delay.predicted  # steps ahead of the chunk's end of the first predicted action
         ahead = np.minimum(np.arange(first, delay.steps + 1), AHEAD) - 1
-        predicted = self.stream.predict(known, AHEAD)
+        predicted = self.stream.predict(recent, AHEAD)
         if predicted is None:
-            predicted = np.repeat(known[-1:], AHEAD, axis=0)
+            predicted = np.repeat(recent[-1:], AHEAD, axis=0)
         behind = self.space.unnormalise(predicted[ahead]).astype(actions.dtype)
         return np.concatenate([actions[delay.dropped :], behind])
 

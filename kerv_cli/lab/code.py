@@ -21,7 +21,7 @@ def code_hash() -> str:
     """Hex SHA-256 over the names and syntax trees of the files that compute an episode: kerv's own, and those of parts
     that are registered from outside. Comments, docstrings and layout do not count. Computed once per process."""
     digest = hashlib.sha256()
-    for name, path in [*_own(), *_outside()]:
+    for name, path in [*_package(), *_outside()]:
         content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
         digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
     return digest.hexdigest()
@@ -38,15 +38,15 @@ class _WithoutDocstrings(ast.NodeTransformer):
         return None if alone else node
 
 
-def _own() -> Iterator[tuple[str, Path]]:
+def _package() -> Iterator[tuple[str, Path]]:
     root = Path(kerv_cli.__file__).parent
     files = [path for room in _COMPUTING for path in (root / room).rglob("*.py")]
     return ((path.relative_to(root).as_posix(), path) for path in sorted(files))
 
 
 def _outside() -> Iterator[tuple[str, Path]]:
-    named = {part.build.partition(":")[0] for kind in kinds() for part in parts(kind).values() if kind != "executor"}
-    for name in sorted(module for module in named if module and not module.startswith("kerv_cli.")):
-        found = importlib.util.find_spec(name)
-        if found is not None and found.origin is not None:
-            yield name, Path(found.origin)
+    modules = {part.build.partition(":")[0] for kind in kinds() for part in parts(kind).values() if kind != "executor"}
+    for name in sorted(module for module in modules if module and not module.startswith("kerv_cli.")):
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.origin is not None:
+            yield name, Path(spec.origin)

@@ -21,19 +21,19 @@ def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: b
     if settings.policy.kind == EXPERT:
         return {}
     idle = idle_keys(settings) | ({} if sweep else dict.fromkeys(_OF_SWEEPS, "a rollout runs in one process"))
-    found = {}
+    reasons = {}
     for word in overrides:
         key = word.partition("=")[0].lstrip("+")
         reason = next((why for name, why in idle.items() if key == name or key.startswith(f"{name}.")), None)
         if reason is not None:
-            found[word] = reason
-    return found
+            reasons[word] = reason
+    return reasons
 
 
 def _idle_timing(timing: TimingSettings) -> dict[str, str]:
     if timing.clock == WAITS:
-        own = ("latency", "latency_ms", "profile", "ar_ms", "delay_compensation")
-        return {f"rollout.{name}": "rollout.clock=waits: the world waits for every decode" for name in own}
+        names = ("latency", "latency_ms", "profile", "ar_ms", "delay_compensation")
+        return {f"rollout.{name}": "rollout.clock=waits: the world waits for every decode" for name in names}
     idle = {}
     if timing.latency != CONSTANT:
         idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
@@ -47,15 +47,15 @@ def _idle_timing(timing: TimingSettings) -> dict[str, str]:
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     """Key of a setting that has no effect -> why."""
     method = settings.parts()
-    chosen = {kind: method[kind].kind for kind in METHOD_KINDS}
+    names = {kind: method[kind].kind for kind in METHOD_KINDS}
     idle: dict[str, str] = {}
-    if chosen["proposer"] == chosen["prefill_draft"] == "none":
+    if names["proposer"] == names["prefill_draft"] == "none":
         idle |= dict.fromkeys(_JUDGED, f"method {settings.method} drafts nothing")
-    elif chosen["skip"] == "always":
+    elif names["skip"] == "always":
         idle["rectifier"] = "skip=always verifies nothing, so nothing is rejected"
-    elif chosen["acceptance"] in ("strict", "sequence"):
-        idle["threshold"] = f"acceptance={chosen['acceptance']} has no threshold"
-    needed = {need for kind in METHOD_KINDS for need in part_of(kind, chosen[kind]).needs(method[kind])}
+    elif names["acceptance"] in ("strict", "sequence"):
+        idle["threshold"] = f"acceptance={names['acceptance']} has no threshold"
+    needed = {need for kind in METHOD_KINDS for need in part_of(kind, names[kind]).needs(method[kind])}
     for kind in _ARTIFACTS:
         if kind not in needed:
             idle[f"policy.{kind}"] = f"method {settings.method} reads no {kind}"

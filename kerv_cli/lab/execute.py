@@ -5,6 +5,7 @@ The process that runs a block also writes its cells, so a crash loses at most th
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 import time
 from collections import deque
@@ -62,8 +63,7 @@ def execute(
         sweep.note(cell, result)
     if executor is not None:
         sweep.run(blocks, executor)
-    found = sweep.outcome
-    outcome = events.Outcome(found.done, found.reused, found.failed, time.perf_counter() - clock)
+    outcome = dataclasses.replace(sweep.outcome, seconds=time.perf_counter() - clock)
     on_event(events.SweepFinished(outcome))
     return outcome
 
@@ -104,8 +104,8 @@ class _Sweep:
             except CheckpointError as error:
                 damaged[cell.id] = cell, failed(error)
         settled = {*damaged, *(cell.id for cell in self.outcome.reused)}
-        left = [block.without(settled) for block in blocks_of(cells, self.workers)]
-        return [block for block in left if block is not None], list(damaged.values())
+        blocks = [block.without(settled) for block in blocks_of(cells, self.workers)]
+        return [block for block in blocks if block is not None], list(damaged.values())
 
     def run(self, blocks: Sequence[Block], executor: Executor) -> None:
         """Keeps every slot busy until all blocks are settled."""
@@ -154,11 +154,11 @@ class _Sweep:
     def _lost(self, attempt: BlockRun, result: CellResult) -> None:
         """After a worker's end: the cell that ran has failed, complete cells are done, the block's others run again."""
         cells = attempt.block.cells
-        guilty = running_cell(self.store.claims, cells, attempt.name)
+        last_cell = running_cell(self.store.claims, cells, attempt.name)
         release(self.store.claims, cells, attempt.name)
-        results = {} if guilty is None else {guilty.id: result}
+        results = {} if last_cell is None else {last_cell.id: result}
         for cell in cells:
-            if guilty is None:  # it ended before any cell ran: so would another attempt
+            if last_cell is None:  # it ended before any cell ran: so would another attempt
                 results[cell.id] = result
             elif self.store.has_cell(cell.id):
                 stored = self.store.read_cell(cell.id)

@@ -1,4 +1,4 @@
-"""What a cell means: the settings that have an effect, the weights and data, the task, the seeds and `ENGINE`.
+"""The meaning of a cell: the settings that have an effect, the weights and data, the task, the seeds and `ENGINE`.
 
 Not the code, versions, machine, workers or layout of files: those are provenance, written beside. So what was measured
 stays, whatever is renamed or added, and what would give the same tokens is the same work in any study.
@@ -49,10 +49,10 @@ def _canonical(value: Any) -> str:
 
 def work_of(settings: Mapping[str, Any], identity: Identity, engine: int = ENGINE) -> str:
     """Hash of what determines the results of a setting, apart from task, seeds and repeat. settings: plain
-    RolloutSettings, of this kerv or an older one. engine: with which they were computed."""
-    kept = without(settings, NOT_DETERMINING - {"policy", "method"})
+    RolloutSettings, of this kerv or an older one. engine: version that computes them."""
+    determining = without(settings, NOT_DETERMINING - {"policy", "method"})
     policy = settings.get("policy", {}).get("kind", MODEL)
-    return _work(_canonical(kept), _canonical(dict(identity)), policy, engine)
+    return _work(_canonical(determining), _canonical(dict(identity)), policy, engine)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -64,27 +64,27 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 
 def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that determine a result: complete, without those that have no effect."""
-    kept = without(settings, NOT_DETERMINING)
+    determining = without(settings, NOT_DETERMINING)
     try:
-        read = settings_from(settings, tolerant=True)
+        typed = settings_from(settings, tolerant=True)
     except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
-        return kept
-    kept = _filled(kept, without(as_plain(read), NOT_DETERMINING))
-    for key in idle_keys(read) if read.policy.kind != EXPERT else ():
-        _drop(kept, key.split("."))
-    kept["runtime"] = without(kept["runtime"], NOT_DETERMINING_RUNTIME)
-    if not stress_of(kept)["level"]:
-        kept["world"] = without(kept["world"], {"stress"})  # level 0 of every kind is the same world
-    return kept
+        return determining
+    determining = _filled(determining, without(as_plain(typed), NOT_DETERMINING))
+    for key in idle_keys(typed) if typed.policy.kind != EXPERT else ():
+        _drop(determining, key.split("."))
+    determining["runtime"] = without(determining["runtime"], NOT_DETERMINING_RUNTIME)
+    if not stress_of(determining)["level"]:
+        determining["world"] = without(determining["world"], {"stress"})  # level 0 of every kind is the same world
+    return determining
 
 
 def _filled(stored: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
     """Stored values and, where an older file has none, the defaults of today; keys that are unknown today stay."""
-    both = {**complete, **stored}
-    for key, value in both.items():
+    values = {**complete, **stored}
+    for key, value in values.items():
         if isinstance(value, Mapping) and isinstance(complete.get(key), Mapping):
-            both[key] = _filled(value, complete[key])
-    return both
+            values[key] = _filled(value, complete[key])
+    return values
 
 
 def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:

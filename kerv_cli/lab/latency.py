@@ -1,4 +1,4 @@
-"""How long a decode lasts for a world that does not wait: as measured, constant, or by a latency profile of another
+"""The latency of a decode in a world that does not wait: as measured, constant, or by a latency profile of another
 model and device (docs/methods.md §8)."""
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Constant:
-    """The same for every decode. latency: seconds."""
+    """A constant latency of every decode, seconds."""
 
     latency: float
 

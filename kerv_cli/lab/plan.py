@@ -42,17 +42,17 @@ class Cell:
 
     @functools.cached_property
     def work(self) -> tuple[str, str, int]:
-        """What it means apart from its seeds: setting, task and repeat."""
+        """Setting (its hash), task and repeat: all that the cell means apart from its seeds."""
         return work_of(self.settings, self.identity), self.task, self.repeat
 
     def part(self, seeds: Sequence[int], name: str = "") -> Cell:
-        """The same work on other seeds. name: of the folder where it lies; empty: a cell that is to run."""
+        """A cell of this work on these seeds. name: of its folder on disk; empty: the cell is to run."""
         return replace(self, seeds=tuple(seeds), id=name or _name(self.work, seeds))
 
-    def again(self, taken: Collection[str]) -> Cell:
-        """The same cell under a name of its own, beside those folders: `<id>-2`, `<id>-3`, …"""
+    def again(self, names: Collection[str]) -> Cell:
+        """This cell with the first id that is not among the names: `<id>-2`, `<id>-3`, …"""
         first = self.part(self.seeds).id
-        return replace(self, id=next(n for n in (f"{first}-{i}" for i in range(2, 10_000)) if n not in taken))
+        return replace(self, id=next(n for n in (f"{first}-{i}" for i in range(2, 10_000)) if n not in names))
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Block:
 
     @property
     def title(self) -> str:
-        """What it is, in a few words."""
+        """Name and size of the block, for a display."""
         if self.batch == 1:
             return f"{self.name}: {len(self.cells)} settings in turn"
         return f"{self.cells[0].label} from {self.name} on: {_episodes(self.cells)} episodes, {self.batch} at a time"
@@ -100,13 +100,13 @@ class Block:
     def order(self, seed: int) -> list[int]:
         """Indices of its cells in the order in which they run the episode of `seed`: a permutation drawn from task,
         seed and repeat."""
-        drawn = hashlib.sha256(f"{self.task} {seed} {self.repeat}".encode()).digest()
-        return [int(i) for i in np.random.default_rng(list(drawn)).permutation(len(self.cells))]
+        digest = hashlib.sha256(f"{self.task} {seed} {self.repeat}".encode()).digest()
+        return [int(i) for i in np.random.default_rng(list(digest)).permutation(len(self.cells))]
 
     def without(self, names: Collection[str]) -> Block | None:
         """The block without the cells of those ids; None if no cell is left."""
-        left = tuple(cell for cell in self.cells if cell.id not in names)
-        return Block(left) if left else None
+        cells = tuple(cell for cell in self.cells if cell.id not in names)
+        return Block(cells) if cells else None
 
 
 def make_cell(
@@ -167,9 +167,9 @@ def plan(
     labels = sorted(settings_by_label, key=lambda label: label != baseline)
     hashes = {label: identity(s) if callable(identity) else identity for label, s in settings_by_label.items()}
     plain = {label: dataclasses.asdict(settings) for label, settings in settings_by_label.items()}
-    written = overrides or {}
+    words = overrides or {}
     return [
-        make_cell(label, written.get(label, ""), plain[label], hashes[label], task, seeds, repeat)
+        make_cell(label, words.get(label, ""), plain[label], hashes[label], task, seeds, repeat)
         for repeat in range(repeats)
         for task in tasks
         for label in labels
@@ -186,13 +186,13 @@ def blocks_of(cells: Iterable[Cell], workers: int = 1) -> list[Block]:
     """The cells grouped by task, seeds, repeat and threads (a process has one number of them), in the order of their
     first cells; each id once. Those of a batch are grouped by setting, into as many blocks as there are workers or
     more."""
-    found: dict[tuple[Any, ...], list[Cell]] = {}
+    groups: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in unique_cells(cells):
         key: tuple[Any, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
         if batch_of(cell.settings) > 1:
             key = (json.dumps([without(cell.settings, {"task"}), cell.identity], sort_keys=True), cell.repeat)
-        found.setdefault(key, []).append(cell)
-    return [Block(tuple(part)) for group in found.values() for part in _parts(group, workers)]
+        groups.setdefault(key, []).append(cell)
+    return [Block(tuple(part)) for group in groups.values() for part in _parts(group, workers)]
 
 
 def _parts(group: Sequence[Cell], workers: int) -> Iterator[list[Cell]]:
@@ -243,8 +243,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     seeds: list[int] = []
     for part in text.split(";"):
         first, _, last = part.partition("-")
-        drawn = range(int(first), int(last or first) + 1)
-        if not 0 < len(drawn) <= MOST_SEEDS:
+        span = range(int(first), int(last or first) + 1)
+        if not 0 < len(span) <= MOST_SEEDS:
             raise ValueError(f"'{part}' is no range of seeds")
-        seeds.extend(drawn)
+        seeds.extend(span)
     return tuple(seeds)

@@ -90,23 +90,23 @@ def plan_from_text(text: str) -> StudyPlan:
     Raises:
         CheckpointError, ValueError: not a plan, or one that contradicts itself.
     """
-    found = read(_File, read_yaml(text), "the plan", tolerant=True)
-    for label in found.labels.values():
+    file = read(_File, read_yaml(text), "the plan", tolerant=True)
+    for label in file.labels.values():
         read(RolloutSettings, label.settings, "the plan", tolerant=True)
         wrong = [kind for kind in METHOD_KINDS if not isinstance(label.settings.get(kind, {}), dict)]
         if wrong or not label.settings.keys() & set(METHOD_KINDS):
             raise ValueError(f"a label has no settings of {' or '.join(wrong or METHOD_KINDS)}")
-    unknown = {line.label for line in found.cells} - set(found.labels)
-    if unknown or found.baseline not in found.labels:
-        raise ValueError(f"it has no label {', '.join(sorted(unknown)) or found.baseline}")
-    return StudyPlan(found.study, found.title, found.baseline, found.axis, tuple(_cells(found)), found.note)
+    unknown = {line.label for line in file.cells} - set(file.labels)
+    if unknown or file.baseline not in file.labels:
+        raise ValueError(f"it has no label {', '.join(sorted(unknown)) or file.baseline}")
+    return StudyPlan(file.study, file.title, file.baseline, file.axis, tuple(_cells(file)), file.note)
 
 
-def _cells(found: _File) -> Iterator[Cell]:
+def _cells(file: _File) -> Iterator[Cell]:
     complete: dict[str, dict[str, Any]] = {}
     shared: dict[tuple[str, str], dict[str, Any]] = {}  # of thousands of cells: memory
-    for line in found.cells:
-        label, key = found.labels[line.label], (line.label, line.task)
+    for line in file.cells:
+        label, key = file.labels[line.label], (line.label, line.task)
         if line.label not in complete:
             complete[line.label] = complete_settings(label.settings)
         if key not in shared:
@@ -124,7 +124,7 @@ def _cells(found: _File) -> Iterator[Cell]:
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
-    """`new`, preceded by what `old` has of its settings and seeds on tasks that it does not name."""
+    """`new`, preceded by the cells of `old` with its settings and seeds on tasks that `new` does not name."""
     if (old.name, old.baseline) != (new.name, new.baseline):
         return new
     tasks = {cell.task for cell in new.cells}
@@ -132,10 +132,10 @@ def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
     seeds: dict[tuple[str, int], set[int]] = {}
     for cell in new.cells:
         seeds.setdefault((cell.label, cell.repeat), set()).update(cell.seeds)
-    kept = []
+    cells = []
     for cell in old.cells:
         key = cell.label, cell.repeat
-        left = [seed for seed in cell.seeds if seed in seeds.get(key, ())]
-        if left and cell.task not in tasks and cell.work[0] == settings[key]:
-            kept.append(cell.part(left, cell.id))
-    return replace(new, cells=(*kept, *new.cells))
+        shared = [seed for seed in cell.seeds if seed in seeds.get(key, ())]
+        if shared and cell.task not in tasks and cell.work[0] == settings[key]:
+            cells.append(cell.part(shared, cell.id))
+    return replace(new, cells=(*cells, *new.cells))

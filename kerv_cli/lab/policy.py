@@ -63,22 +63,22 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
 
 
 def shown_to(target: Mapping[str, object]) -> str:
-    """What a target of these settings observes, `vision` or `state (privileged)`; stands in every row, so that a
+    """The observation of a target with these settings, `vision` or `state (privileged)`; every row has it, so that a
     privileged policy is recognised."""
     kind = str(target.get(OBSERVATION, "vision"))
     return "state (privileged)" if kind == "state" else kind
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
-    """Those of the tasks that the policy's target was not trained on; none where it does not say what it was."""
+    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
     if is_expert(settings):
         return []
-    made = artifacts_of(settings).description.provenance.get("settings")
-    trained = made.get("task") if isinstance(made, Mapping) else None
-    if not trained or not isinstance(trained, list) or not all(isinstance(name, str) for name in trained):
+    training = artifacts_of(settings).description.provenance.get("settings")
+    names = training.get("task") if isinstance(training, Mapping) else None
+    if not names or not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         return []
-    known = set(resolve_tasks(trained))
-    return [task for task in tasks if task not in known]
+    trained_on = set(resolve_tasks(names))
+    return [task for task in tasks if task not in trained_on]
 
 
 def check(settings: RolloutSettings) -> None:
@@ -106,9 +106,9 @@ def check(settings: RolloutSettings) -> None:
     check_method(method, settings.chunk, target.chunk, target.parallel)
     check_batch(method, settings.method, settings.rollout.batch)
     timing.check_method(settings, spec, target)
-    wanted = needs(method)
-    artifacts.check(wanted)
-    if "calibration" in wanted and method["threshold"].kind in ("kinematic", "change"):
+    kinds = needs(method)
+    artifacts.check(kinds)
+    if "calibration" in kinds and method["threshold"].kind in ("kinematic", "change"):
         calibration = artifacts.load("calibration")
         for task in tasks if method["threshold"].k_s is None else ():
             calibration.k_s(task)
@@ -160,8 +160,8 @@ class Sampled:
         self.count += 1
         if self.count % self.every:
             return record
-        wanted = self.reference.decode(observation).actions
-        return dataclasses.replace(record, deviation=deviation(self.decoder.target.actions, record.actions, wanted))
+        reference = self.reference.decode(observation).actions
+        return dataclasses.replace(record, deviation=deviation(self.decoder.target.actions, record.actions, reference))
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """Tells the decoder; AR needs no history."""

@@ -47,23 +47,23 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
     sweep = compose("sweep", mine, SweepSettings)
     if by_path is not None:
-        changed = {o.split("=", 1)[0].removeprefix("study.") for o in mine if o.startswith("study.")}
-        kept = {name: getattr(sweep.study, name) for name in changed & set(StudySettings.__dataclass_fields__)}
-        sweep.study = dataclasses.replace(by_path, **kept)
-    given = {_key(o) for o in theirs}
-    common = [o for o in split_words(sweep.study.common) if _key(o) not in given] + theirs
-    written = _points(sweep.study)
-    for words in written.values():
-        varied = given & {_key(word) for word in words}
+        names = {o.split("=", 1)[0].removeprefix("study.") for o in mine if o.startswith("study.")}
+        changes = {name: getattr(sweep.study, name) for name in names & set(StudySettings.__dataclass_fields__)}
+        sweep.study = dataclasses.replace(by_path, **changes)
+    keys = {_key(o) for o in theirs}
+    common = [o for o in split_words(sweep.study.common) if _key(o) not in keys] + theirs
+    points = _points(sweep.study)
+    for words in points.values():
+        varied = keys & {_key(word) for word in words}
         if varied:
             raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
-    if sweep.study.baseline not in written:
-        raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(written)}")
+    if sweep.study.baseline not in points:
+        raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(points)}")
     composer = Composer("rollout", RolloutSettings)
-    settings = {label: composer.compose([*common, *words]) for label, words in written.items()}
+    settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
     for setting in settings.values():
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
-    texts = {label: " ".join(words) for label, words in written.items()}
+    texts = {label: " ".join(words) for label, words in points.items()}
     return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, sweep.rerun, tuple(theirs))
 
 
@@ -81,17 +81,17 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     if "results" in varied:
         raise UsageError("results= names one folder: a run lies in one place")
     settings: dict[str, RolloutSettings] = {}
-    written: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for point in expand(words) if multirun else [words]:
         composed = compose("rollout", [*shared, *point], RolloutSettings)
         composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
         values = [f"{key.rsplit('.', 1)[-1]}={_value(point, key)}" for key in varied]
         parts = [word for word in point if _key(word) in METHOD_KINDS and _key(word) not in varied]
         label = " ".join([composed.method, *parts, *values])
-        settings[label], written[label] = composed, " ".join(point)
+        settings[label], texts[label] = composed, " ".join(point)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
     study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
-    return ResolvedStudy(study, settings, written)
+    return ResolvedStudy(study, settings, texts)
 
 
 def _value(point: Sequence[str], key: str) -> str:
@@ -104,13 +104,14 @@ def _is_ar(settings: RolloutSettings) -> bool:
 
 
 def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
-    """Overrides without effect -> why: a setting's own in that setting, those of the command line in every setting."""
-    found: dict[str, str] = {}
+    """Overrides without effect -> why: a setting's words that it does not read, and words of the command line that no
+    setting reads."""
+    reasons: dict[str, str] = {}
     for label, settings in resolved.settings.items():
-        own = without_effect(settings, resolved.overrides[label].split(), sweep=True)
-        found |= {f"{label}: {word}": why for word, why in own.items()}
-    of_all = [without_effect(settings, resolved.common, sweep=True) for settings in resolved.settings.values()]
-    return found | {word: why for word, why in of_all[0].items() if all(word in idle for idle in of_all)}
+        idle = without_effect(settings, resolved.overrides[label].split(), sweep=True)
+        reasons |= {f"{label}: {word}": why for word, why in idle.items()}
+    common = [without_effect(settings, resolved.common, sweep=True) for settings in resolved.settings.values()]
+    return reasons | {word: why for word, why in common[0].items() if all(word in idle for idle in common)}
 
 
 def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings | None]:
@@ -134,7 +135,7 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
 
 
 def _read_study(path: Path) -> dict[str, Any]:
-    """The study file's values; raises as `_study_of_path`."""
+    """The study file's values. Raises UsageError where it cannot be read or is no mapping."""
     try:
         value = read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -163,12 +164,12 @@ def _key(override: str) -> str:
 
 def _points(study: StudySettings) -> dict[str, list[str]]:
     """Label -> override words; a grid's labels carry its values: `spec_vla r=3`."""
-    written: dict[str, list[str]] = {}
+    points: dict[str, list[str]] = {}
     for label, text in study.settings.items():
         varied = swept_keys(text)
         for words in expand(text):
             values = [f"{_key(w).rsplit('.', 1)[-1]}={w.split('=', 1)[1]}" for w in words if _key(w) in varied]
-            written[" ".join([label, *values])] = words
-        if len(written) > MOST_POINTS:
+            points[" ".join([label, *values])] = words
+        if len(points) > MOST_POINTS:
             raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
-    return written
+    return points

@@ -1,4 +1,4 @@
-"""What a results folder already holds of a plan, why the rest of it is to run, and where it is stored."""
+"""Splits a plan into the cells that a results folder holds and those to run, with the reason for each."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 
 
 @dataclass(frozen=True)
-class Kept:
-    """A complete cell on disk, unchecked: its hashes are compared when it is used. engine: with which it was computed;
-    code: hash of the source that computed it, empty before it was noted."""
+class StockEntry:
+    """A complete cell on disk, unchecked: its hashes are compared when it is used. engine: version that computed it;
+    code: hash of the source that computed it, empty in cells older than that hash."""
 
     id: str
     store: StudyStore
@@ -47,7 +47,7 @@ class Kept:
 
     @property
     def work(self) -> tuple[str, str, int]:
-        """As `Cell.work`."""
+        """Setting, task and repeat; equal to a planned cell's `work` where that cell means the same."""
         return work_of(self.settings, self.identity, self.engine), self.task, self.repeat
 
 
@@ -56,43 +56,43 @@ class Stock:
 
     def __init__(self, store: StudyStore, others: bool = True) -> None:
         self.store = store
-        self.by_work: dict[tuple[str, str, int], list[Kept]] = {}
-        self.by_label: dict[str, list[Kept]] = {}
+        self.by_work: dict[tuple[str, str, int], list[StockEntry]] = {}
+        self.by_label: dict[str, list[StockEntry]] = {}
         self.names: set[str] = set()  # of the study's own cells
-        for kept in _kept(store):
-            self.names.add(kept.id)
-            self._add(kept)
+        for entry in _entries(store):
+            self.names.add(entry.id)
+            self._add(entry)
         for other in studies_of(store) if others else ():
-            for kept in _kept(other):
-                self._add(kept)
+            for entry in _entries(other):
+                self._add(entry)
         self.settings = {work[0] for work in self.by_work}
         self._blocks: dict[str, dict[int, str]] = {}
 
-    def _add(self, kept: Kept) -> None:
-        self.by_work.setdefault(kept.work, []).append(kept)
-        self.by_label.setdefault(kept.label, []).append(kept)
+    def _add(self, entry: StockEntry) -> None:
+        self.by_work.setdefault(entry.work, []).append(entry)
+        self.by_label.setdefault(entry.label, []).append(entry)
 
-    def of(self, cell: Cell) -> list[Kept]:
+    def of(self, cell: Cell) -> list[StockEntry]:
         """Cells that hold results of the same work for some of its seeds."""
-        kept = self.by_work.get(cell.work, [])
+        entries = self.by_work.get(cell.work, [])
         if depends_on_order(cell.settings):
-            return [one for one in kept if one.seeds == cell.seeds]
-        return [one for one in kept if not set(one.seeds).isdisjoint(cell.seeds)]
+            return [entry for entry in entries if entry.seeds == cell.seeds]
+        return [entry for entry in entries if not set(entry.seeds).isdisjoint(cell.seeds)]
 
-    def block(self, kept: Kept, seed: int) -> str:
-        """The attempt at a block in which the episode was measured; unknown in the oldest cells, then its run."""
-        name = str(kept.store.cells / kept.id)
+    def block(self, entry: StockEntry, seed: int) -> str:
+        """Name of the attempt at a block that measured the episode; in the oldest cells, which lack it, their run."""
+        name = str(entry.store.cells / entry.id)
         if name not in self._blocks:
-            episodes = kept.store.read_cell(kept.id).episodes
+            episodes = entry.store.read_cell(entry.id).episodes
             self._blocks[name] = dict(zip(episodes["seed"], episodes["block"], strict=True))
-        return self._blocks[name].get(seed) or kept.run
+        return self._blocks[name].get(seed) or entry.run
 
 
-def _kept(store: StudyStore) -> Iterator[Kept]:
+def _entries(store: StudyStore) -> Iterator[StockEntry]:
     for folder in store.folders():
         try:
             config, status = store.described(folder.name)
-            yield Kept(
+            yield StockEntry(
                 folder.name,
                 store,
                 str(config["label"]),
@@ -122,7 +122,7 @@ class Covered:
     sources: dict[str, StudyStore] = field(default_factory=dict)
 
 
-Pieces = dict[int, Kept]
+Pieces = dict[int, StockEntry]
 """Seed -> the cell on disk that holds its episode."""
 
 
@@ -139,59 +139,59 @@ def cover(planned: Sequence[Cell], stock: Stock, rerun: str = NEVER, since: str 
     groups: dict[tuple[str, tuple[int, ...], int], list[Cell]] = {}
     for cell in planned:
         groups.setdefault((cell.task, cell.seeds, cell.repeat), []).append(cell)
-    whole: dict[int, tuple[Pieces, list[tuple[int, ...]]]] = {}
+    splits: dict[int, tuple[Pieces, list[tuple[int, ...]]]] = {}
     accepts = _accepts(rerun, since)
     for group in groups.values():
         pieces = _pieces(group, stock, accepts)
         if rerun == TIMED:
             pieces = _in_turn(group, pieces, stock)
-        whole |= {id(cell): (own, parts) for cell, own, parts in zip(group, pieces, _parts(group, pieces), strict=True)}
+        splits |= zip(map(id, group), zip(pieces, _parts(group, pieces), strict=True), strict=True)
     covered = Covered()
     for cell in planned:
-        _append(covered, cell, *whole[id(cell)], stock, rerun)
+        _append(covered, cell, *splits[id(cell)], stock, rerun)
     return covered
 
 
-def _accepts(rerun: str, since: str) -> Callable[[Kept], bool]:
+def _accepts(rerun: str, since: str) -> Callable[[StockEntry], bool]:
     if rerun == CHANGED:
         code = code_hash()
-        return lambda kept: kept.code == code
+        return lambda entry: entry.code == code
     if rerun == ALL:
-        return lambda kept: bool(since) and kept.started >= since
-    return lambda kept: True
+        return lambda entry: bool(since) and entry.started >= since
+    return lambda entry: True
 
 
-def _pieces(group: Sequence[Cell], stock: Stock, accepts: Callable[[Kept], bool]) -> list[Pieces]:
-    """Of every cell; first what the run measured that holds most of the group's settings, for their times belong
-    together, then the study's own, then the newest."""
-    choices = [[kept for kept in stock.of(cell) if accepts(kept)] for cell in group]
-    runs = Counter(run for kept in choices for run in {one.run for one in kept})
+def _pieces(group: Sequence[Cell], stock: Stock, accepts: Callable[[StockEntry], bool]) -> list[Pieces]:
+    """The pieces of every cell. Of several entries with a seed, that of the run with most of the group's settings
+    counts, because their times belong together; then one of this study; then the newest."""
+    choices = [[entry for entry in stock.of(cell) if accepts(entry)] for cell in group]
+    runs = Counter(run for entries in choices for run in {entry.run for entry in entries})
     return [
         {
-            seed: kept
-            for kept in sorted(own, key=lambda k: (runs[k.run], k.store.name == stock.store.name, k.started))
-            for seed in kept.seeds
+            seed: entry
+            for entry in sorted(entries, key=lambda e: (runs[e.run], e.store.name == stock.store.name, e.started))
+            for seed in entry.seeds
             if seed in cell.seeds
         }
-        for cell, own in zip(group, choices, strict=True)
+        for cell, entries in zip(group, choices, strict=True)
     ]
 
 
 def _in_turn(group: Sequence[Cell], pieces: Sequence[Pieces], stock: Stock) -> list[Pieces]:
-    """Without the seeds whose episodes the settings did not run in one block."""
+    """The pieces without the seeds whose episodes the settings did not run in one block."""
     together = {
         seed
         for seed in group[0].seeds
-        if all(seed in own for own in pieces) and len({stock.block(own[seed], seed) for own in pieces}) == 1
+        if all(seed in piece for piece in pieces) and len({stock.block(piece[seed], seed) for piece in pieces}) == 1
     }
-    return [{seed: kept for seed, kept in own.items() if seed in together} for own in pieces]
+    return [{seed: entry for seed, entry in piece.items() if seed in together} for piece in pieces]
 
 
 def _parts(group: Sequence[Cell], pieces: Sequence[Pieces]) -> list[list[tuple[int, ...]]]:
     """Per cell the seeds to run, cut where another set of the group's settings runs them."""
 
     def misses(seed: int) -> tuple[int, ...]:
-        return tuple(i for i, own in enumerate(pieces) if seed not in own)
+        return tuple(i for i, piece in enumerate(pieces) if seed not in piece)
 
     cut = [(who, tuple(seeds)) for who, seeds in groupby(group[0].seeds, key=misses)]
     parts: list[list[tuple[int, ...]]] = []
@@ -211,13 +211,13 @@ def _append(
     for seed in cell.seeds:
         if seed in pieces:
             by_cell.setdefault(pieces[seed].id, []).append(seed)
-    for name, stored in by_cell.items():
-        covered.cells.append(cell.part(stored, name))
-        source = pieces[stored[0]].store
+    for name, seeds in by_cell.items():
+        covered.cells.append(cell.part(seeds, name))
+        source = pieces[seeds[0]].store
         if source.name != stock.store.name:
             covered.sources[name] = source
-    for missing in parts:
-        to_run = cell.part(missing)
+    for seeds_to_run in parts:
+        to_run = cell.part(seeds_to_run)
         if to_run.id in stock.names:
             to_run = to_run.again(stock.names)
         covered.cells.append(to_run)
@@ -226,8 +226,8 @@ def _append(
 
 def _reason(cell: Cell, stock: Stock, rerun: str) -> str:
     """Why a cell is to run, in a few words."""
-    stored = {seed for kept in stock.of(cell) for seed in kept.seeds}
-    if stored.issuperset(cell.seeds):
+    seeds = {seed for entry in stock.of(cell) for seed in entry.seeds}
+    if seeds.issuperset(cell.seeds):
         return {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
     if cell.work in stock.by_work:
         return "new seeds"
@@ -237,19 +237,19 @@ def _reason(cell: Cell, stock: Stock, rerun: str) -> str:
     return _differences(near[-1], cell) if near else "new setting"
 
 
-def _differences(kept: Kept, cell: Cell) -> str:
-    """What of a stored setting has changed since, for a label that is still there."""
-    told = [f"engine {kept.engine} → {ENGINE}"] if kept.engine != ENGINE else []
+def _differences(entry: StockEntry, cell: Cell) -> str:
+    """The changes from an entry's engine, weights and settings to a cell's of the same label, in a few words."""
+    changes = [f"engine {entry.engine} → {ENGINE}"] if entry.engine != ENGINE else []
     weights = [
         kind
-        for kind in dict.fromkeys([*cell.identity, *kept.identity])
-        if kind != OBSERVATION and cell.identity.get(kind) != kept.identity.get(kind)
+        for kind in dict.fromkeys([*cell.identity, *entry.identity])
+        if kind != OBSERVATION and cell.identity.get(kind) != entry.identity.get(kind)
     ]
-    told += [f"{_weights(kind, cell)} changed" for kind in weights]
-    old, new = flat(effective(kept.settings)), flat(effective(cell.settings))
+    changes += [f"{_weights(kind, cell)} changed" for kind in weights]
+    old, new = flat(effective(entry.settings)), flat(effective(cell.settings))
     keys = [key for key in dict.fromkeys([*new, *old]) if old.get(key) != new.get(key)]
-    told += [f"{key} {old.get(key)} → {new.get(key)}" for key in keys]
-    return ", ".join(told[:3]) or "new setting"
+    changes += [f"{key} {old.get(key)} → {new.get(key)}" for key in keys]
+    return ", ".join(changes[:3]) or "new setting"
 
 
 def _weights(kind: str, cell: Cell) -> str:
@@ -276,17 +276,17 @@ def _copy(source: StudyStore, store: StudyStore, name: str) -> None:
 
 
 def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
-    """Where the cells are stored, the cells under the names that they have there, and how many of them are complete:
-    in a new folder, or in the newest run of the same cells that was interrupted. A run that is complete is not reused:
-    a rollout is asked for in order to be run."""
+    """The store of a rollout's cells, the cells by the names that they have in it, and the number of complete ones:
+    a new folder, or the newest run of the same cells that was interrupted. A complete run is not reused, because who
+    types a rollout wants it run."""
     work = {(*cell.work, cell.seeds) for cell in cells}
     for store in reversed(stores(Path(results).expanduser(), ROLLOUTS)):
         with contextlib.suppress(UsageError, CheckpointError):
             if {(*cell.work, cell.seeds) for cell in store.read_plan().cells} != work:
                 continue
-            there = cover(cells, Stock(store, others=False))
-            if there.reasons:
-                return store, there.cells, len(there.cells) - len(there.reasons)
+            covered = cover(cells, Stock(store, others=False))
+            if covered.reasons:
+                return store, covered.cells, len(covered.cells) - len(covered.reasons)
     return StudyStore(results, new_name(results, cells), ROLLOUTS), list(cells), 0
 
 
@@ -294,29 +294,29 @@ def new_name(results: str | Path, cells: Sequence[Cell]) -> str:
     """A free name: date, time and methods, e.g. `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(cell.settings["method"]) for cell in unique_cells(cells)))
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
-    taken = (Path(results).expanduser() / ROLLOUTS / name).exists()
-    return f"{name}-{secrets.token_hex(2)}" if taken else name
+    exists = (Path(results).expanduser() / ROLLOUTS / name).exists()
+    return f"{name}-{secrets.token_hex(2)}" if exists else name
 
 
 def disagreements(cells: Iterable[Cell], stock: Stock) -> list[str]:
     """A sentence for every cell that was measured twice with other results: other tokens of the same work."""
-    told = []
+    sentences = []
     for cell in {cell.id: cell for cell in cells}.values():
-        kept = [one for one in stock.of(cell) if one.store.name == stock.store.name]
-        for other in kept if len(kept) > 1 else ():
+        entries = [entry for entry in stock.of(cell) if entry.store.name == stock.store.name]
+        for other in entries if len(entries) > 1 else ():
             if other.id == cell.id:
                 continue
             differ = _differ(stock.store, cell, other)
             if differ:
-                told.append(
+                sentences.append(
                     f"cells {other.id} and {cell.id} are the same work ({cell.label} on {cell.task}) and differ in "
                     f"{len(differ)} episodes, e.g. seed {differ[0]}: {cell.id} counts; code that changes tokens raises "
                     "ENGINE"
                 )
-    return told
+    return sentences
 
 
-def _differ(store: StudyStore, cell: Cell, other: Kept) -> list[int]:
+def _differ(store: StudyStore, cell: Cell, other: StockEntry) -> list[int]:
     first, second = (store.read_cell(name).episodes.set_index("seed") for name in (cell.id, other.id))
     shared = [seed for seed in cell.seeds if seed in first.index and seed in second.index]
     columns = ["success", "steps", "forwards", "tokens"]

@@ -14,7 +14,7 @@ from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.episode import ActionDecoder, run_episode
 from kerv_cli.lab.policy import batch_decoder_for, clock_for, decoder_for
-from kerv_cli.lab.together import Ended, Wanted, run_together
+from kerv_cli.lab.together import EpisodeEnd, Request, run_together
 from kerv_cli.methods.compose import own_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.camera import CameraConfig
@@ -51,7 +51,7 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
 
 
 def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """As `open_world`, but a world of its own, which whoever asked for it closes."""
+    """A new world for a task, which the caller closes; see `open_world`."""
     return _stressed(spec_of(task).open_world(task, camera_config(settings.camera), settings.horizon), stress)
 
 
@@ -119,7 +119,7 @@ class Watched:
         self.decoder.finish(success)
 
 
-def run_batch(settings: RolloutSettings, wanted: Iterable[Wanted[K]]) -> Iterator[Ended[K]]:
+def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
     """Runs episodes of one setting on any tasks, `rollout.batch` at a time; see `run_together`. None is recorded.
 
     Raises:
@@ -129,7 +129,7 @@ def run_batch(settings: RolloutSettings, wanted: Iterable[Wanted[K]]) -> Iterato
     def opened(task: str) -> World:
         return new_world(task, settings.world, build_stress(settings.world.stress))
 
-    return run_together(batch_decoder_for(settings), wanted, settings.rollout.batch, opened)
+    return run_together(batch_decoder_for(settings), requests, settings.rollout.batch, opened)
 
 
 def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
@@ -151,10 +151,10 @@ def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings
     """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to,
     autoregressively or in parallel, TOGETHER at a time."""
     decoder = BatchDecoder(own_decoder(target))
-    wanted = [Wanted(None, task, seed) for task in tasks for seed in seeds]
+    requests = [Request(None, task, seed) for task in tasks for seed in seeds]
     outcomes = []
-    for ended in run_together(decoder, wanted, TOGETHER, lambda task: new_world(task, settings)):
-        if isinstance(ended.result, Exception):
-            raise ended.result
-        outcomes.append(ended.result.success)
+    for end in run_together(decoder, requests, TOGETHER, lambda task: new_world(task, settings)):
+        if isinstance(end.result, Exception):
+            raise end.result
+        outcomes.append(end.result.success)
     return float(np.mean(outcomes))

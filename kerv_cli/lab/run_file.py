@@ -68,10 +68,10 @@ def interrupted_since(folder: Path, arguments: list[str]) -> str:
 def sweep_command(folder: Path, name: str, *further: str) -> str:
     """The command that runs the study in this folder, as it was typed last; without a record, by its name. further:
     overrides to add."""
-    swept = (command.arguments for command in reversed(invocations(folder)) if command.arguments[:1] == ("sweep",))
-    words = next(swept, ("sweep", f"study={name}"))
-    kept = [word for word in words if not word.startswith(("results=", "rerun=", "-"))]
-    return shlex.join(["kerv", *kept, *further])
+    sweeps = (command.arguments for command in reversed(invocations(folder)) if command.arguments[:1] == ("sweep",))
+    words = list(next(sweeps, ("sweep", f"study={name}")))
+    words = [word for word in words if not word.startswith(("results=", "rerun=", "-"))]
+    return shlex.join(["kerv", *words, *further])
 
 
 def _write(folder: Path, commands: tuple[Invocation, ...]) -> None:

@@ -209,25 +209,25 @@ class StudyStore:
         Raises:
             StorageError: the disk refused.
         """
-        places = (self.damaged / (name if not i else f"{name}-{i}") for i in range(10_000))
-        place = next(path for path in places if not path.exists())
-        with storage_errors(place):
+        paths = (self.damaged / (name if not i else f"{name}-{i}") for i in range(10_000))
+        path = next(path for path in paths if not path.exists())
+        with storage_errors(path):
             self.damaged.mkdir(exist_ok=True)
-            os.rename(self.cells / name, place)
+            os.rename(self.cells / name, path)
             sync(self.damaged)
-        return place
+        return path
 
     def damages(self) -> list[tuple[str, DamagedCell]]:
         """Name of every cell that is not what was written -> why; one of a newer kerv is not among them."""
-        found = []
+        damages = []
         for folder in self.folders():
             try:
                 self.status_of(folder.name)
             except DamagedCell as error:
-                found.append((folder.name, error))
+                damages.append((folder.name, error))
             except CheckpointError:
                 continue
-        return found
+        return damages
 
     def write_cell(
         self,
@@ -299,7 +299,7 @@ class StudyStore:
         Raises:
             CheckpointError: it is absent or damaged, or of a newer kerv.
         """
-        return _stored([self._read(name)])[0]
+        return _with_frames([self._read(name)])[0]
 
     def _read(self, name: str) -> _ReadCell:
         """A complete cell as it lies in its files; raises as `read_cell`."""
@@ -323,16 +323,16 @@ class StudyStore:
             UsageError: not one is complete; the message names what to run.
         """
         unique = list({cell.id: cell for cell in cells}.values())
-        there = [cell for cell in unique if (self.cells / cell.id).exists()]
-        if not there:
+        on_disk = [cell for cell in unique if (self.cells / cell.id).exists()]
+        if not on_disk:
             raise UsageError(f"study '{self.name}' has no complete cell: {self.how_to_run()}")
-        found: dict[str, StoredCell] = {}
-        for first in range(0, len(there), _READ_TOGETHER):
-            read = [self._read_as(cell) for cell in there[first : first + _READ_TOGETHER]]
-            found |= {stored.id: stored for stored in _stored(read)}
-            del read
+        results: dict[str, StoredCell] = {}
+        for first in range(0, len(on_disk), _READ_TOGETHER):
+            part = [self._read_as(cell) for cell in on_disk[first : first + _READ_TOGETHER]]
+            results |= {result.id: result for result in _with_frames(part)}
+            del part
             pa.default_memory_pool().release_unused()
-        return found, [cell for cell in unique if cell.id not in found]
+        return results, [cell for cell in unique if cell.id not in results]
 
     def _read_as(self, cell: Cell) -> _ReadCell:
         """A complete cell that is the result of `cell`.
@@ -386,7 +386,7 @@ def _read_entry(text: str) -> dict[str, Any]:
 
 
 def _interned(status: Mapping[str, Any]) -> dict[str, Any]:
-    """The same entries; texts that thousands of cells share stand in memory once."""
+    """The entries with interned texts: one that thousands of cells share is in memory once."""
     return {sys.intern(key): sys.intern(value) if isinstance(value, str) else value for key, value in status.items()}
 
 
@@ -413,8 +413,8 @@ def with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     """
     if table.schema.equals(schema):
         return table
-    there, names = set(table.column_names), list(schema.names)
-    for field in (field for field in schema if field.name not in there):
+    present, names = set(table.column_names), list(schema.names)
+    for field in (field for field in schema if field.name not in present):
         table = table.append_column(field, pa.nulls(table.num_rows, field.type))
     further = [name for name in table.column_names if name not in set(names)]
     table = table.select([*names, *further])
@@ -428,7 +428,7 @@ def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
     return dict(zip(seeds[starts].tolist(), np.split(seconds, starts[1:]), strict=True))
 
 
-def _stored(cells: Sequence[_ReadCell]) -> list[StoredCell]:
+def _with_frames(cells: Sequence[_ReadCell]) -> list[StoredCell]:
     """The cells with their episodes as data frames, converted all at once."""
     whole = pa.concat_tables([cell.episodes for cell in cells], promote_options="default").to_pandas()
     try:

@@ -40,8 +40,8 @@ def check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     if timing.clock != REAL:
         return
     if timing.latency == PROFILE or (timing.ar_ms and timing.latency != CONSTANT):
-        asked = "rollout.latency=profile" if timing.latency == PROFILE else f"rollout.ar_ms={timing.ar_ms:g}"
-        raise UsageError(f"policy=expert with {asked}: it has no forwards; use rollout.latency=constant or measured")
+        override = "rollout.latency=profile" if timing.latency == PROFILE else f"rollout.ar_ms={timing.ar_ms:g}"
+        raise UsageError(f"policy=expert with {override}: it has no forwards; use rollout.latency=constant or measured")
     _check_chunk(timing, spec, 1)
 
 
@@ -49,7 +49,7 @@ def check_method(settings: RolloutSettings, spec: EnvironmentSpec, target: Targe
     """Refuses a profile that does not know what the method does, and a latency that leaves nothing of a chunk.
 
     Raises:
-        UsageError: as said.
+        UsageError: the profile lacks a phase of the method, the target measures no AR, or all of a chunk is stale.
     """
     timing = settings.rollout
     if timing.clock != REAL:
@@ -98,17 +98,17 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
         UsageError: a profile that is missing, impossible, or lacks a phase that the method needs.
     """
     timing = settings.rollout
-    wanted = timing.ar_ms / 1000.0
+    ar_seconds = timing.ar_ms / 1000.0
     if timing.latency == CONSTANT:
         return latency.Constant(timing.latency_ms / 1000.0)
     if timing.latency == MEASURED:
-        return latency.Measured(wanted / measured if wanted else 1.0)
+        return latency.Measured(ar_seconds / measured if ar_seconds else 1.0)
     assert target is not None
     drafter = latency.DRAFTER if "drafter" in needs(settings.parts()) else ()
     profile = latency.open_profile(settings.results, timing.profile, (*latency.FORWARDS, *drafter))
-    if not wanted:
+    if not ar_seconds:
         return latency.Profiled(profile)
     whole = profile.decode((settings.chunk or target.chunk) * target.actions.dofs)
     if not whole:
         raise UsageError(f"rollout.profile={timing.profile}: AR takes no time in it: nothing can be in proportion")
-    return latency.Profiled(profile, wanted / whole)
+    return latency.Profiled(profile, ar_seconds / whole)

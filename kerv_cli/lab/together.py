@@ -1,6 +1,6 @@
 """Runs several episodes at once in one process: each in a world of its own, all of them decoded together.
 
-As soon as an episode ends the next one begins in its place, so that the batch stays full until the last ones.
+As soon as an episode ends the next one begins in its slot, so that the batch stays full until the last ones.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OpenWorld = Callable[[str], World]
 
 
 @dataclass(frozen=True)
-class Wanted(Generic[K]):
+class Request(Generic[K]):
     """An episode to run. key: whose it is, for the caller."""
 
     key: K
@@ -33,78 +33,78 @@ class Wanted(Generic[K]):
 
 
 @dataclass(frozen=True)
-class Ended(Generic[K]):
-    """An episode that was run. result: its record, or the error that its world raised. The record's wall_seconds are
+class EpisodeEnd(Generic[K]):
+    """The end of an episode. result: its record, or the error that its world raised. The record's wall_seconds are
     its share of the time: that of a decode is divided by the episodes that were decoded together."""
 
-    wanted: Wanted[K]
+    request: Request[K]
     result: EpisodeRecord | Exception
 
 
 def run_together(
-    decoder: BatchDecoder, wanted: Iterable[Wanted[K]], batch: int, open_world: OpenWorld
-) -> Iterator[Ended[K]]:
+    decoder: BatchDecoder, requests: Iterable[Request[K]], batch: int, open_world: OpenWorld
+) -> Iterator[EpisodeEnd[K]]:
     """Runs the episodes, at most `batch` at a time, and yields each as it ends.
 
-    A world is opened when an episode needs one and closed when its task has no episode left: the places of a batch go
+    A world is opened when an episode needs one and closed when its task has no episode left: the slots of a batch go
     to different tasks as long as there are enough of them, because a world costs more than a reset.
     """
-    waiting = _Waiting(wanted)
-    places: list[_Place[K]] = [_Place(decoder.lane(), open_world) for _ in range(min(batch, waiting.count))]
+    queue = _Queue(requests)
+    slots: list[_Slot[K]] = [_Slot(decoder.lane(), open_world) for _ in range(min(batch, queue.count))]
     try:
         while True:
-            for place in places:
-                while place.asked is None and waiting.count:
-                    yield from place.begin(waiting.take(place.task))
-                if place.asked is None:
-                    place.close()
-            live = [place for place in places if place.asked is not None]
+            for slot in slots:
+                while slot.request is None and queue.count:
+                    yield from slot.begin(queue.take(slot.task))
+                if slot.request is None:
+                    slot.close()
+            live = [slot for slot in slots if slot.request is not None]
             if not live:
                 return
             began = time.perf_counter()
-            decodes = decoder.decode([place.lane for place in live], [place.observation for place in live])
+            decodes = decoder.decode([slot.lane for slot in live], [slot.observation for slot in live])
             share = (time.perf_counter() - began) / len(live)
-            for place, decode in zip(live, decodes, strict=True):
-                place.seconds += share
-                yield from place.go_on(decode)
+            for slot, decode in zip(live, decodes, strict=True):
+                slot.seconds += share
+                yield from slot.go_on(decode)
     finally:
-        for place in places:
-            place.close()
+        for slot in slots:
+            slot.close()
 
 
-class _Waiting(Generic[K]):
+class _Queue(Generic[K]):
     """Episodes that have not begun, by task."""
 
-    def __init__(self, wanted: Iterable[Wanted[K]]) -> None:
-        self.by_task: OrderedDict[str, deque[Wanted[K]]] = OrderedDict()
-        for one in wanted:
-            self.by_task.setdefault(one.task, deque()).append(one)
+    def __init__(self, requests: Iterable[Request[K]]) -> None:
+        self.by_task: OrderedDict[str, deque[Request[K]]] = OrderedDict()
+        for request in requests:
+            self.by_task.setdefault(request.task, deque()).append(request)
         self.count = sum(map(len, self.by_task.values()))
 
-    def take(self, task: str) -> Wanted[K]:
-        """The next one of this task; where it has none, of the task with the most left."""
+    def take(self, task: str) -> Request[K]:
+        """The next request of this task; where it has none, of the task with the most."""
         if not self.by_task.get(task):
             task = max(self.by_task, key=lambda name: len(self.by_task[name]))
         self.count -= 1
         return self.by_task[task].popleft()
 
 
-class _Place(Generic[K]):
-    """A place of the batch: the world that is open in it and the episode that runs there. seconds: that it took."""
+class _Slot(Generic[K]):
+    """A slot of the batch: its open world and the episode that runs in it. seconds: time of that episode so far."""
 
     def __init__(self, lane: Lane, open_world: OpenWorld) -> None:
         self.lane, self.open_world = lane, open_world
         self.task, self.seconds = "", 0.0
         self.world: World | None = None
-        self.asked: Wanted[K] | None = None
+        self.request: Request[K] | None = None
         self.steps: Generator[Observation, DecodeRecord, EpisodeRecord] | None = None
 
-    def begin(self, wanted: Wanted[K]) -> Iterator[Ended[K]]:
+    def begin(self, request: Request[K]) -> Iterator[EpisodeEnd[K]]:
         """Begins an episode; yields it where it ends at once."""
-        self.asked, self.seconds = wanted, 0.0
+        self.request, self.seconds = request, 0.0
         yield from self._timed(self._first)
 
-    def go_on(self, decode: DecodeRecord) -> Iterator[Ended[K]]:
+    def go_on(self, decode: DecodeRecord) -> Iterator[EpisodeEnd[K]]:
         """Executes a decode; yields the episode where it has ended."""
         yield from self._timed(lambda: self._steps().send(decode))
 
@@ -115,22 +115,22 @@ class _Place(Generic[K]):
         self.world, self.task = None, ""
 
     def _first(self) -> Observation:
-        assert self.asked is not None
-        if self.task != self.asked.task:
+        assert self.request is not None
+        if self.task != self.request.task:
             self.close()
-            self.world, self.task = self.open_world(self.asked.task), self.asked.task
+            self.world, self.task = self.open_world(self.request.task), self.request.task
         assert self.world is not None
-        self.steps = episode(self.world, self.lane, self.asked.seed)
+        self.steps = episode(self.world, self.lane, self.request.seed)
         return next(self.steps)
 
     def _steps(self) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
         assert self.steps is not None
         return self.steps
 
-    def _timed(self, step: Callable[[], Observation]) -> Iterator[Ended[K]]:
+    def _timed(self, step: Callable[[], Observation]) -> Iterator[EpisodeEnd[K]]:
         """Runs the episode on to its next observation, or yields its end."""
-        began, asked = time.perf_counter(), self.asked
-        assert asked is not None
+        began, request = time.perf_counter(), self.request
+        assert request is not None
         try:
             self.observation = step()
             self.seconds += time.perf_counter() - began
@@ -141,5 +141,5 @@ class _Place(Generic[K]):
         except Exception as error:  # noqa: BLE001 - one world's failure of any kind must not end the others
             result = error
             self.close()
-        self.asked = self.steps = None
-        yield Ended(asked, result)
+        self.request = self.steps = None
+        yield EpisodeEnd(request, result)
