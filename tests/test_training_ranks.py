@@ -168,5 +168,5 @@ def test_a_recording_may_show_further_views_than_the_target_sees(camera: str, ac
     if accepted:
         assert TargetActs.of("results", "mt10-vision", SPEC, settings).sha256
     else:
-        with pytest.raises(UsageError, match=r"or begin with corner4\+"):
+        with pytest.raises(UsageError, match="or join further views behind it"):
             TargetActs.of("results", "mt10-vision", SPEC, settings)

@@ -97,8 +97,8 @@ class TargetActs:
         camera = spec.camera_name(world.camera.name)
         if views and not f"{camera}+".startswith(f"{views[0]}+"):
             raise UsageError(
-                f"policy.target={name} sees {views[0]}, the recording would show {camera}: world.camera.name must be "
-                f"{views[0]}, or begin with {views[0]}+"
+                f"policy.target={name} sees {views[0]}, the recording would show {camera}: set "
+                f"world.camera.name={views[0]}, or join further views behind it"
             )
         return cls(folder, description.sha256)
 
