@@ -97,6 +97,16 @@ def test_another_study_runs_only_what_it_does_not_share(store: StudyStore) -> No
     assert len(table_of(other)) == 3
 
 
+def test_a_cell_that_is_damaged_in_another_study_runs_here(store: StudyStore) -> None:
+    cells = threshold_study(["reach-v3"])
+    swept(store, cells)
+    (store.cells / cells[0].id / "decodes.parquet").write_bytes(b"torn")
+    other = StudyStore(store.root.parent.parent, "other")
+    swept(other, cells)
+    assert other.damages() == []
+    assert table_of(other)["episodes"].tolist() == [4, 4, 4, 4]
+
+
 def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(store: StudyStore) -> None:
     swept(store, threshold_study(["reach-v3"], radii=(3,)))
     swept(store, threshold_study(["reach-v3"], radii=(3, 9)))

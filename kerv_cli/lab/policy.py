@@ -20,6 +20,7 @@ from kerv_cli.lab import timing
 from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
+from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import check as check_method
 from kerv_cli.methods.compose import check_batch, compose, needs
@@ -30,8 +31,6 @@ from kerv_cli.worlds.stress import check as check_stress
 WARM_UP_DECODES = 6
 CALIBRATION_DECODES = 15
 """Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
-OBSERVATION = "observation"
-"""Key of the identity's only entry that is not a hash: what the target observes. The target's hash determines it."""
 
 
 def artifacts_of(settings: RolloutSettings) -> Artifacts:

@@ -259,17 +259,18 @@ def _weights(kind: str, cell: Cell) -> str:
 
 
 def take_over(store: StudyStore, covered: Covered) -> None:
-    """Copies the cells that other studies hold into `store`.
+    """Copies the cells that other studies hold into `store`. One that is damaged there is left out, and so runs here.
 
     Raises:
         StorageError: the disk refused.
     """
     for name, source in covered.sources.items():
-        _copy(source, store, name)
+        with contextlib.suppress(CheckpointError):
+            source.status_of(name)
+            _copy(source, store, name)
 
 
 def _copy(source: StudyStore, store: StudyStore, name: str) -> None:
-    source.status_of(name)  # a damaged cell is not spread
     write_folder(
         store.cells / name, lambda temporary: shutil.copytree(source.cells / name, temporary, dirs_exist_ok=True)
     )
