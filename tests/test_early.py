@@ -119,10 +119,8 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("is_intel", [True, False])
 @pytest.mark.parametrize("history", [0, 2])
-def test_packed_weights_give_the_same_logits(history: int, is_intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("kerv_cli.targets.compact.kernels.is_intel", lambda: is_intel)
+def test_packed_weights_give_the_same_logits(history: int) -> None:
     torch.manual_seed(0)
     early = drafter(DrafterSettings(kind="early", layers=2, width=24, rank=6, history=history))
     for parameter in early.parameters():  # fresh blocks begin as the identity, with gains of one

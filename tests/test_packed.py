@@ -244,13 +244,23 @@ def test_what_trains_is_not_packed_and_gets_its_gradients() -> None:
     assert close(x.grad, twin.grad)
 
 
-@pytest.mark.parametrize("intel", [True, False])
-def test_one_row_on_either_processor(intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernels, "is_intel", lambda: intel)
+def test_one_row_goes_through_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
     weight, x, other = torch.randn(24, 16), torch.randn(16), torch.randn(24)
     fast = FastLinear(weight)
     products, plain = [], kernels.row_product
     monkeypatch.setattr(kernels, "row_product", lambda *both: products.append(both) or plain(*both))
     torch.testing.assert_close(fast.of_vector(x, 0.5), 0.5 * (weight @ x))
     torch.testing.assert_close(fast.added_to_vector(other, x), other + weight @ x)
-    assert len(products) == (0 if intel else 2)
+    assert len(products) == 2
+
+
+def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
+    plain, packed = both_trunks(3, 2, 2, 8)
+    x, seen = torch.randn(1, 6, 16), np.array([[True, False, True, True]])
+    outputs = []
+    with torch.inference_mode():
+        for trunk in (plain, packed):
+            cache = trunk.new_cache(1, 6)
+            trunk(x[:, :5], torch.arange(5), cache)
+            outputs.append(trunk(x[:, 5:], torch.tensor([4]), cache, seen))
+    assert close(*outputs)

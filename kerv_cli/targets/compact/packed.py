@@ -1,9 +1,9 @@
 """Packed weights: a second form of a frozen float32 policy's weights for speed on a CPU, made by `pack`.
 
-They are the same numbers in other layouts (oneDNN's blocked one, which halves the time of 30 tokens; input-major for a
-single token), with linear factors folded together: a norm's gain or a temperature into the weights behind it. At these
-widths half of a one-token forward is the overhead of calls, the other half reading the weights: so a layer has as few
-calls and copies as possible.
+They are the same numbers in other layouts (oneDNN's blocked one halves the time of 30 tokens; one token goes through
+numpy, `row_step.py`), with linear factors folded together: a norm's gain or a temperature into the weights behind it.
+At these widths half of a one-token forward was the overhead of calls, the other half reading the weights: so a layer
+has as few calls and copies as possible.
 
 Packed weights are not part of the module's state: copying, pickling, moving, loading weights or training drops them,
 and the module computes without them.
@@ -27,6 +27,7 @@ from kerv_cli.targets.compact.features import hand_features, saturating_columns,
 from kerv_cli.targets.compact.kernels import FastConv, FastLinear, RowNorm, gain_of, has_blocked_layouts
 from kerv_cli.targets.compact.packable import Packable, Packed
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
+from kerv_cli.targets.compact.row_step import RowLayer, RowLayers
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, PackedStack
 from kerv_cli.targets.compact.vision import VisionEncoder
@@ -93,8 +94,6 @@ class PackedLayer:
     def __call__(self, x: Tensor, turn: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
         """x (B, T, E); turn (T, 3 A C / 2); cache (2, B, A, capacity, C), valid up to `start`; mask (T, start + T)."""
         batch, tokens, width = x.shape
-        if batch * tokens == 1:
-            return self.step(x, turn, cache, start, mask)
         rows = x.reshape(-1, width)
         qkv = self.qkv(self.norm(rows))
         qkv.view(torch.complex64).view(batch, tokens, -1).mul_(turn)
@@ -119,20 +118,6 @@ class PackedLayer:
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal)
         return attended.transpose(1, 2).reshape(batch * tokens, self.width)
 
-    def step(self, x: Tensor, turn: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
-        """`__call__` for one token of one sequence, computed as a vector."""
-        row = x.reshape(self.width)
-        qkv = self.qkv.of_vector(row, self.norm.of_vector(row))
-        qkv.view(torch.complex64).mul_(turn.view(-1))
-        q, k, v = heads = qkv.view(3, 1, self.heads, 1, self.channels)
-        if cache is not None:
-            cache.narrow(3, start, 1).copy_(heads[1:])
-            k, v = cache.narrow(3, 0, start + 1)
-        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        row = self.out.added_to_vector(row, attended.view(self.width))
-        gate, up = self.gate_up.of_vector(row, self.norm.of_vector(row)).view(2, -1)
-        return self.down.added_to_vector(row, F.silu(gate).mul_(up)).view(1, 1, self.width)
-
 
 class PackedLayers(PackedStack):
     """Packed weights of a stack's layers and its final norm. Keys in its caches have neighbouring channel pairs."""
@@ -145,10 +130,15 @@ class PackedLayers(PackedStack):
         turns = torch.cat([turn.repeat(1, 2 * stack.heads), torch.ones_like(turn).repeat(1, stack.heads)], -1)
         self.turns = torch.view_as_real(turns).flatten(1)
         self.layers = [PackedLayer(layer) for layer in stack.layers]  # type: ignore[arg-type]
+        rows = [RowLayer(layer.qkv, layer.out, layer.gate_up, layer.down) for layer in self.layers]
+        qk = self.turns[:, : 2 * stack.width].contiguous()
         self.rows, self.gain = RowNorm(stack.norm), gain_of(stack.norm)
+        self.one_row = RowLayers(rows, qk, stack.heads, self.rows.width_eps)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
         """All layers: x (B, T, E) -> hidden states (B, T, E), before the norm."""
+        if cache is not None and x.shape[0] * x.shape[1] == 1:
+            return self.one_row(x.view(-1), int(positions), cache, mask).view(1, 1, -1)
         turn = self.turns.index_select(0, positions).view(torch.complex64)
         start = cache.length if cache is not None else 0
         for i, layer in enumerate(self.layers):
@@ -157,6 +147,8 @@ class PackedLayers(PackedStack):
 
     def norm(self, x: Tensor) -> Tensor:
         """The final RMSNorm with its gain."""
+        if x.shape[0] * x.shape[1] == 1:
+            return self.one_row.norm(x.view(-1), self.gain).view(1, 1, -1)
         return self.rows(x).mul_(self.gain)
 
 
