@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -66,7 +67,17 @@ class BatchDecoder:
     @torch.inference_mode()
     def decode(self, lanes: Sequence[Lane], observations: Sequence[Observation]) -> list[DecodeRecord]:
         """One observation of each lane -> its actions and their record."""
-        chunks = [self._chunk(prompt, lane) for prompt, lane in zip(self._prompts(observations), lanes, strict=True)]
+        prompts: list[Tensor] = []
+
+        def encode(i: int) -> Tensor:  # the first that asks has all of them encoded
+            prompts.extend(() if prompts else self._prompts(observations))
+            return prompts[i]
+
+        steps, space, cache = self.decoder.steps, self.target.actions, self.decoder.cache
+        chunks = [
+            Chunk(partial(encode, i), steps, space, cache, lane.situation, self.limits, observation=observations[i])
+            for i, lane in enumerate(lanes)
+        ]
         self._complete(chunks)
         records = [self._record(chunk) for chunk in chunks]
         samples = []
@@ -86,19 +97,14 @@ class BatchDecoder:
             return [self.target.encode(observation) for observation in observations]
         return list(together(observations).split(1))
 
-    def _chunk(self, prompt: Tensor, lane: Lane) -> Chunk:
-        steps, actions = self.decoder.steps, self.target.actions
-        return Chunk(prompt, steps, actions, self.decoder.cache, lane.situation, self.limits)
-
     def _complete(self, chunks: Sequence[Chunk]) -> None:
         """Commits all tokens of every chunk; prompts of one length run together, so that none is padded."""
+        if isinstance(self.skip, TakesMany):
+            self.skip.take_many(chunks, self._cache)
+            return
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
             group = [chunk for chunk in chunks if chunk.prompt_length == length]
-            prompt = torch.cat([chunk.prompt for chunk in group])
-            if isinstance(self.skip, TakesMany):
-                self.skip.take_many(group, prompt, self._cache)
-            else:
-                _one_by_one(group, self._tokens(prompt))
+            _one_by_one(group, self._tokens(torch.cat([chunk.prompt for chunk in group])))
 
     def _tokens(self, prompt: Tensor) -> list[list[int]]:
         """prompt (B, P, E) -> the N tokens of each row, decoded one by one."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.protocol import Cache
 from kerv_cli.engine.record import PARALLEL, PHASES, Round, Trust
@@ -107,22 +107,26 @@ class Choice:
 class Chunk:
     """The N tokens of one decode. Only its own methods change what is committed; the parts of a method read it.
 
-    prompt: (1, P, E). size: N. limits: r per DoF in bins; early drafters choose their tokens by it. choice: which side
-    drafts, where a boundary decides. The cache holds the prompt and every committed token but the
-    last; `hidden` (1, P + c − 1, E) are the target's states there after the prefill, which committed c tokens.
+    prompt: (1, P, E), encoded when it is first read: a chunk that nothing of the target's decodes costs no encoding.
+    observation: what is decoded, where there is one. size: N. limits: r per DoF in bins; early drafters choose their
+    tokens by it. choice: which side drafts, where a boundary decides. The cache holds the prompt and every committed
+    token but the last; `hidden` (1, P + c − 1, E) are the target's states there after the prefill, which committed c
+    tokens.
     """
 
     def __init__(
         self,
-        prompt: Tensor,
+        prompt: Tensor | Callable[[], Tensor],
         steps: int,
         space: ActionSpace,
         cache: Cache,
         situation: Situation,
         limits: tuple[int, ...] = (),
         choice: Choice | None = None,
+        observation: Observation | None = None,
     ) -> None:
-        self.prompt, self.space, self.cache, self.situation = prompt, space, cache, situation
+        self._prompt, self.space, self.cache, self.situation = prompt, space, cache, situation
+        self.observation = observation
         self.size, self.limits, self.choice = steps * space.dofs, limits, choice
         self.tokens: list[int] = []
         self.rounds: list[Round] = []
@@ -145,6 +149,18 @@ class Chunk:
     def steps(self) -> int:
         """H, control steps."""
         return self.size // self.dofs
+
+    @property
+    def prompt(self) -> Tensor:
+        """(1, P, E)."""
+        if not isinstance(self._prompt, Tensor):
+            self._prompt = self._prompt()
+        return self._prompt
+
+    @property
+    def encoded(self) -> bool:
+        """Whether the target encoded the observation."""
+        return isinstance(self._prompt, Tensor)
 
     @property
     def prompt_length(self) -> int:

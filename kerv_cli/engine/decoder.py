@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,9 +110,14 @@ class Decoder:
     def decode(self, observation: Observation) -> DecodeRecord:
         """The chunk's actions and the record of its decode."""
         clock = Clock(self.target.device)
-        prompt = self.target.encode(observation)
-        clock.lap("vision")
-        chunk = self.decode_prompt(prompt, clock)
+
+        def encode() -> Tensor:
+            clock.lap("propose")  # whoever asks first drafts from it
+            prompt = self.target.encode(observation)
+            clock.lap("vision")
+            return prompt
+
+        chunk = self.decode_prompt(encode, clock, observation)
         actions, predicted = self.actions_of(chunk)
         self.threshold.update(chunk.variability)
         if self.parts.rectifier is not None:
@@ -129,14 +134,21 @@ class Decoder:
         return space.unnormalise(chunk.closed).astype(np.float32), predicted
 
     @torch.inference_mode()
-    def decode_prompt(self, prompt: Tensor, clock: Clock | None = None) -> Chunk:
-        """prompt (1, P, E) -> a complete chunk, or one that the rectifier closed."""
-        clock, parts = clock or Clock(prompt.device), self.parts
+    def decode_prompt(
+        self,
+        prompt: Tensor | Callable[[], Tensor],
+        clock: Clock | None = None,
+        observation: Observation | None = None,
+    ) -> Chunk:
+        """prompt (1, P, E), or what encodes it -> a complete chunk, or one that the rectifier closed. observation: for
+        drafts that look at it themselves."""
+        clock, parts = clock or Clock(self.target.device), self.parts
         choice = None
         if parts.boundary is not None:
             choice = parts.boundary.choose(np.array(self.situation.path), self.situation.random)
         limits = self.acceptance.limits(self.threshold.radius())
-        chunk = Chunk(prompt, self.steps, self.target.actions, self.cache, self.situation, limits, choice)
+        space = self.target.actions
+        chunk = Chunk(prompt, self.steps, space, self.cache, self.situation, limits, choice, observation)
         clock.lap("propose")
         if parts.skip is not None:
             skipped = parts.skip.take(chunk)
@@ -158,7 +170,7 @@ class Decoder:
 
     def prefill(self, chunk: Chunk, clock: Clock) -> None:
         """The first forward: the prompt and, where there is an in-prefill draft, the draft behind it, to verify it."""
-        prompt, target, parts, length = chunk.prompt, self.target, self.parts, chunk.prompt_length
+        target, parts = self.target, self.parts
         draft: TokenTree | Unread = EMPTY
         if parts.prefill_draft is not None and chunk.size > 1:
             # one token less than the chunk has, as in a round: the bonus is its last token
@@ -166,7 +178,8 @@ class Decoder:
             clock.lap("propose")
         if parts.proposer is not None and chunk.size > 1 and isinstance(parts.proposer, Asks):
             parts.proposer.ask(chunk)
-        x = prompt
+        x = prompt = chunk.prompt
+        length = chunk.prompt_length
         if len(draft):
             tokens = draft.tokens if isinstance(draft, Unread) else upload(draft.tokens, prompt.device)
             x = torch.cat([prompt, target.embed(tokens[None])], 1)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     import numpy as np
-    from torch import Tensor
 
     from kerv_cli.engine.chunk import Choice, Chunk
     from kerv_cli.engine.protocol import Cache
@@ -98,5 +97,5 @@ class Skip(ABC):
 class TakesMany(Protocol):
     """A skip rule that can take the chunks of several episodes together."""
 
-    def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
-        """Completes B chunks whose prompts are the rows of prompt (B, P, E). cache: rows -> an empty one."""
+    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
+        """Completes B chunks. cache: rows -> an empty one."""

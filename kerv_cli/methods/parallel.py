@@ -9,8 +9,6 @@ from kerv_cli.base.registry import add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.protocol import Cache, ParallelTarget
     from kerv_cli.methods.context import Context
@@ -37,8 +35,11 @@ class ParallelPass(Skip):
         chunk.commit_at_once(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist())
         return True
 
-    def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
-        """Commits the tokens of several chunks after one pass over prompt (B, P, E)."""
+    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
+        """Commits the tokens of several chunks, whose prompts are equally long, after one pass."""
+        import torch
+
+        prompt = torch.cat([chunk.prompt for chunk in chunks])
         hidden = self.target.parallel_pass(prompt, cache(len(chunks)))
         rows = self.target.head(hidden[:, : chunks[0].size]).argmax(-1).tolist()
         for chunk, tokens in zip(chunks, rows, strict=True):

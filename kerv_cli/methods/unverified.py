@@ -9,8 +9,6 @@ from kerv_cli.base.registry import add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.proposer import DraftsChunks
     from kerv_cli.engine.protocol import Cache
@@ -37,10 +35,10 @@ class AlwaysSkip(Skip):
         chunk.skip(chains[0], self.source.name)
         return True
 
-    def take_many(self, chunks: Sequence[Chunk], prompt: Tensor, cache: Callable[[int], Cache]) -> None:
-        """Fills chunks with the drafts of one pass over prompt (B, P, E), where the source is an `EarlyProposer`."""
+    def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
+        """Fills chunks with the drafts of one pass, where the source is an `EarlyProposer`."""
         source: Any = self.source
-        for chunk, tokens in zip(chunks, source.tokens_of(chunks, prompt), strict=True):
+        for chunk, tokens in zip(chunks, source.tokens_of(chunks), strict=True):
             chunk.skip(tokens, self.source.name)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -27,6 +28,16 @@ from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 64  # observations that the target decodes at once
 RADII = {"strict": 0, "r3": 3, "r9": 9}
+
+
+class Decoded(Protocol):
+    """Samples with the target's tokens (n, N) and whether their episodes were perturbed (n,)."""
+
+    @property
+    def tokens(self) -> Tensor: ...
+
+    @property
+    def perturbed(self) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -169,7 +180,7 @@ def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> 
     return ((drafts - teacher).abs() <= limit).long().cumprod(1).sum(1)
 
 
-def measure(logits: Tensor, samples: EarlySamples, strict: Tensor) -> Metrics:
+def measure(logits: Tensor, samples: Decoded, strict: Tensor) -> Metrics:
     """logits (n, N, V), strict (N,) bool -> accepted tokens of N and the share of chunks accepted whole, at every
     radius; token accuracy."""
     kinds = [mask for mask in (samples.perturbed, ~samples.perturbed) if mask.any()]

@@ -262,8 +262,12 @@ class EarlyProposer(ChainProposer):
             self._drafted = chunk, self.early.drafted(*self._inputs(chunk))
         return self._drafted[1]
 
+    def features(self, chunk: Chunk) -> Tensor:
+        """What the network reads of the chunk's observation, (1, F): the pooled prompt."""
+        return self.target.pooled(chunk.prompt)
+
     def _inputs(self, chunk: Chunk) -> tuple[Tensor, np.ndarray, int]:
-        return self.target.pooled(chunk.prompt), chunk.situation.history.values(), max(chunk.limits, default=0)
+        return self.features(chunk), chunk.situation.history.values(), max(chunk.limits, default=0)
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
         """The draft on the device, (N + 1,) as `EarlyDrafter.on_device`; None where the host has it. Who
@@ -293,16 +297,17 @@ class EarlyProposer(ChainProposer):
 
     def distance(self, chunk: Chunk) -> float:
         """How far the observation is from those that the drafter was trained on; see `EarlyDrafter.distance`."""
-        return self.early.distance(self.target.pooled(chunk.prompt))
+        return self.early.distance(self.features(chunk))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """The drafted tokens behind the committed ones."""
         return [self.drafted(chunk).tokens[len(chunk.tokens) : chunk.size][:depth]]
 
-    def tokens_of(self, chunks: Sequence[Chunk], prompt: Tensor) -> list[list[int]]:
-        """The drafts of B chunks whose prompts are the rows of prompt (B, P, E), and whose limits are equal."""
+    def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
+        """The drafts of B chunks whose limits are equal."""
         histories = [chunk.situation.history.values() for chunk in chunks]
-        return self.early.tokens_of(self.target.pooled(prompt), histories, max(chunks[0].limits, default=0))
+        features = torch.cat([self.features(chunk) for chunk in chunks])
+        return self.early.tokens_of(features, histories, max(chunks[0].limits, default=0))
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether the estimate that the whole chunk is accepted reaches SURE."""

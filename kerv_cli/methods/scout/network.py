@@ -1,0 +1,77 @@
+"""The scout's network: a stem and positions of its own, then the early drafter's network (docs/methods.md §5.2).
+
+It reads the image, the hand and the instruction, and nothing that the target computes: so a chunk that is executed
+unverified costs no encoding of the target's, and what goes wrong in one view need not go wrong in the other.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.methods.early.drafter import EarlyDrafter
+from kerv_cli.methods.scout import ScoutSettings
+from kerv_cli.targets.compact.features import hand_features, scene_features, scene_width
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.vision import VisionEncoder
+
+
+class Scout(nn.Module):
+    """From one observation to the logits (N, V) of a chunk. Shapes: B batch, p proprioception, K places, W words."""
+
+    centre: Tensor
+
+    def __init__(
+        self,
+        settings: ScoutSettings,
+        actions: ActionSpace,
+        observation: ObservationSpace,
+        chunk: int,
+        views: int,
+        size: int,
+        words: int,
+    ) -> None:
+        """chunk: H. views, size: of the camera's frame, pixels. words: of the target's vocabulary."""
+        super().__init__()
+        s = self.settings = settings
+        self.observation, self.size = observation, size
+        self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
+        self.stems = nn.ModuleList(
+            VisionEncoder(size, s.grid, s.keypoints, s.channels, s.cell_width, single=True) for _ in range(views)
+        )
+        self.cells = nn.Linear(s.cell_width, s.cell_features)
+        self.words = nn.Embedding(words, s.word_width)
+        felt, places = len(observation.proprioception), len(observation.places)
+        self.locate = nn.Sequential(
+            nn.Linear(2 * s.keypoints * views + felt + s.word_width, 128),
+            nn.SiLU(),
+            nn.Linear(128, 64),
+            nn.SiLU(),
+            nn.Linear(64, 3 * places),
+        )
+        seen = (s.cell_width + s.grid**2 * s.cell_features) * views
+        self.drafter = EarlyDrafter(s, actions, chunk, seen + s.word_width + scene_width(observation))
+
+    @classmethod
+    def beside(cls, settings: ScoutSettings, target: CompactTarget) -> Scout:
+        """A fresh scout for the target's spaces, H, camera and vocabulary."""
+        shape = len(target.encoders), target.settings.image_size, target.words.size
+        return cls(settings, target.actions, target.observation, target.chunk, *shape)
+
+    def see(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """What the drafter's network reads (B, F), and the estimated positions of the places (B, K, 3), metres."""
+        assert inputs.images is not None
+        felt, words = inputs.proprioception, self.words(inputs.words).mean(1)
+        views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
+        seen = [part for cells, _ in views for part in (cells.mean(1), self.cells(cells).flatten(1))]
+        points = [points for _, points in views]
+        located = self.locate(torch.cat([*points, hand_features(felt, self.centre), words], -1))
+        places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
+        scene = scene_features(felt, places, self.centre)
+        return torch.cat([*seen, words, scene], -1), places
+
+    def forward(self, inputs: Inputs, history: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Observations, history (B, h, D) normalised, valid (B, h) -> logits (B, N, V), positions (B, K, 3)."""
+        features, places = self.see(inputs)
+        return self.drafter(features, history, valid), places

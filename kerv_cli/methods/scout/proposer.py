@@ -1,0 +1,35 @@
+"""Drafts of the scout (docs/methods.md §5.2): those of its early drafter's network, from what its own eyes see."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.early.drafter import EarlyProposer
+from kerv_cli.methods.scout.network import Scout
+from kerv_cli.targets.compact.target import CompactTarget
+
+
+class ScoutProposer(EarlyProposer):
+    """The scout's chunk, drafted once per observation, without the target's encoder."""
+
+    name = "scout"
+
+    def __init__(self, scout: Scout, target: CompactTarget) -> None:
+        super().__init__(scout.drafter, target)
+        self.scout, self.inputs = scout, target.inputs
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> ScoutProposer:
+        """proposer=scout."""
+        return cls(context.artifact("scout"), context.target)
+
+    @torch.inference_mode()
+    def features(self, chunk: Chunk) -> Tensor:
+        """What the network reads of the chunk's observation, (1, F)."""
+        assert chunk.observation is not None
+        return self.scout.see(self.inputs(chunk.observation))[0]

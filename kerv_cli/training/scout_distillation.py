@@ -1,0 +1,93 @@
+"""Training a scout on the frozen target's greedy decodes and on the positions that it estimates (docs/methods.md §5.2).
+
+Nothing privileged is read: neither the expert's actions nor the simulator's positions, only what the target says of an
+observation. The first `scene_steps` train the stem and its positions alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.base.settings import DrafterSettings, TrainSettings
+from kerv_cli.methods.scout.network import Scout
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.distillation import greedy
+from kerv_cli.training.early_distillation import BATCH, EarlyObservations, measure, observations
+from kerv_cli.training.imitation import position_loss, soft_labels, token_loss
+from kerv_cli.training.loop import Metrics
+from kerv_cli.worlds.demos.dataset import DemoDataset
+
+
+@dataclass(frozen=True)
+class ScoutSamples(EarlyObservations):
+    """Observations, and what the target says of them."""
+
+    tokens: Tensor  # (n, N) int64
+    places: Tensor  # (n, K, 3) float32, metres
+
+
+@torch.inference_mode()
+def teach_scout(
+    target: CompactTarget, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
+) -> ScoutSamples:
+    """The target's decodes and positions for about `settings.samples` observations, spread evenly over all episodes.
+
+    Raises:
+        CheckpointError: a demonstration's frames are not of the size that the target takes.
+    """
+    stride = int(dataset.manifest.config["frame_stride"])
+    share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
+    parts: list[ScoutSamples] = []
+    for index in range(len(dataset.episodes)):
+        rows = observations(target, dataset.load(index), index, share, settings.history)
+        tokens, places = [], []
+        for indices in torch.arange(len(rows)).split(BATCH):
+            prompt, located = target.encode_batch(rows.inputs(indices, target.device))
+            tokens.append(greedy(target, prompt)[0].cpu())
+            places.append(located.float().cpu())
+        parts.append(ScoutSamples(**vars(rows), tokens=torch.cat(tokens), places=torch.cat(places)))
+        on_progress(index + 1, len(dataset.episodes))
+    return ScoutSamples.joined(parts)
+
+
+class ScoutDistillation:
+    """Loss and validation of one run. The target's tokens are the labels; neighbouring bins share probability."""
+
+    def __init__(self, scout: Scout, training: ScoutSamples, held_out: ScoutSamples, train: TrainSettings) -> None:
+        self.scout, self.training, self.held_out, self.train = scout, training, held_out, train
+        self.device = scout.centre.device
+        self.labels = soft_labels(scout.drafter.actions.tokens, train.label_sigma).to(self.device)
+
+    def outputs(self, scout: Scout, samples: ScoutSamples, indices: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (B, N, V) and positions (B, K, 3) for the samples at `indices` (B,)."""
+        past = (samples.history[indices].to(self.device), samples.known[indices].to(self.device))
+        logits, places = scout(samples.inputs(indices, self.device), *past)
+        return logits, places
+
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Cross-entropy with the softened tokens and the weighted position loss at `indices` (B,)."""
+        labels = self.training.places[indices].to(self.device)
+        if step < self.train.scene_steps:
+            loss = position_loss(self.scout.see(self.training.inputs(indices, self.device))[1], labels)
+            return loss, {"position_loss": float(loss.detach())}
+        logits, places = self.outputs(self.scout, self.training, indices)
+        token = token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
+        position = position_loss(places, labels)
+        metrics = {"token_loss": float(token.detach()), "position_loss": float(position.detach())}
+        return token + self.train.scene_weight * position, metrics
+
+    @torch.no_grad()
+    def validate(self, module: nn.Module) -> Metrics:
+        """Drafts and positions of the held-out observations; plain and perturbed episodes count alike."""
+        assert isinstance(module, Scout)
+        batches = torch.arange(len(self.held_out)).split(256)
+        drafts, places = zip(*(self.outputs(module, self.held_out, i) for i in batches), strict=True)
+        metrics = measure(torch.cat(drafts).cpu(), self.held_out, module.drafter.strict.cpu())
+        error = (torch.cat(places).cpu() - self.held_out.places).norm(dim=-1).median(0).values
+        names = [place.name.replace(" ", "_") for place in module.observation.places]
+        metrics |= {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
+        return {"score": metrics["accepted_r9"] + metrics["accepted_strict"], **metrics}
