@@ -15,6 +15,7 @@ class StreakSkipSettings:
 
     kind: str = "streak"
     most: int = number(8, 1)  # decodes in a row without a verification
+    opening: int = number(0, 0)  # decodes that an episode begins with, unverified
     tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
 
 

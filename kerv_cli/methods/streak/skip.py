@@ -17,7 +17,8 @@ from kerv_cli.methods.streak import StreakSkipSettings
 class StreakSkip(Skip):
     """Executes drafts unverified for as long as verification keeps agreeing (§4.5): a chunk whose draft agrees with the
     target's tokens allows one unverified decode before the next verification, the next one in a row two, then four, up
-    to `most`; a chunk that does not agree ends it. An episode begins with a verification."""
+    to `most`; a chunk that does not agree ends it. An episode begins with a verification, or with `opening` unverified
+    decodes."""
 
     def __init__(self, settings: StreakSkipSettings, source: DraftsChunks) -> None:
         self.settings, self.source = settings, source
@@ -31,8 +32,8 @@ class StreakSkip(Skip):
         return cls(settings, first_source(context.built["prefill_draft"]))
 
     def begin(self, task: str, seed: int) -> None:
-        """An episode begins, with a verification."""
-        self.allowed = self.left = 0
+        """An episode begins."""
+        self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> bool:
         """Fills the chunk with the source's draft while unverified decodes are left -> whether it did."""
