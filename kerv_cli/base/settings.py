@@ -458,6 +458,7 @@ class BuildTargetSettings(RunSettings):
     camera: str = ""  # name of the image it is shown; empty: the environment's first camera, else primary
     prompt: str = "openvla"  # openvla | openvla_v01
     crop: bool = False  # show the central 90 %: for checkpoints fine-tuned with augmented images (LIBERO's)
+    libero: bool = False  # before that a JPEG round trip and Lanczos, as OpenVLA's own evaluation on LIBERO does
     int8: bool = False  # the language model's layers with one byte per weight
     prompt_tokens: int = number(64, 1, 65_536)  # longest prompt, without the vision tokens
 

@@ -53,6 +53,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         files=shards.sizes(),
         prompt=settings.prompt,
         crop=settings.crop,
+        libero=settings.libero,
         int8=settings.int8,
         prompt_tokens=settings.prompt_tokens,
         image_size=shape.towers[0].image,
@@ -72,6 +73,8 @@ def _description(
 ) -> dict[str, Any]:
     """The contents of target.json, but for the provenance."""
     computed = {"prompt": settings.prompt, "crop": settings.crop, "int8": settings.int8}
+    if settings.libero:  # hashes of older targets lack it
+        computed["libero"] = True
     observation = spec.observation if spec else SEES_NOTHING_ELSE
     return {
         "format": FORMAT,
