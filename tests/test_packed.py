@@ -6,6 +6,7 @@ import copy
 import pickle
 
 import numpy as np
+import plain_decoder
 import pytest
 import torch
 from hypothesis import given, settings
@@ -264,3 +265,8 @@ def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
             trunk(x[:, :5], torch.arange(5), cache)
             outputs.append(trunk(x[:, 5:], torch.tensor([4]), cache, seen))
     assert close(*outputs)
+
+
+def test_a_plain_decoder_in_numpy_gives_the_shipped_policys_tokens(capsys: pytest.CaptureFixture[str]) -> None:
+    assert plain_decoder.main("mt10-vision", 3)
+    assert "ratio" in capsys.readouterr().out
