@@ -305,8 +305,7 @@ def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from kerv_cli.lab.catalogue import find_run
-from kerv_cli.lab.removal import remove
+from kerv_cli.lab.catalogue import find_run, remove
 
 left = int(sys.argv[3])
 

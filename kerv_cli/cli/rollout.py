@@ -53,7 +53,7 @@ def rollout(
 
     from kerv_cli.base.config import to_yaml
     from kerv_cli.base.places import check_writable
-    from kerv_cli.lab.effects import without_effect
+    from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
     from kerv_cli.worlds import resolve_tasks
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import fnmatch
+import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -13,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_json, sha256_of, visible
-from kerv_cli.base.leftovers import clean
+from kerv_cli.base.files import read_json, sha256_of, storage_errors, sync, visible
+from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
+from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, unique_cells
 from kerv_cli.lab.run_file import invocations
@@ -280,3 +283,28 @@ def disk_bytes(folder: Path) -> int:
 
 def _files(folder: Path) -> Iterator[Path]:
     return (path for path in folder.rglob("*") if path.is_file())
+
+
+def check_removable(run: RunEntry) -> None:
+    """Raises UsageError: the folder is a link, or a process computes cells of the run at the moment."""
+    if run.folder.is_symlink():
+        raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
+    if not run.has_episodes or run.state == "damaged":
+        return
+    store = store_of(run)
+    if any(is_claimed(store.claims, cell) for cell in store.read_plan().cells):
+        raise UsageError(f"{run.id} is running: stop it first")
+
+
+def remove(run: RunEntry) -> None:
+    """Removes the run's folder: first it gets a temporary's name, which no command reads and which the next one that
+    looks there cleans away if this process is killed before it is done.
+
+    Raises:
+        StorageError: the disk refused; the run is as it was.
+    """
+    gone = temporary_beside(run.folder)
+    with storage_errors(run.folder):
+        run.folder.rename(gone)
+        sync(run.folder.parent)
+    shutil.rmtree(gone, ignore_errors=True)

@@ -14,7 +14,7 @@ from kerv_cli.base.files import read_yaml
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
-from kerv_cli.lab.effects import without_effect
+from kerv_cli.lab.identity import without_effect
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 EPISODES_PER_CELL = 1
