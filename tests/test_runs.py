@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
 from kerv_cli.lab.catalogue import find_runs, matching
-from kerv_cli.lab.cells import CellRunner
+from kerv_cli.lab.run import CellRunner
 from kerv_cli.report.export import TRACKERS, export
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]

@@ -22,7 +22,6 @@ from kerv_cli.base.places import shipped_dir
 from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, unique_cells
-from kerv_cli.lab.run_file import invocations
 from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, stores
 
 SWEEP, ROLLOUT = "sweep", "rollout"
@@ -136,7 +135,7 @@ def store_of(run: RunEntry) -> StudyStore:
 
 def _study(store: StudyStore) -> RunEntry:
     kind = SWEEP if store.family == STUDIES else ROLLOUT
-    typed = invocations(store.root)
+    typed = store.commands()
     name = store.name
     try:
         cells = unique_cells(store.read_plan().cells)

@@ -1,7 +1,7 @@
 """The results folder of a study. A cell is either complete or absent.
 
 results/studies/<name>/, results/rollouts/<run>/
-    run.json                      the commands that ran it; see run_file.py
+    run.json                      the commands that ran it, as they were typed
     plan.yaml                     what was asked for
     cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
     failures/<id>.txt             traceback of the last attempt, until one succeeds
@@ -17,9 +17,12 @@ import hashlib
 import json
 import os
 import re
+import secrets
+import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -39,21 +42,23 @@ from kerv_cli.base.files import (
     to_yaml,
     visible,
     write_folder,
+    write_json,
 )
 from kerv_cli.base.leftovers import clean
 from kerv_cli.base.limits import check_name
+from kerv_cli.base.manifests import read
+from kerv_cli.base.provenance import git_commit
 from kerv_cli.base.settings import StudySettings
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab import rows
 from kerv_cli.lab.claims import write_lock
 from kerv_cli.lab.identity import work_of
-from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+from kerv_cli.lab.plan import Cell, StudyPlan, merge_plans, plan_from_text, plan_text
 from kerv_cli.lab.rows import Circumstances
-from kerv_cli.lab.run_file import sweep_command
 
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
+_MOST_NAME = 32  # letters of the methods in a rollout's name
 _READ_TOGETHER = 100  # cells whose columns are converted at once: many tables of a few rows take much memory
 _DECODE_TIMES = pa.schema([rows.DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
@@ -84,6 +89,25 @@ class StoredCell:
         return self.episodes[self.episodes["seed"].isin(cell.seeds)]
 
 
+@dataclass(frozen=True)
+class Invocation:
+    """One command that ran cells of a run. arguments: behind `kerv`. started, finished: ISO 8601, UTC; the second is
+    empty where it was interrupted or failed. git_commit: of kerv."""
+
+    arguments: tuple[str, ...]
+    started: str
+    git_commit: str
+    finished: str = ""
+
+
+@dataclass(frozen=True)
+class _RunFile:
+    """Contents of run.json, the oldest command first."""
+
+    commands: tuple[Invocation, ...]
+    format: int = 1
+
+
 FORMAT = 1
 """Of a cell's files. A cell of a higher one is of a newer kerv and is left alone."""
 
@@ -104,6 +128,7 @@ class StudyStore:
         self.cells = self.root / "cells"
         self.rollouts = self.root / "rollouts"
         self.plan_path = self.root / "plan.yaml"
+        self.run_path = self.root / "run.json"
         self.failures = self.root / "failures"
         self.damaged = self.root / "damaged"  # cells that were set aside
         self.claims = self.root / "claims"
@@ -145,8 +170,44 @@ class StudyStore:
     def how_to_run(self) -> str:
         """The command that runs this study, for messages."""
         if self.family == STUDIES:
-            return f"run `{sweep_command(self.root, self.name)}`"
+            return f"run `{self.sweep_command()}`"
         return f"run `kerv runs rerun {self.name}`"
+
+    def commands(self) -> tuple[Invocation, ...]:
+        """The commands in run.json, the oldest first; none where it is missing or damaged."""
+        with contextlib.suppress(CheckpointError):
+            return read(_RunFile, read_json(self.run_path), str(self.run_path), tolerant=True).commands
+        return ()
+
+    def note_command(self, arguments: Sequence[str]) -> None:
+        """Appends a command that begins now to run.json. Raises StorageError: the disk refused."""
+        self._write_commands(*self.commands(), Invocation(tuple(arguments), _now(), git_commit()))
+
+    def note_finished(self) -> None:
+        """Notes that the last command came to its end. Raises StorageError: the disk refused."""
+        *before, last = self.commands()
+        self._write_commands(*before, replace(last, finished=_now()))
+
+    def _write_commands(self, *commands: Invocation) -> None:
+        write_json(self.run_path, asdict(_RunFile(commands)))
+
+    def interrupted_since(self, arguments: Sequence[str]) -> str:
+        """When the command was begun that this one goes on with: the same arguments, never finished. Empty where there
+        is none."""
+        since = ""
+        for command in reversed(self.commands()):
+            if command.arguments != tuple(arguments) or command.finished:
+                break
+            since = command.started
+        return since
+
+    def sweep_command(self, *further: str) -> str:
+        """The command that runs the study, as it was typed last; without a record, by its name. further: overrides to
+        add."""
+        sweeps = (command.arguments for command in reversed(self.commands()) if command.arguments[:1] == ("sweep",))
+        words = next(sweeps, ("sweep", f"study={self.name}"))
+        kept = (word for word in words if not word.startswith(("results=", "rerun=", "-")))
+        return shlex.join(["kerv", *kept, *further])
 
     def has_cell(self, name: str) -> bool:
         """Whether the cell is complete; its files are compared with their hashes.
@@ -442,6 +503,10 @@ def _with_frames(cells: Sequence[_ReadCell]) -> list[StoredCell]:
     ]
 
 
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
 def _seal(status: Mapping[str, Any]) -> str:
     """Hash of all entries of a status but its own."""
     text = json.dumps({key: value for key, value in status.items() if key != "sha256"}, sort_keys=True)
@@ -472,3 +537,11 @@ def begun_studies(results: Path | str) -> list[str]:
             if any((store.cells / cell.id).exists() for cell in store.read_plan().cells):
                 names.append(store.name)
     return names
+
+
+def new_rollout(results: str | Path, cells: Sequence[Cell]) -> StudyStore:
+    """The folder of a new rollout, not yet created, by date, time and methods: `20260301-142530-ar-spec_vla`."""
+    methods = "-".join(dict.fromkeys(str(cell.settings["method"]) for cell in cells))
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
+    store = StudyStore(results, name, ROLLOUTS)
+    return StudyStore(results, f"{name}-{secrets.token_hex(2)}", ROLLOUTS) if store.root.exists() else store

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Generator, Hashable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -18,7 +18,7 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.lab.episode import episode
 from kerv_cli.worlds.spec import World
 
-K = TypeVar("K", bound=Hashable)
+K = TypeVar("K")
 OpenWorld = Callable[[str], World]
 """Task -> a new world."""
 
