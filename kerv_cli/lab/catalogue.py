@@ -233,7 +233,8 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
 def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
     if not (folder / "log.csv").is_file():
         return "complete"  # copied or imported: it has no log
-    rows = _log(folder)
+    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
     steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
     return "complete" if step >= steps else f"step {step:.0f} of {steps}"
 
@@ -263,11 +264,6 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     return {kind: names.get(value, value[:12]) for kind, value in run.made_from.items()}
 
 
-def _log(folder: Path) -> list[dict[str, str]]:
-    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def _changed(path: Path) -> str:
     try:
         return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")[:19]
@@ -277,11 +273,7 @@ def _changed(path: Path) -> str:
 
 def disk_bytes(folder: Path) -> int:
     """Size of everything below a folder."""
-    return sum(path.stat().st_size for path in _files(folder))
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    return (path for path in folder.rglob("*") if path.is_file())
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def check_removable(run: RunEntry) -> None:

@@ -14,7 +14,7 @@ import secrets
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -68,6 +68,10 @@ class CellResult:
     reused: bool = False  # another sweep completed it meanwhile
     trace: str = ""
     storage: bool = False  # the disk refused the cell: no other cell could be written either
+
+
+Results = dict[str, CellResult]
+"""Ends of a block's cells by id."""
 
 
 def failed(error: BaseException) -> CellResult:
@@ -137,7 +141,7 @@ class _Sweep:
         }
         self.waiting: deque[Block] = deque()
         self.elsewhere: list[Block] = []  # another sweep computes them
-        self.running: dict[Future[Any], BlockRun] = {}
+        self.running: dict[Future[Results | None], BlockRun] = {}
 
     def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
         """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
@@ -159,7 +163,11 @@ class _Sweep:
         try:
             while self.waiting or self.running or self.elsewhere:
                 while self.waiting and len(self.running) < executor.slots:
-                    self._start(self.waiting.popleft(), executor)
+                    block = self.waiting.popleft()
+                    name = f"{self.run_id}-{secrets.token_hex(4)}"
+                    attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
+                    self.on_event(events.BlockStarted(block))
+                    self.running[executor.submit(attempt)] = attempt
                 for future in wait(self.running, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done:
                     self._settle(self.running.pop(future), future)
                 self._look_elsewhere()
@@ -169,13 +177,7 @@ class _Sweep:
             for attempt in self.running.values():
                 release(self.store.claims, attempt.block.cells, attempt.name)
 
-    def _start(self, block: Block, executor: Executor) -> None:
-        name = f"{self.run_id}-{secrets.token_hex(4)}"
-        attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
-        self.on_event(events.BlockStarted(block))
-        self.running[executor.submit(attempt)] = attempt
-
-    def _settle(self, attempt: BlockRun, future: Future[dict[str, CellResult] | None]) -> None:
+    def _settle(self, attempt: BlockRun, future: Future[Results | None]) -> None:
         block = attempt.block
         try:
             results = future.result()
@@ -191,7 +193,7 @@ class _Sweep:
         else:
             self._note_all(block, results)
 
-    def _note_all(self, block: Block, results: Mapping[str, CellResult]) -> None:
+    def _note_all(self, block: Block, results: Results) -> None:
         for cell in block.cells:
             if cell.id in results:
                 self.note(cell, results[cell.id])
@@ -218,12 +220,12 @@ class _Sweep:
         """When nothing else is left to do, queues the blocks that no other sweep computes any more."""
         if self.waiting or self.running or not self.elsewhere:
             return
-        claimed = [any(is_claimed(self.store.claims, cell) for cell in block.cells) for block in self.elsewhere]
-        if all(claimed):
+        blocks, self.elsewhere = self.elsewhere, []
+        for block in blocks:
+            theirs = any(is_claimed(self.store.claims, cell) for cell in block.cells)
+            (self.elsewhere if theirs else self.waiting).append(block)
+        if not self.waiting:
             time.sleep(_POLL_SECONDS)
-            return
-        self.waiting.extend(block for block, theirs in zip(self.elsewhere, claimed, strict=True) if not theirs)
-        self.elsewhere = [block for block, theirs in zip(self.elsewhere, claimed, strict=True) if theirs]
 
     def note(self, cell: Cell, result: CellResult) -> None:
         """Adds a cell's result to the outcome and emits its event."""
@@ -257,7 +259,7 @@ class BlockRun:
     gauge: Gauge | None = None
     status: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(self) -> dict[str, CellResult] | None:
+    def __call__(self) -> Results | None:
         """Results by cell id; None where another sweep computes one of the cells: nothing was run then."""
         try:
             if not claim(self.store.claims, self.block.cells, self.run, self.name):
@@ -269,7 +271,7 @@ class BlockRun:
         finally:
             release(self.store.claims, self.block.cells, self.name)
 
-    def _take_turns(self) -> dict[str, CellResult]:
+    def _take_turns(self) -> Results:
         turns = [_Turn(cell, self) for cell in self.block.cells]
         results = {turn.cell.id: result for turn in turns if (result := turn.prepare()) is not None}
         order = 0
@@ -285,7 +287,7 @@ class BlockRun:
                         return results
         return results
 
-    def _together(self) -> dict[str, CellResult]:
+    def _together(self) -> Results:
         """Runs the cells of a batch; a cell is written as soon as its last episode has ended."""
         turns = {cell.id: _Turn(cell, self) for cell in self.block.cells if not self.store.has_cell(cell.id)}
         results = {cell.id: CellResult(reused=True) for cell in self.block.cells if cell.id not in turns}

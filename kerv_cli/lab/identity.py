@@ -30,6 +30,9 @@ ENGINE = 1
 """Which tokens the code gives. Raised by hand in a change that alters tokens or actions, and in no other:
 tests/test_golden.py holds both."""
 
+Plain = Mapping[str, Any]
+"""RolloutSettings as nested plain values: those of a cell, as they are stored."""
+
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
 
@@ -47,7 +50,7 @@ _JUDGED = ("acceptance", "threshold", "rectifier")
 _ARTIFACTS = ("drafter", "early", "datastore", "calibration")
 
 
-def hash_of(value: Any) -> str:
+def hash_of(value: object) -> str:
     """First 16 hex digits of the SHA-256 of canonical JSON.
 
     Raises:
@@ -57,13 +60,13 @@ def hash_of(value: Any) -> str:
     return hashlib.sha256(_canonical(value).encode("ascii")).hexdigest()[:16]
 
 
-def _canonical(value: Any) -> str:
+def _canonical(value: object) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
-def work_of(settings: Mapping[str, Any], identity: Identity, engine: int = ENGINE) -> str:
-    """Hash of what determines the results of a setting, apart from task, seeds and repeat. settings: plain
-    RolloutSettings, of this kerv or an older one. engine: version that computes them."""
+def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
+    """Hash of what determines the results of a setting, of this kerv or an older one, apart from task, seeds and
+    repeat. engine: version that computes them."""
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
     policy = settings.get("policy", {}).get("kind", MODEL)
     return _work(_canonical(determining), _canonical(dict(identity)), policy, engine)
@@ -76,7 +79,7 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
     return hash_of({"settings": effective(plain), "policy": {"kind": policy, **hashes}, "engine": engine})
 
 
-def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
+def effective(settings: Plain) -> dict[str, Any]:
     """The settings that determine a result: complete, without those that have no effect."""
     determining = without(settings, NOT_DETERMINING)
     try:
@@ -92,7 +95,7 @@ def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
     return determining
 
 
-def _filled(stored: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
+def _filled(stored: Plain, complete: Plain) -> dict[str, Any]:
     """Stored values and, where an older file has none, the defaults of today; keys that are unknown today stay."""
     values = {**complete, **stored}
     for key, value in values.items():
@@ -107,33 +110,33 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
     settings.pop(path[-1], None)
 
 
-def complete_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Stored plain RolloutSettings with today's defaults where an older kerv had no such setting."""
+def complete_settings(settings: Plain) -> dict[str, Any]:
+    """Stored settings with today's defaults where an older kerv had no such setting."""
     try:
         return _filled(settings, as_plain(settings_from(settings, tolerant=True)))
     except KervError:
         return dict(settings)
 
 
-def depends_on_order(settings: Mapping[str, Any]) -> bool:
+def depends_on_order(settings: Plain) -> bool:
     """Whether an episode's result depends on the episodes before it in its cell: a skip level that feedback moves."""
     skip = settings.get("skip", {})
     return bool(skip.get("up") or skip.get("down"))
 
 
-def stress_of(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Kind and level of the stress in plain RolloutSettings; `none` where nothing is shifted."""
+def stress_of(settings: Plain) -> dict[str, Any]:
+    """Kind and level of a setting's stress; `none` where nothing is shifted."""
     stress = settings["world"].get("stress", {})
     level = int(stress.get("level", 0))
     return {"kind": stress["kind"] if level else "none", "level": level}
 
 
-def batch_of(settings: Mapping[str, Any]) -> int:
-    """Episodes that run at the same time in plain RolloutSettings; with more than one they have no times."""
+def batch_of(settings: Plain) -> int:
+    """Episodes that a setting runs at the same time; with more than one they have no times."""
     return int(settings.get("rollout", {}).get("batch", 1))
 
 
-def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
     """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}."""
     pairs: dict[str, Any] = {}
     for key, value in settings.items():
@@ -141,7 +144,7 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return pairs
 
 
-def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
     """The settings without those keys."""
     return {key: value for key, value in settings.items() if key not in names}
 

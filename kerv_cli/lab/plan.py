@@ -18,7 +18,7 @@ from kerv_cli.base.files import read_yaml, to_yaml
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings
-from kerv_cli.lab.identity import Identity, batch_of, complete_settings, hash_of, without, work_of
+from kerv_cli.lab.identity import Identity, Plain, batch_of, complete_settings, hash_of, without, work_of
 
 MOST_CELLS = 100_000
 """Cells of a study; more are refused before they are planned."""
@@ -116,7 +116,7 @@ class Block:
 def make_cell(
     label: str,
     overrides: str,
-    settings: Mapping[str, Any],
+    settings: Plain,
     identity: Identity,
     task: str,
     seeds: Sequence[int],
@@ -186,9 +186,9 @@ def blocks_of(cells: Iterable[Cell], workers: int = 1) -> list[Block]:
     """The cells grouped by task, seeds, repeat and threads (a process has one number of them), in the order of their
     first cells; each id once. Those of a batch are grouped by setting, into as many blocks as there are workers or
     more."""
-    groups: dict[tuple[Any, ...], list[Cell]] = {}
+    groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in unique_cells(cells):
-        key: tuple[Any, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
+        key: tuple[object, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
         if batch_of(cell.settings) > 1:
             key = (json.dumps([without(cell.settings, {"task"}), cell.identity], sort_keys=True), cell.repeat)
         groups.setdefault(key, []).append(cell)

@@ -53,19 +53,14 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     if is_expert(settings):
         tasks = resolve_tasks(settings.task)
         experts = spec_of(tasks[0]).experts
-        ours = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
-        return {"target": "", **({"expert": ours} if ours else {}), OBSERVATION: "state (privileged)"}
+        hashes = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
+        return {"target": "", **({"expert": hashes} if hashes else {}), OBSERVATION: "state (privileged)"}
     profile = clock.profile_identity(settings)
     artifacts = artifacts_of(settings)
-    shown = shown_to(artifacts.description.settings)
-    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: shown}
-
-
-def shown_to(target: Mapping[str, object]) -> str:
-    """The observation of a target with these settings, `vision` or `state (privileged)`; every row has it, so that a
-    privileged policy is recognised."""
-    kind = str(target.get(OBSERVATION, "vision"))
-    return "state (privileged)" if kind == "state" else kind
+    # every row of a table has it, so that a privileged policy is recognised
+    observation = str(artifacts.description.settings.get(OBSERVATION, "vision"))
+    observation = "state (privileged)" if observation == "state" else observation
+    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: observation}
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:

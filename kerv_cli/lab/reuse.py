@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
 from kerv_cli.lab.code import code_hash
-from kerv_cli.lab.identity import ENGINE, OBSERVATION, depends_on_order, effective, flat, work_of
-from kerv_cli.lab.plan import Cell, blocks_of
+from kerv_cli.lab.identity import ENGINE, OBSERVATION, Identity, Plain, depends_on_order, effective, flat, work_of
+from kerv_cli.lab.plan import Cell, blocks_of, unique_cells
 from kerv_cli.lab.store import ROLLOUTS, StudyStore, new_rollout, stores, studies_of
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
@@ -33,8 +33,8 @@ class StockEntry:
     task: str
     repeat: int
     seeds: tuple[int, ...]
-    settings: Mapping[str, Any]
-    identity: Mapping[str, str]
+    settings: Plain
+    identity: Identity
     started: str
     run: str
     engine: int
@@ -240,17 +240,12 @@ def _differences(entry: StockEntry, cell: Cell) -> str:
         for kind in dict.fromkeys([*cell.identity, *entry.identity])
         if kind != OBSERVATION and cell.identity.get(kind) != entry.identity.get(kind)
     ]
-    changes += [f"{_weights(kind, cell)} changed" for kind in weights]
+    names = {"target": f"weights of {cell.settings['policy']['target']}"}
+    changes += [f"{names.get(kind, kind)} changed" for kind in weights]
     old, new = flat(effective(entry.settings)), flat(effective(cell.settings))
     keys = [key for key in dict.fromkeys([*new, *old]) if old.get(key) != new.get(key)]
     changes += [f"{key} {old.get(key)} → {new.get(key)}" for key in keys]
     return ", ".join(changes[:3]) or "new setting"
-
-
-def _weights(kind: str, cell: Cell) -> str:
-    if kind == "target":
-        return f"weights of {cell.settings['policy']['target']}"
-    return kind
 
 
 def take_over(store: StudyStore, covered: Covered) -> None:
@@ -262,13 +257,8 @@ def take_over(store: StudyStore, covered: Covered) -> None:
     for name, source in covered.sources.items():
         with contextlib.suppress(CheckpointError):
             source.status_of(name)
-            _copy(source, store, name)
-
-
-def _copy(source: StudyStore, store: StudyStore, name: str) -> None:
-    write_folder(
-        store.cells / name, lambda temporary: shutil.copytree(source.cells / name, temporary, dirs_exist_ok=True)
-    )
+            copy = functools.partial(shutil.copytree, source.cells / name, dirs_exist_ok=True)
+            write_folder(store.cells / name, copy)
 
 
 def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
@@ -330,21 +320,19 @@ def estimate(covered: Covered, store: StudyStore, workers: int, prior_seconds: f
     Raises:
         CheckpointError: a complete cell cannot be read.
     """
-    every_cell = [cell for block in blocks_of(covered.cells) for cell in block.cells]
-    seconds: dict[str, float] = {}
-    episodes: dict[str, int] = {}
-    todo: list[Cell] = []
-    for cell in every_cell:
+    seconds: Counter[str] = Counter()
+    episodes: Counter[str] = Counter()
+    cells = unique_cells(covered.cells)
+    to_run = [cell for cell in cells if cell.id in covered.reasons]
+    for cell in cells:
         if cell.id not in covered.reasons:
             _, status = covered.sources.get(cell.id, store).described(cell.id)
-            seconds[cell.label] = seconds.get(cell.label, 0.0) + status["wall_seconds"]
-            episodes[cell.label] = episodes.get(cell.label, 0) + status["episodes"]
-        else:
-            todo.append(cell)
-    stored = sum(episodes.values())
-    prior = sum(seconds.values()) / stored if stored else prior_seconds
+            seconds[cell.label] += status["wall_seconds"]
+            episodes[cell.label] += status["episodes"]
+    stored = episodes.total()
+    prior = seconds.total() / stored if stored else prior_seconds
     means = {label: seconds[label] / count for label, count in episodes.items()}
-    total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in todo)
+    total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in to_run)
     source = f"measured on {stored} stored episodes" if stored else f"a guess of {prior_seconds:g} s per episode"
-    at_once = max(1, min(workers, len(blocks_of(todo, workers))))
-    return TimeEstimate(total / at_once, len(todo), len(every_cell) - len(todo), source)
+    at_once = max(1, min(workers, len(blocks_of(to_run, workers))))
+    return TimeEstimate(total / at_once, len(to_run), len(cells) - len(to_run), source)

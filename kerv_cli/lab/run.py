@@ -143,9 +143,6 @@ def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings
     return float(np.mean(outcomes))
 
 
-_TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
-
-
 OnCellStep = Callable[[Cell, int, int], None]
 """Told the cell, the seed and the number of control steps executed, after each of them."""
 
@@ -215,6 +212,9 @@ def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
 def _runner(settings: str, task: str) -> Runner:
     """The process's runner of these settings (JSON) on a task."""
     return Runner(settings_from(json.loads(settings)), task)
+
+
+_TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
 
 
 def reference_decode(device: str) -> float:
