@@ -32,10 +32,9 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab import run
-from kerv_cli.lab.block import RunEpisode
-from kerv_cli.lab.cells import CellRunner
-from kerv_cli.lab.execute import execute
+from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.plan import Cell, blocks_of, make_cell
+from kerv_cli.lab.run import CellRunner
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.together import Request, run_together
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer

@@ -19,10 +19,9 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.block import RunEpisode
 from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.events import CellDone, Event
-from kerv_cli.lab.execute import execute
+from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import Cell
 from kerv_cli.lab.store import StudyStore

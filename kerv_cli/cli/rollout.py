@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from kerv_cli.engine.record import EpisodeRecord
-    from kerv_cli.lab.cells import CellRunner
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
+    from kerv_cli.lab.run import CellRunner
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.tables import StudyData
 
@@ -53,7 +53,7 @@ def rollout(
 
     from kerv_cli.base.config import to_yaml
     from kerv_cli.base.places import check_writable
-    from kerv_cli.lab.effects import without_effect
+    from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
     from kerv_cli.worlds import resolve_tasks
 
@@ -137,18 +137,16 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     from kerv_cli.base.errors import Interrupted
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab import events
-    from kerv_cli.lab.cells import CellRunner, reference_decode
     from kerv_cli.lab.execute import execute
     from kerv_cli.lab.reuse import begin
-    from kerv_cli.lab.run import close_worlds
-    from kerv_cli.lab.run_file import note_invocation
+    from kerv_cli.lab.run import CellRunner, close_worlds, reference_decode
     from kerv_cli.report.viewing import save_recording
 
     store, cells, done = begin(results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
     store.write_plan(resolved.study, cells)
-    note_invocation(store.root, arguments)
+    store.note_command(arguments)
     runtime = next(iter(resolved.settings.values())).runtime
     with ProgressDisplay(console(stderr=True)) as display:
 

@@ -225,8 +225,7 @@ def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None
 @edge
 def rm(overrides: Words = None, yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
-    from kerv_cli.lab.catalogue import disk_bytes, find_run
-    from kerv_cli.lab.removal import check_removable, remove
+    from kerv_cli.lab.catalogue import check_removable, disk_bytes, find_run, remove
 
     names, results = _split(overrides, 1)
     runs = [find_run(results, name, exact=yes) for name in names]

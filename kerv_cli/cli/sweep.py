@@ -60,12 +60,11 @@ def sweep(
     check_writable(first.results)
     cells = planned_cells(resolved)
     from kerv_cli.lab.reuse import Stock, cover, disagreements
-    from kerv_cli.lab.run_file import interrupted_since
     from kerv_cli.lab.store import StudyStore
 
     store = StudyStore(first.results, resolved.study.name)
     stock = Stock(store)
-    covered = cover(cells, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
+    covered = cover(cells, stock, resolved.rerun, store.interrupted_since(["sweep", *words]))
     _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
     if plan:
         _print_plan(covered, store, first.runtime.workers, as_json)
@@ -84,8 +83,8 @@ def _warn(lines: Iterable[str]) -> None:
 
 
 def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
-    from kerv_cli.lab.estimate import estimate
     from kerv_cli.lab.plan import seeds_text
+    from kerv_cli.lab.reuse import estimate
 
     by_label: dict[str, list[Cell]] = {}
     for cell in covered.cells:
@@ -112,10 +111,9 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
     """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
     from kerv_cli.base.errors import Interrupted
     from kerv_cli.cli.progress import ProgressDisplay
-    from kerv_cli.lab.cells import CellRunner, reference_decode
     from kerv_cli.lab.execute import execute
     from kerv_cli.lab.reuse import take_over
-    from kerv_cli.lab.run_file import note_finished, note_invocation
+    from kerv_cli.lab.run import CellRunner, reference_decode
     from kerv_cli.report.viewing import save_recording
 
     runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
@@ -123,7 +121,7 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
     take_over(store, covered)
     if resolved.until == "done":
         store.write_plan(resolved.study, cells)
-    note_invocation(store.root, ["sweep", *words])
+    store.note_command(["sweep", *words])
     here = runtime.executor == "local" and runtime.workers == 1
     with ProgressDisplay(console(stderr=True)) as display:
         runner = CellRunner(store.rollouts, save_recording, on_step=display.on_step if here else None)
@@ -139,7 +137,7 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
                 f"interrupted: {count} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
             ) from None
     if not outcome.failed:
-        note_finished(store.root)
+        store.note_finished()
     return outcome
 
 
@@ -179,7 +177,6 @@ def _until_decided(
 def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> None:
     """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
     command, for the one that is named."""
-    from kerv_cli.lab.run_file import sweep_command
     from kerv_cli.report.summary import not_in_turn, summary_table
     from kerv_cli.report.tables import values_of
 
@@ -190,7 +187,7 @@ def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> Non
         typer.echo(f"its cells are of {len(codes)} states of the code, commits {names}")
     apart = not_in_turn(table)
     if apart:
-        command = runnable(f"'{sweep_command(store.root, store.name, 'rerun=timed')}'", words)
+        command = runnable(f"'{store.sweep_command('rerun=timed')}'", words)
         typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; {command} does that")
     note = store.read_plan().note
     if note:

@@ -16,7 +16,7 @@ from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, deviation
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab import timing
+from kerv_cli.lab import clock
 from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
@@ -53,19 +53,14 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     if is_expert(settings):
         tasks = resolve_tasks(settings.task)
         experts = spec_of(tasks[0]).experts
-        ours = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
-        return {"target": "", **({"expert": ours} if ours else {}), OBSERVATION: "state (privileged)"}
-    profile = timing.identity_of(settings)
+        hashes = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
+        return {"target": "", **({"expert": hashes} if hashes else {}), OBSERVATION: "state (privileged)"}
+    profile = clock.profile_identity(settings)
     artifacts = artifacts_of(settings)
-    shown = shown_to(artifacts.description.settings)
-    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: shown}
-
-
-def shown_to(target: Mapping[str, object]) -> str:
-    """The observation of a target with these settings, `vision` or `state (privileged)`; every row has it, so that a
-    privileged policy is recognised."""
-    kind = str(target.get(OBSERVATION, "vision"))
-    return "state (privileged)" if kind == "state" else kind
+    # every row of a table has it, so that a privileged policy is recognised
+    observation = str(artifacts.description.settings.get(OBSERVATION, "vision"))
+    observation = "state (privileged)" if observation == "state" else observation
+    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: observation}
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
@@ -92,7 +87,6 @@ def check(settings: RolloutSettings) -> None:
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     check_stress(settings.world.stress, spec)
-    timing.check_numbers(settings, spec)
     if is_expert(settings):
         _check_expert(settings, spec)
         return
@@ -104,7 +98,7 @@ def check(settings: RolloutSettings) -> None:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     check_method(method, settings.chunk, target.chunk, target.parallel)
     check_batch(method, settings.method, settings.rollout.batch)
-    timing.check_method(settings, spec, target)
+    clock.check(settings, spec, target)
     kinds = needs(method)
     artifacts.check(kinds)
     if "calibration" in kinds and method["threshold"].kind in ("kinematic", "change"):
@@ -123,7 +117,7 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 
 
 def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
-    timing.check_expert(settings, spec)
+    clock.check(settings, spec, None)
     if settings.rollout.batch > 1:
         raise UsageError(f"policy=expert with rollout.batch={settings.rollout.batch}: it decodes nothing, leave it out")
     if settings.deviation_every > 0:
@@ -211,13 +205,13 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
         return None
     target = None if is_expert(settings) else artifacts_of(settings).description
     measured = 0.0
-    if timing.calibrates(settings):
+    if clock.calibrates(settings):
         runtime = settings.runtime
         measured = _ar_seconds(
             *(settings.results, settings.policy.target, settings.chunk, task, settings.world.camera.size),
             *(runtime.device, runtime.dtype, runtime.threads),
         )
-    latency = timing.latency_of(settings, target, measured)
+    latency = clock.latency_of(settings, target, measured)
     return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
 
 

@@ -79,9 +79,9 @@ def render(
         figures=figures,
         sections=sections,
         tasks=_by_task(per_task),
-        recordings=_recordings(store),
+        recordings=[Link(path.stem, _href(path, store.root)) for path in sorted(store.rollouts.glob("*.rrd"))],
         files=[Link(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
-        commands=_commands(data),
+        commands=[(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()],
     )
 
 
@@ -160,37 +160,21 @@ def _number(value: float) -> str:
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
     """A row per task, a column per setting: successes and the speedup. A study of stress has many settings: they are
     the rows there, and the tasks the columns."""
-    labels = list(dict.fromkeys(per_task["label"]))
+    texts = {(row["label"], row["task"]): _cell(row) for row in rows_of(per_task)}
+    labels, tasks = list(dict.fromkeys(per_task["label"])), sorted(set(per_task["task"]))
     if stressed.is_stressed(per_task):
-        cells = {(row["label"], row["task"]): row for row in rows_of(per_task)}
-        tasks = sorted(set(per_task["task"]))
         return pd.DataFrame(
-            {"setting": label, **{task: _cell(cells.get((label, task))) for task in tasks}} for label in labels
+            {"setting": label, **{task: texts.get((label, task), "–") for task in tasks}} for label in labels
         )
-    rows = []
-    for task in sorted(set(per_task["task"])):
-        settings = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}
-        rows.append({"task": task, **{label: _cell(settings.get(label)) for label in labels}})
-    return pd.DataFrame(rows)
+    return pd.DataFrame({"task": task, **{label: texts.get((label, task), "–") for label in labels}} for task in tasks)
 
 
-def _cell(row: Mapping[str, Any] | None) -> str:
-    if row is None:
-        return "–"
+def _cell(row: Mapping[str, Any]) -> str:
     share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
     if row["label"] == row["baseline"] or not is_number(row["speedup"]):
         return share
     return f"{share} · {row['speedup']:.2f}×"
 
 
-def _recordings(store: StudyStore) -> list[Link]:
-    return [Link(path.stem, _href(path, store.root)) for path in sorted(store.rollouts.glob("*.rrd"))]
-
-
 def _href(path: Path, page: Path) -> str:
     return quote(Path(os.path.relpath(path, page)).as_posix())
-
-
-def _commands(data: StudyData) -> list[tuple[str, str]]:
-    """(setting, the overrides that make it)."""
-    return [(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()]

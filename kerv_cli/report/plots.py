@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.engine.record import PHASES
-from kerv_cli.report.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours
+from kerv_cli.report.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours, shared_legend
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.scatter import success_floor, tradeoff_figure
+from kerv_cli.report.scatter import limit_success, tradeoff_figure
 from kerv_cli.report.stressed import is_stressed, stress_figure
 from kerv_cli.report.tables import is_number, rows_of
 
@@ -131,10 +131,11 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
         _draw_baseline(panel, rows, measure, scale)
         panel.set(title=name, ylabel=unit, xlabel=axis)
         _name_ticks(panel, ticks, beside)
-        _limit(panel, measure, rows)
-    entries = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in entries}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+        if measure == "success":
+            limit_success(panel, rows)
+        else:
+            panel.margins(y=0.12)
+    shared_legend(figure, axes, columns)
     return figure
 
 
@@ -183,14 +184,6 @@ def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) 
         panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=INK, alpha=0.06, linewidth=0)
 
 
-def _limit(panel: Axes, measure: str, rows: pd.DataFrame) -> None:
-    """Axis limits: success from where it matters to 102 %, ratios by their values with a margin."""
-    if measure == "success":
-        panel.set_ylim(success_floor(rows), 102)
-    else:
-        panel.margins(y=0.12)
-
-
 def _by_setting(rows: pd.DataFrame) -> Figure:
     figure = new_figure(12.0, 2.0 + 0.38 * len(rows))
     axes = figure.subplots(1, len(_PANELS), sharey=True)
@@ -205,8 +198,10 @@ def _by_setting(rows: pd.DataFrame) -> Figure:
         panel.grid(axis="y", visible=False)
         if measure == "speedup":
             _draw_ceilings(panel, rows)
-        low, high = (success_floor(rows), 102) if measure == "success" else (0, 1.08 * panel.get_xlim()[1])
-        panel.set_xlim(low, high)
+        if measure == "success":
+            limit_success(panel, rows, "x")
+        else:
+            panel.set_xlim(0, 1.08 * panel.get_xlim()[1])
         _separate(panel, rows)
     _name_rows(axes[0], _grouped_names(rows))
     return figure

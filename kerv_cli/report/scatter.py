@@ -42,9 +42,7 @@ def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
     panel.set(xlabel="speedup: time per step, baseline ÷ setting", ylabel="success, % of episodes")
     panel.margins(x=0.14)
     panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
-    panel.set_ylim(success_floor(rows), 103)
-    panel.set_yticks([tick for tick in panel.get_yticks() if tick <= 100])
-    panel.set_ylim(success_floor(rows), 103)
+    limit_success(panel, rows)
     panel.set_title("Success against speedup")
     entitle(figure, title, about)  # before the labels: it moves the panel
     labels = [(row["speedup"], 100 * row["success"], str(row["label"])) for row in points]
@@ -56,6 +54,13 @@ def success_floor(rows: pd.DataFrame) -> float:
     """Where an axis of success begins, in percent: a little below the lowest interval, so that differences show."""
     lows = [100 * value for value in rows["success_low"] if is_number(value)]
     return max(0.0, 5.0 * math.floor((min(lows, default=0.0) - 3.0) / 5.0))
+
+
+def limit_success(panel: Axes, rows: pd.DataFrame, axis: str = "y") -> None:
+    """Limits an axis of success: from `success_floor` to a little above 100 %, without a tick there."""
+    floor = success_floor(rows)
+    panel.set(**{f"{axis}lim": (floor, 103)})
+    panel.set(**{f"{axis}ticks": [tick for tick in getattr(panel, f"get_{axis}ticks")() if floor <= tick <= 100]})
 
 
 def _draw_point(panel: Axes, row: dict[str, Any], shade: str) -> None:

@@ -24,8 +24,7 @@ from kerv_cli.lab.identity import (
     without,
     work_of,
 )
-from kerv_cli.lab.plan import Cell, seeds_text
-from kerv_cli.lab.plan_file import StudyPlan
+from kerv_cli.lab.plan import Cell, StudyPlan, seeds_text
 from kerv_cli.lab.store import StoredCell, StudyStore
 from kerv_cli.report.ceiling import (
     NONE,
