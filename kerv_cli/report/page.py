@@ -93,8 +93,8 @@ def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str
         rows = rows_of(whole, MICRO)
         rates = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
         return f"Success: {rates}."
-    choice = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
-    text = sentence(choice, data.plan.axis, LOSS, data.plan.baseline)
+    choice = choices(whole, per_task.iloc[:0], LOSS)[0]
+    text = sentence(choice, LOSS, data.plan.baseline)
     return text[:1].upper() + text[1:] + "."
 
 
