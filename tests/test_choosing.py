@@ -90,8 +90,8 @@ def test_untimed_settings_are_chosen_by_the_order_of_the_tests(table: pd.DataFra
 
 
 def test_ten_settings_at_the_bound_are_seldom_chosen() -> None:
-    """Ten settings that lose exactly the bound, a tenth of the pairs discordant; each tested by itself, one looks safe in
-    11 to 20 % of the studies."""
+    """Ten settings that lose exactly the bound, a tenth of the pairs discordant; each tested by itself, one looks safe
+    in a fifth of the studies."""
     random, chosen, studies = np.random.default_rng(0), 0, 300
     for _ in range(studies):
         draws = random.multinomial(200, (0.85, 0.065, 0.035, 0.05), size=10)
