@@ -8,7 +8,6 @@ a method is built, so that ε and δ are settings of the method.
 from __future__ import annotations
 
 import functools
-import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -25,12 +24,11 @@ from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import steps_of
 from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
-from kerv_cli.methods.risk import RiskSkipSettings
+from kerv_cli.methods.risk import RiskSkipSettings, hash_of_recording
 from kerv_cli.methods.risk.alarm import alarm_level
 from kerv_cli.methods.risk.betting import p_value
 
 FORMAT = 1
-CERTIFICATE = 2  # raised where the same recording certifies another level or raises the alarm elsewhere
 GRID = 40  # candidate levels: quantiles of the scores
 DECODES, FEATURES = "decodes.parquet", "features.npy"
 AGAIN = "run 'kerv calibrate risk'"
@@ -241,9 +239,8 @@ def _sources(folder: Path) -> MadeFrom:
 
 
 def _check(folder: Path, request: Request) -> str:
-    """A hash of the recording and of what is made of it, so that another certificate is other work."""
     read_risk(folder, request)
-    return hashlib.sha256(f"{sha256_of(folder / 'risk.json')} {CERTIFICATE}".encode()).hexdigest()
+    return hash_of_recording(folder / "risk.json")
 
 
 def _load(folder: Path, request: Request) -> RiskRecording:
