@@ -117,11 +117,9 @@ def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str])
     variance, freedom = 0.0, 0
     for number in np.unique(stratum):
         parts = sums[stratum == number]
-        if len(parts) > 1 or number >= 0 or len(sums) == 1:
-            variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else math.nan
-            freedom += len(parts) - 1
-        else:
-            variance += float(parts[0]) ** 2  # the only stratum of one cluster beside others
+        # the only stratum of one cluster has nothing to be compared with: the whole sum counts
+        variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else float(parts[0]) ** 2
+        freedom += len(parts) - 1
     return float(stdtrit(freedom, 0.975)) * math.sqrt(variance) if freedom else math.nan
 
 
