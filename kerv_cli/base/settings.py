@@ -534,6 +534,9 @@ class CalibrateRiskSettings(TaskSettings):
     epsilon: float = number(0.15, above=0, most=0.99)  # of the table that is printed
     delta: float = number(0.1, above=0, most=0.5)
     features: bool = False  # keep the pooled prompts, for `kerv train score`
+    acceptance: Any = field(default_factory=chosen("acceptance", "relaxed"))  # how what is verified is decoded
+    threshold: Any = field(default_factory=chosen("threshold", "fixed"))
+    chunk: int = number(0, 0, 1024)
     world: RolloutWorldSettings = field(default_factory=RolloutWorldSettings)
 
     def check_together(self, prefix: str) -> None:

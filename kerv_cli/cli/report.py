@@ -20,7 +20,7 @@ Publish = Annotated[
 
 
 Choose = Annotated[
-    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the boldest safe one.")
+    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the fastest safe one.")
 ]
 
 
@@ -77,11 +77,11 @@ def _choose(settings: ReportSettings, as_json: bool) -> None:
     answers = {}
     for name in names:
         data = load_study(StudyStore(results, name))
-        groups = choices(study_table(data), per_task_table(data), data.plan.axis, settings.loss)
+        groups = choices(study_table(data), per_task_table(data), settings.loss)
         answers[name] = rows_of(choices_frame(groups))
         if not as_json:
             typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
-            typer.echo(f"  {sentence(groups[0], data.plan.axis, settings.loss, data.plan.baseline)}")
+            typer.echo(f"  {sentence(groups[0], settings.loss, data.plan.baseline)}")
             for choice in groups[1:]:
                 typer.echo(f"  {short(choice)}")
     if as_json:

@@ -126,7 +126,7 @@ def compose(
         UsageError: as `check`. CheckpointError: an artifact is missing or belongs to another target.
     """
     check(method, chunk, target.chunk, is_parallel(target))
-    context = Context(target, artifact, task)
+    context = Context(target, artifact, task, method=method, chunk=chunk)
     for kind in METHOD_KINDS:
         context.built[kind] = part_of(kind, method[kind].kind).built(method[kind], context)
     return Decoder(target, Parts(**context.built), chunk)

@@ -93,8 +93,8 @@ def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str
         rows = rows_of(whole, MICRO)
         rates = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
         return f"Success: {rates}."
-    choice = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
-    text = sentence(choice, data.plan.axis, LOSS, data.plan.baseline)
+    choice = choices(whole, per_task.iloc[:0], LOSS)[0]
+    text = sentence(choice, LOSS, data.plan.baseline)
     return text[:1].upper() + text[1:] + "."
 
 
@@ -136,13 +136,11 @@ def _about(whole: pd.DataFrame) -> str:
 def _suite(whole: pd.DataFrame) -> pd.DataFrame:
     """The table of all settings, pooled over tasks, with the two numbers that the average over difficulty changes."""
     frame = summary_frame(whole, MICRO)
-    macro = {row["label"]: row for row in rows_of(whole, MACRO)}
-    if not macro or whole["difficulty"].astype(str).str.count(";").max() == 0:
+    if MACRO not in set(whole["averaging"]) or whole["difficulty"].astype(str).str.count(";").max() == 0:
         return frame
-    success = [f"{100 * macro[label]['success']:.1f}" for label in frame["setting"]]
-    speed = [_number(macro[label]["speedup"]) for label in frame["setting"]]
-    frame.insert(len(frame.columns), "success %, by difficulty", success)
-    frame.insert(len(frame.columns), "speedup, by difficulty", speed)
+    macro = summary_frame(whole, MACRO)
+    for name in ("success %", "speedup"):
+        frame[f"{name}, by difficulty"] = macro[name]
     return frame
 
 
@@ -151,10 +149,6 @@ def _how_to_run(store: StudyStore) -> str:
     results = str(store.root.parent.parent)
     where = "" if results == "results" else f" results={shlex.quote(results)}"
     return f"Run `kerv sweep study={store.name}{where}`"
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if is_number(value) else "–"
 
 
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:

@@ -14,7 +14,7 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance, versions
-from kerv_cli.base.registry import NoSettings, find, part_of
+from kerv_cli.base.registry import NoSettings, find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import CalibrateRiskSettings, RolloutSettings, as_plain
 from kerv_cli.engine.chunk import Chunk
@@ -30,7 +30,7 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import compose
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.risk.gate import episode_numbers
-from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, save_risk
+from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, decoding_of, save_risk
 from kerv_cli.methods.risk.scores import Draft, Score
 from kerv_cli.training.risk_records import RiskRecords, Row
 from kerv_cli.worlds import resolve_tasks, spec_of
@@ -129,6 +129,7 @@ class RiskRun:
         return {
             "artifacts": self.hashes,
             "recorded": [s.sources, s.scores, s.unverified, s.scale, s.features],
+            "decoding": [asdict(s.acceptance), asdict(s.threshold), s.chunk],
             "world": asdict(s.world),
             "runtime": [runtime.device, runtime.dtype, runtime.threads],
             "engine": ENGINE,
@@ -178,10 +179,10 @@ class RiskRun:
             names = self.settings.scores
             scores[source.name] = {n: find("score", n).built(NoSettings(n), beside) for n in names}
         recorder = Recorder(target, sources, scores, self.settings)
-        method = RolloutSettings(acceptance=part_of("acceptance", "relaxed").settings()).parts()
+        method = RolloutSettings(acceptance=self.settings.acceptance, threshold=self.settings.threshold).parts()
         method["prefill_draft"] = _default_settings(self.settings.sources[0])
-        decoder = compose(method, target, self.artifacts.load, task)
-        return Decoder(target, replace(decoder.parts, skip=recorder)), recorder
+        decoder = compose(method, target, self.artifacts.load, task, self.settings.chunk)
+        return Decoder(target, replace(decoder.parts, skip=recorder), self.settings.chunk), recorder
 
     def finish(self, draw: Draw | None = None) -> RiskRecording:
         """Writes the recording in one step -> the recording. draw: adds pictures to its folder.
@@ -213,6 +214,7 @@ class RiskRun:
             files={},
             provenance=origin,
             made_from={kind: digest for kind, digest in self.hashes.items() if kind != "target"},
+            decoding=decoding_of(vars(self.settings), self.settings.chunk, self.artifacts.target),
         )
         return save_risk(self.folder, manifest, rows, np.array(features) if features else None, draw)
 
