@@ -7,102 +7,60 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-import typer
-
-_SCHEMAS = {
-    "rollout": "RolloutSettings",
-    "sweep": "RolloutSettings",
-    "demos": "DemosSettings",
-    "train_target": "TrainTargetSettings",
-    "train_drafter": "TrainDrafterSettings",
-    "build_datastore": "BuildDatastoreSettings",
-    "calibrate": "CalibrateSettings",
-    "calibrate_risk": "CalibrateRiskSettings",
-    "train_score": "TrainScoreSettings",
-    "report": "ReportSettings",
-    "doctor": "DoctorSettings",
-    "view": "ViewSettings",
-    "bench": "BenchSettings",
-    "serve": "ServeSettings",
-}
-"""Command -> name of its settings' class."""
-_OF_THE_SWEEP = ("study", "until", "loss")
-
-
-def complete_overrides(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completions of an override, for the command that is typed."""
-    command = "_".join(ctx.command_path.split()[1:])
-    return completions(command, list(ctx.params.get("overrides") or []), incomplete)
+from kerv_cli.base.registry import NoSettings, Part, parts
+from kerv_cli.base.settings import choices_of
+from kerv_cli.cli.command import commands_below, schemas_of, top_keys
 
 
 def completions(command: str, typed: Sequence[str], incomplete: str) -> list[str]:
     """`me` -> `method=`; `method=s` -> every method that begins so; `threshold.` -> the keys of the chosen threshold.
 
     Args:
-        command: e.g. `rollout`, `train_drafter`.
+        command: e.g. `rollout`, `train drafter`.
         typed: the overrides in front of it: a chosen part has keys of its own.
     """
-    if command not in _SCHEMAS:
-        return []
+    part = parts("command")[command]
     key, equals, _ = incomplete.partition("=")
     if equals:
-        words = [f"{key}={name}" for name in _values(command, key)]
+        words = [f"{key}={name}" for name in _values(part, key)]
     elif "." in incomplete:
-        words = [f"{name}=" for name in _keys(command, typed)]
+        words = [f"{name}=" for name in _keys(part, typed, incomplete)]
     else:
-        words = [f"{name}=" for name in _top(command)]
+        keys = [] if part.settings is NoSettings else [f"{name}=" for name in top_keys(part)]
+        below = [] if typed else [one.name.removeprefix(f"{command} ") for one in commands_below(f"{command} ")]
+        words = [*part.traits.get("completes", list)(), *below, *keys]
     return [word for word in dict.fromkeys(words) if word.startswith(incomplete)]
 
 
-def groups_of(command: str) -> dict[str, list[str]]:
-    """The groups that the command's defaults choose from, and the names in them."""
-    import yaml
-
-    from kerv_cli.base.config import conf_dir, groups
-
-    names_of = groups()
-    files = ("rollout", "sweep") if command == "sweep" else (command,)
-    used: list[str] = []
-    for file in files:
-        defaults = yaml.safe_load((conf_dir() / f"{file}.yaml").read_text(encoding="utf-8")).get("defaults", [])
-        used += [name for choice in defaults if isinstance(choice, dict) for name in choice]
-    return {name: names_of[name] for name in used if name in names_of}
-
-
-def _values(command: str, key: str) -> list[str]:
+def _values(part: Part, key: str) -> list[str]:
     if key == "task":
         from kerv_cli.worlds import task_names
 
         return list(task_names())
-    if key == "study" and command == "report":
-        results = Path("results/studies")
-        return sorted(path.parent.name for path in results.glob("*/plan.yaml"))
+    if key in part.traits.get("values", {}):
+        return list(part.traits["values"][key]())
     if key == "world.stress.kind":
-        from kerv_cli.base.registry import parts
-
         return list(parts("stress"))
-    if key == "until":
-        return ["decided", "done"]
-    return groups_of(command).get(key, [])
+    for _, schema in schemas_of(part):
+        if key in choices_of(schema):
+            from kerv_cli.base.config import groups
+
+            return groups()[key]
+        for at in fields(schema):
+            if at.name == key and "names" in at.metadata:
+                return list(at.metadata["names"])
+    return []
 
 
-def _top(command: str) -> list[str]:
-    """Groups and plain keys of the first level; a mapping is written with a dot behind it."""
-    from kerv_cli.base import settings
-
-    names = [field.name for field in fields(getattr(settings, _SCHEMAS[command]))]
-    extra = _OF_THE_SWEEP if command == "sweep" else ("study",) if command == "report" else ()
-    return [*groups_of(command), *extra, *names]
-
-
-def _keys(command: str, typed: Sequence[str]) -> list[str]:
+def _keys(part: Part, typed: Sequence[str], incomplete: str) -> list[str]:
     """Dotted keys of the command with the parts that were chosen in front."""
-    from kerv_cli.base import settings
     from kerv_cli.base.config import keys_of
 
-    composed = "rollout" if command == "sweep" else command
-    choices = [word for word in typed if word.split("=", 1)[0] in groups_of(composed)]
-    return keys_of(composed, choices, getattr(settings, _SCHEMAS[composed]))
+    for name, schema in schemas_of(part):
+        if incomplete.split(".")[0] in {at.name for at in fields(schema)}:
+            choices = [word for word in typed if word.split("=", 1)[0] in choices_of(schema)]
+            return keys_of(name.replace(" ", "_"), choices, schema)
+    return []
 
 
 BASH = """# completion of kerv for bash. '=' ends a word for bash and not for kerv, so the line is split at blanks here.
