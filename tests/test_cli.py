@@ -55,14 +55,17 @@ def test_help_lists_the_commands_without_importing_anything_heavy() -> None:
 
 @pytest.mark.parametrize("words", [[], ["train"]])
 def test_help_is_fast(words: list[str]) -> None:
-    def seconds() -> float:
-        """Of the processor: what else the machine does is no matter of kerv's."""
+    def seconds(command: list[str]) -> float:
+        """Of the processor."""
         began = os.times()
-        process(*words, "--help")
+        subprocess.run(command, capture_output=True, check=True)
         ended = os.times()
         return ended.children_user + ended.children_system - began.children_user - began.children_system
 
-    assert min(seconds() for _ in range(5)) < 0.5
+    typer = min(seconds([sys.executable, "-c", "import typer"]) for _ in range(3))
+    # half a second on an idle machine; a loaded one is judged against the import of typer alone
+    asked = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words, "--help"]
+    assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
 
 
 @pytest.mark.parametrize(
@@ -275,9 +278,11 @@ def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path: Path) -> None:
     assert run("seeds", "task=reach", results).stdout == "reach-v3: 100000 to 100002\n"
     assert json.loads(run("seeds", "task=reach", "episodes=1", results, "--json").stdout) == {"reach-v3": [100000]}
     assert one_line(run("seeds", "episodes=0"), 2) == "kerv: episodes=0: from 1 to 100"
-    assert one_line(run("seeds", "uses=x"), 2) == "kerv: unknown key 'uses': did you mean use?"
-    completed = {"_KERV_COMPLETE": "complete_bash", "COMP_WORDS": "kerv seeds use=d", "COMP_CWORD": "2"}
-    assert run(**completed).stdout.split() == ["use=demonstrations"]
+    assert one_line(run("seeds", "uses=x"), 2).startswith("kerv: unknown key 'uses': did you mean use ")
+    asked = {"_KERV_COMPLETE": "complete_bash", "COMP_WORDS": "kerv seeds use=d", "COMP_CWORD": "2"}
+    environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": "own_command", **asked}
+    done = subprocess.run([sys.executable, "-c", BE_KERV], capture_output=True, text=True, env=environment, check=False)
+    assert done.stdout.split() == ["use=demonstrations"], done.stderr
 
 
 def test_bash_completes_behind_an_equals_sign_without_a_start_up_file(tmp_path: Path) -> None:

@@ -213,12 +213,13 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
         base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
     store.store(name=f"base_{command}", node=base)
     choices = [{group: name} for group, name in choices_of(schema).items()]
-    store.store(name=command, node={"defaults": [f"base_{command}", *choices, "_self_"]})  # a file outranks it
+    store.store(name=f"own_{command}", node={"defaults": [f"base_{command}", *choices, "_self_"]})
     for group in PART_GROUPS:
         for name, part in _parts_of(group).items():
             _store_part(group, name, part.settings)
+    own = not (conf_dir() / f"{command}.yaml").is_file()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra_compose(command, overrides=list(overrides))
+        return hydra_compose(f"own_{command}" if own else command, overrides=list(overrides))
 
 
 def _open_mappings(node: Any) -> None:
