@@ -69,6 +69,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of another type or out of range.
     """
+    check_once(overrides, groups())
     return Composer(command, schema).compose(overrides)
 
 
@@ -84,7 +85,6 @@ class Composer(Generic[T]):
         from hydra.errors import HydraException
         from omegaconf.errors import OmegaConfBaseException
 
-        check_once(overrides, self.groups)
         overrides, method = method_of_file(overrides)
         overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
         self._check(overrides)
