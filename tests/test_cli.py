@@ -181,7 +181,7 @@ def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:
 
 
 def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
-    from kerv_cli.cli.completing import completions
+    from kerv_cli.cli.command import completions
 
     assert "method=spec_vla" in completions("rollout", [], "method=s")
     assert completions("rollout", [], "me") == ["method="]

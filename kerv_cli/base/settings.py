@@ -173,17 +173,18 @@ class PolicySettings:
         return self.others.get(kind) or getattr(self, kind, None)
 
 
-POLICY: Any = setting(PolicySettings, "what chooses the actions: vision, state, expert, … (conf/policy)")
-DEMOS: Any = setting("mt10", "demonstrations, by name")
-STARTS: Any = choice("all", "all", "half", help="half: of every task, the episodes that begin on one side")
-FIRST_EPISODES: Any = number(0, 0, 100_000, help="per task, the first ones by seed; 0: all")
+# descriptions of settings that several commands have
+POLICY = "what chooses the actions: vision, state, expert, … (conf/policy)"
+DEMOS = "demonstrations, by name"
+STARTS = "half: of every task, the episodes that begin on one side"
+FIRST_EPISODES = "per task, the first ones by seed; 0: all"
 
 
 @dataclass(kw_only=True)
 class MethodSettings(RunSettings):
     """A policy and the method by which it decodes. The parts are settings of the classes in kerv_cli/methods."""
 
-    policy: PolicySettings = POLICY
+    policy: PolicySettings = setting(PolicySettings, POLICY)
     method: str = setting("ar", "how it decodes: ar, spec_vla, kerv, heisd, one_pass, … (conf/method)")
     prefill_draft: Any = part("proposer", help="what drafts before the prefill")
     proposer: Any = part("proposer", help="what drafts behind the prefill: none, drafter, retrieval, hold, …")
@@ -326,7 +327,7 @@ class TrainTargetSettings(TaskSettings):
     groups: ClassVar = {"target": "small", "train": "target", "world": "default", "runtime": "auto"}
 
     name: str = setting("mt10-vision", "folder below <results>/artifacts/target, or a path")
-    demos: str = DEMOS
+    demos: str = setting("mt10", DEMOS)
     target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, small, base, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
@@ -353,7 +354,7 @@ class DemosExportSettings(CommandSettings):
     """`kerv demos export`: demonstrations for other tools."""
 
     format: str = choice("lerobot", "lerobot", help="a LeRobot dataset of version 3")
-    demos: str = DEMOS
+    demos: str = setting("mt10", DEMOS)
     to: str = setting("", "folder; empty: <results>/lerobot/<demos>")
 
 
@@ -395,10 +396,10 @@ class TrainDrafterSettings(RunSettings):
     # drafter=early has optimisation settings of its own, so that it comes behind train
     groups: ClassVar = {"policy": "vision", "cover": "all", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
 
-    policy: PolicySettings = POLICY
-    demos: str = DEMOS
+    policy: PolicySettings = setting(PolicySettings, POLICY)
+    demos: str = setting("mt10", DEMOS)
     task: list[str] = setting([], "tasks and suites whose demonstrations are used; empty: all")
-    starts: str = STARTS
+    starts: str = choice("all", "all", "half", help=STARTS)
     drafter: DrafterSettings = setting(DrafterSettings, "shapes: eagle, early (conf/drafter)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
@@ -409,7 +410,7 @@ class TrainScoreSettings(RunSettings):
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
-    policy: PolicySettings = POLICY
+    policy: PolicySettings = setting(PolicySettings, POLICY)
     inputs: list[str] = setting(["odds", "entropy", "familiarity", "steadiness"], "scores it reads beside the prompt")
     steps: int = number(300, 1, 10**6, help="optimisation steps")
     lr: float = number(3e-3, 0, 10, help="learning rate")
@@ -497,7 +498,7 @@ class BuildDrafterSettings(RunSettings):
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
-    policy: PolicySettings = POLICY
+    policy: PolicySettings = setting(PolicySettings, POLICY)
     checkpoint: str = setting("", "folder with config.json and model.safetensors")
     positions: str = setting("sequence", "sequence or text (docs/methods.md §2.2)")
     mask: str = setting("causal", "causal or prompt")
@@ -509,11 +510,11 @@ class BuildDatastoreSettings(TaskSettings):
 
     groups: ClassVar = {"policy": "vision", "cover": "all", "runtime": "cpu"}
 
-    policy: PolicySettings = POLICY
+    policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: datastore/ beside the target")
-    demos: str = DEMOS
-    episodes: int = FIRST_EPISODES
-    starts: str = STARTS
+    demos: str = setting("mt10", DEMOS)
+    episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
+    starts: str = choice("all", "all", "half", help=STARTS)
     stride: int = number(1, 1, 10_000, help="every so many of an episode's observations become entries")
     half: bool = setting(False, "keys on disk in float16: half the size, for shipping")
     components: int = number(0, 0, 65_536, help="directions that keys are projected onto; 0: keys stay as they are")
@@ -526,10 +527,10 @@ class CalibrateSettings(TaskSettings):
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
-    policy: PolicySettings = POLICY
+    policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: beside the target")
-    demos: str = DEMOS
-    episodes: int = FIRST_EPISODES
+    demos: str = setting("mt10", DEMOS)
+    episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes that the errors are measured on")
     # labels: clean; executed: noisy in perturbed episodes
     history: str = choice("labels", "labels", "executed", help="what predictions are made from")
@@ -559,7 +560,7 @@ class CalibrateRiskSettings(TaskSettings):
 
     groups: ClassVar = {"policy": "vision", "world": "default", "cover": "all", "runtime": "cpu"}
 
-    policy: PolicySettings = POLICY
+    policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: risk/ beside the target")
     episodes: int = number(20, 1, 100_000, help="episodes per task")
     seed: int = number(50_100, 0, 2**31 - 1, help="first one, a selection seed")

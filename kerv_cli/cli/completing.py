@@ -1,67 +1,9 @@
-"""Completion of a command line: groups, names, keys and tasks, of the command at hand only."""
+"""The shells' completion scripts."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
-
-from kerv_cli.base.registry import NoSettings, Part, parts
-from kerv_cli.base.settings import choices_of
-from kerv_cli.cli.command import commands_below, schemas_of, top_keys
-
-
-def completions(command: str, typed: Sequence[str], incomplete: str) -> list[str]:
-    """`me` -> `method=`; `method=s` -> every method that begins so; `threshold.` -> the keys of the chosen threshold.
-
-    Args:
-        command: e.g. `rollout`, `train drafter`.
-        typed: the overrides in front of it: a chosen part has keys of its own.
-    """
-    part = parts("command")[command]
-    key, equals, _ = incomplete.partition("=")
-    if equals:
-        words = [f"{key}={name}" for name in _values(part, key)]
-    elif "." in incomplete:
-        words = [f"{name}=" for name in _keys(part, typed, incomplete)]
-    else:
-        keys = [] if part.settings is NoSettings else [f"{name}=" for name in top_keys(part)]
-        below = [] if typed else [one.name.removeprefix(f"{command} ") for one in commands_below(f"{command} ")]
-        words = [*part.traits.get("completes", list)(), *below, *keys]
-    return [word for word in dict.fromkeys(words) if word.startswith(incomplete)]
-
-
-def _values(part: Part, key: str) -> list[str]:
-    if key == "task":
-        from kerv_cli.worlds import task_names
-
-        return list(task_names())
-    if key in part.traits.get("values", {}):
-        return list(part.traits["values"][key]())
-    if key == "world.stress.kind":
-        return list(parts("stress"))
-    for _, schema in schemas_of(part):
-        if key in choices_of(schema):
-            from kerv_cli.base.config import groups
-
-            return groups()[key]
-        for at in fields(schema):
-            if at.name == key and "names" in at.metadata:
-                return list(at.metadata["names"])
-    return []
-
-
-def _keys(part: Part, typed: Sequence[str], incomplete: str) -> list[str]:
-    """Dotted keys of the command with the parts that were chosen in front."""
-    from kerv_cli.base.config import keys_of
-
-    for name, schema in schemas_of(part):
-        if incomplete.split(".")[0] in {at.name for at in fields(schema)}:
-            choices = [word for word in typed if word.split("=", 1)[0] in choices_of(schema)]
-            return keys_of(name.replace(" ", "_"), choices, schema)
-    return []
-
 
 BASH = """# completion of kerv for bash. '=' ends a word for bash and not for kerv, so the line is split at blanks here.
 _kerv_completion() {
