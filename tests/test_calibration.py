@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import typer
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
@@ -23,7 +22,7 @@ from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CalibrateSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.calibrate import calibrate
+from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.record import Round
@@ -400,9 +399,14 @@ def test_windows_longer_than_every_episode_are_refused(results: Path) -> None:
 
 
 def test_the_command_prints_what_it_found(results: Path) -> None:
-    app = typer.Typer()
-    app.command()(calibrate)
-    common = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state", f"results={results}"]
+    common = [
+        "calibrate",
+        "task=reach,drawer-close",
+        "demos=few",
+        "held_out=0.4",
+        "policy.target=nano-state",
+        f"results={results}",
+    ]
     done = CliRunner().invoke(app, [*common, "decodes=0", "name=without"])
     assert done.exit_code == 0, done.output
     for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without", "radius R, minimum"):

@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
+import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base import settings as s
 from kerv_cli.base.config import MOST_POINTS, PART_GROUPS, compose, expand
 from kerv_cli.base.errors import UsageError
@@ -18,24 +19,7 @@ from kerv_cli.base.registry import parts
 from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.kinematics.prediction import MINIMUM
 
-SCHEMAS = {
-    "rollout": s.RolloutSettings,
-    "sweep": s.SweepSettings,
-    "train_target": s.TrainTargetSettings,
-    "train_drafter": s.TrainDrafterSettings,
-    "demos": s.DemosSettings,
-    "doctor": s.DoctorSettings,
-    "build_datastore": s.BuildDatastoreSettings,
-    "calibrate": s.CalibrateSettings,
-    "demos_export": s.DemosExportSettings,
-    "demos_import": s.DemosImportSettings,
-    "build_target": s.BuildTargetSettings,
-    "build_drafter": s.BuildDrafterSettings,
-    "bench": s.BenchSettings,
-    "bench_replay": s.BenchReplaySettings,
-    "serve": s.ServeSettings,
-    "report": s.ReportSettings,
-}
+SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 
 
 def numbers(kind: type) -> Iterator[tuple[type, Field[Any]]]:

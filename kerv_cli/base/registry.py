@@ -72,8 +72,8 @@ class Part:
     """One choice among the parts of a kind.
 
     kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
-    environment, stress or executor. build: `module:function` or `module:Class.method`; its arguments are documented
-    where the kind is used, of a method's parts in `methods/context.py`.
+    environment, stress, executor or command. build: `module:function` or `module:Class.method`; its arguments are
+    documented where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
     settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
     and timeline.

@@ -4,50 +4,35 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from kerv_cli.cli.common import Overrides, ShowConfig, composed, console, edge, print_table
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_json, write_json
+from kerv_cli.base.settings import BenchReplaySettings, BenchSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import console, print_table
 
-if TYPE_CHECKING:
-    from kerv_cli.base.settings import BenchSettings
-
-REPLAY = "replay"
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
 Compare = Annotated[
     tuple[Path, Path] | None, typer.Option("--compare", help="Compare two results instead of measuring one.")
 ]
 
 
-@edge
-def bench(
-    overrides: Overrides = None, cfg: ShowConfig = False, as_json: AsJson = False, compare: Compare = None
-) -> None:
+@command(
+    "bench",
+    BenchSettings,
+    keys="target dtype tokens repeats drafter_depth runtime.device runtime.dtype runtime.threads results",
+    examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 tokens=[7,28]"),
+    typed={"target": "model"},  # to Hydra target= would be a choice among the files of conf/target
+)
+def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = None) -> None:
     """Measure a target's forwards against the device's limits; target= is a policy or a shape: vla-150m, smolvla,
-    openvla-7b. 'kerv bench replay study=NAME target=…' executes a study's recorded decodes on that target."""
-    words = list(overrides or [])
-    if words[:1] == [REPLAY]:
-        _replay(words[1:], cfg, as_json)
-        return
-    from kerv_cli.base.settings import BenchSettings
-
-    settings = composed("bench", renamed(words), BenchSettings, cfg)
+    openvla-7b."""
     if compare is not None:
         _compare(*compare)
         return
-    _measure(settings, as_json)
-
-
-def renamed(words: list[str]) -> list[str]:
-    """To Hydra target= and study= would be choices among the files of conf/; here they name a policy or shape, and a
-    study of the results folder."""
-    keys = {"target": "model", "study": "recorded"}
-    return [f"{keys.get(key, key)}{equals}{value}" for key, equals, value in (word.partition("=") for word in words)]
-
-
-def _measure(settings: BenchSettings, as_json: bool) -> None:
-    from kerv_cli.base.files import write_json
     from kerv_cli.bench import report
     from kerv_cli.bench.run import open_and_card, place_of, run
 
@@ -71,8 +56,6 @@ def _measure(settings: BenchSettings, as_json: bool) -> None:
 
 
 def _compare(a: Path, b: Path) -> None:
-    from kerv_cli.base.errors import CheckpointError
-    from kerv_cli.base.files import read_json
     from kerv_cli.bench.report import comparison_rows
 
     documents: list[dict[str, Any]] = []
@@ -85,10 +68,15 @@ def _compare(a: Path, b: Path) -> None:
     print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
 
 
-def _replay(words: list[str], cfg: bool, as_json: bool) -> None:
-    from kerv_cli.base.settings import BenchReplaySettings
-
-    settings = composed("bench_replay", renamed(words), BenchReplaySettings, cfg)
+@command(
+    "bench replay",
+    BenchReplaySettings,
+    keys="study target decodes dtype tokens repeats profiles runtime.device results",
+    examples=("kerv bench replay study=demo", "kerv bench replay study=main target=openvla-7b runtime.device=cuda"),
+    typed={"target": "model", "study": "recorded"},
+)
+def replay_study(settings: BenchReplaySettings, as_json: AsJson = False) -> None:
+    """Execute a study's recorded decodes on another target."""
     from kerv_cli.bench.replay_run import replay
 
     result = replay(settings)

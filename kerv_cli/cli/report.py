@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, console, edge, print_json
-
-if TYPE_CHECKING:
-    from kerv_cli.base.settings import ReportSettings
+from kerv_cli.base.settings import ReportSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, console, print_json
 
 Publish = Annotated[
     bool,
@@ -24,21 +24,31 @@ Choose = Annotated[
 ]
 
 
-@edge
+def studies_there() -> list[str]:
+    """Names of the studies in ./results."""
+    return sorted(path.parent.name for path in Path("results/studies").glob("*/plan.yaml"))
+
+
+@command(
+    "report",
+    ReportSettings,
+    keys="study results against loss",
+    examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
+    # a folder of results; to Hydra study= would be a choice among the files of conf/study
+    typed={"study": "only"},
+    values={"study": studies_there},
+)
 def report(
-    overrides: Overrides = None,
-    cfg: ShowConfig = False,
+    settings: ReportSettings,
+    words: list[str],
     publish: Publish = False,
     choose: Choose = False,
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
-    from kerv_cli.base.settings import ReportSettings
     from kerv_cli.lab.resolve import study_name
 
-    # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
-    words = [f"only={study_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
-    settings = composed("report", words, ReportSettings, cfg)
+    settings.only = settings.only and study_name(settings.only)
     from kerv_cli.base.places import results_dir
     from kerv_cli.cli.sweep import tell_table
     from kerv_cli.lab.store import StudyStore

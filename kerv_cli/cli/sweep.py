@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from kerv_cli.base.errors import Interrupted
+from kerv_cli.base.places import check_writable
+from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
-    Overrides,
-    ShowConfig,
     ShowPlan,
     called,
     console,
-    edge,
     in_same,
     print_json,
     print_notes,
@@ -36,18 +37,24 @@ if TYPE_CHECKING:
 SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core takes 0.5 to 1.5
 
 
-@edge
-def sweep(
-    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
-) -> None:
-    """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused."""
+@command(
+    "sweep",
+    SweepSettings,
+    keys="study task episodes policy until rerun loss runtime.workers results",
+    examples=("kerv sweep study=demo", "kerv sweep study=threshold task=[reach,push] episodes=5 --plan"),
+    each="rollout",
+)
+def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+    """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused. Without study=
+    list the studies."""
+    if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in words):
+        _list_studies(as_json)
+        return
     from kerv_cli.base.config import to_yaml
-    from kerv_cli.base.places import check_writable
     from kerv_cli.cli.rollout import planned_cells
     from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import idle_overrides, resolve
 
-    words = list(overrides or [])
     resolved = resolve(words)
     first = next(iter(resolved.settings.values()))
     if cfg:
@@ -75,6 +82,28 @@ def sweep(
         _warn(disagreements(outcome.done, Stock(store, others=False)))
     if outcome.failed:
         raise typer.Exit(1)
+
+
+def _list_studies(as_json: bool) -> None:
+    """Prints the studies of conf/ and how large each is."""
+    from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
+    from kerv_cli.base.files import read_yaml
+    from kerv_cli.base.manifests import read
+    from kerv_cli.worlds import resolve_tasks
+
+    rows, composer = [], Composer("rollout", RolloutSettings)
+    for name in groups()["study"]:
+        path = conf_dir() / "study" / f"{name}.yaml"
+        study = read(StudySettings, {"name": name, **read_yaml(path.read_text(encoding="utf-8"))}, str(path))
+        common = composer.compose(split_words(study.common))
+        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(resolve_tasks(common.task))
+        rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
+    columns = ("study", "settings", "tasks", "episodes", "in all", "")
+    if as_json:
+        print_json([dict(zip((*columns[:5], "title"), row, strict=True)) for row in rows])
+        return
+    print_table(columns, rows, "episodes: per task; in all: settings x tasks x episodes")
+    typer.echo(f"run one, e.g.: {called()} sweep study=demo; what it would do: --plan")
 
 
 def _warn(lines: Iterable[str]) -> None:
@@ -109,7 +138,6 @@ def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool
 
 def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
     """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
-    from kerv_cli.base.errors import Interrupted
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab.execute import execute
     from kerv_cli.lab.reuse import take_over
@@ -174,7 +202,7 @@ def _until_decided(
     return total
 
 
-def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> None:
+def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
     """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
     command, for the one that is named."""
     from kerv_cli.report.summary import not_in_turn, summary_table

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.config import MOST_POINTS, Composer, check_once, compose, expand, split_words, swept_keys
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import METHOD_KINDS
@@ -57,8 +57,13 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         varied = keys & {_key(word) for word in words}
         if varied:
             raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
+    if not points:
+        raise UsageError(f"study '{sweep.study.name}' has no settings: see conf/study/demo.yaml for some")
     if sweep.study.baseline not in points:
-        raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(points)}")
+        raise UsageError(
+            f"study '{sweep.study.name}' has no setting '{sweep.study.baseline}', the baseline that its others are "
+            f"compared with: add it, or name one of these by baseline=: {', '.join(points)}"
+        )
     composer = Composer("rollout", RolloutSettings)
     settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
     for setting in settings.values():
@@ -116,13 +121,15 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
     Raises:
         UsageError: no such file, or it is no study.
     """
+    check_once(overrides, ["study"])
     paths = [o.split("=", 1)[1] for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))]
     if not paths:
         return list(overrides), None
-    if len(paths) > 1:
-        raise UsageError(f"study= is given twice, {paths[0]} and {paths[-1]}: leave one out")
-    path = Path(paths[-1]).expanduser()
+    path = Path(paths[0]).expanduser()
     value = _read_study(path)
+    for key in value:
+        if key not in StudySettings.__dataclass_fields__:
+            raise UnknownName(f"key in study={path}:", key, StudySettings.__dataclass_fields__)
     try:
         study = read(StudySettings, {"name": path.stem, **value}, str(path))
     except CheckpointError as error:
