@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,9 +17,10 @@ import pytest
 from examples.insertion import SPEC as INSERTION
 from typer.testing import CliRunner
 
+from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import Part, parts
 from kerv_cli.base.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
 from kerv_cli.cli.app import app
 from kerv_cli.lab.identity import stress_of, work_of
@@ -414,3 +416,27 @@ def test_the_plan_and_the_figures_say_which_stress_it_is(tmp_path: Path, capsys:
     assert capsys.readouterr().out.startswith("expert, stress push 2: 1 tasks, 2 episodes")
     rollout(words)
     assert "stress push 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("traits", "builds", "says"),
+    [
+        (
+            {},
+            "Drift",
+            "needs the trait needed, a tuple of actions, position, images, model, range: it is None",
+        ),
+        ({"needed": ("wings",)}, "Drift", "it is ('wings',)"),
+        ({"needed": "actions"}, "Drift", "it is actions"),
+        ({"needed": ()}, "LEVELS.count", "stress 'odd' builds int, which is no subclass of Stress"),
+    ],
+)
+def test_a_kind_that_does_not_fit_gets_one_line(
+    traits: dict[str, Any], builds: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd = Part("stress", "odd", f"examples.own_stress:{builds}", traits=traits)
+    monkeypatch.setitem(registry._PARTS, "stress", {**parts("stress"), "odd": odd})
+    refuse = stressing.build if builds == "LEVELS.count" else lambda asked: stressing.check(asked, METAWORLD)
+    with pytest.raises(UsageError, match=re.escape(says)) as refused:
+        refuse(StressSettings("odd", 1))
+    assert "\n" not in str(refused.value)
