@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -389,19 +386,13 @@ def test_what_an_environment_cannot_do_is_refused() -> None:
     check(settings("world.stress.kind=object", "world.stress.level=4"))
 
 
-def kerv(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words]
-    paths = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "KERV_PLUGINS": "examples.insertion", "PYTHONPATH": os.pathsep.join(paths)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env=environment)
-
-
 WORDS = ["policy=expert", "task=insert-peg", "episodes=2", "record=0", "world.stress.kind=push"]
 
 
 def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -> None:
-    run = kerv("rollout", "-m", *WORDS, "world.stress.level=0,2", "--json", cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
+    words = ["rollout", "-m", *WORDS, f"results={tmp_path}"]
+    run = CliRunner().invoke(app, [*words, "world.stress.level=0,2", "--json"])
+    assert run.exit_code == 0, run.stderr
     rows = json.loads(run.stdout)["settings"]
     assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]
     wrong = CliRunner().invoke(app, ["rollout", *WORDS, "world.stress.level=5", f"results={tmp_path}"])
