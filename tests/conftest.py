@@ -22,6 +22,23 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 """kerv's own and the example `insertion`, taken before test modules are imported."""
 
 
+LONGEST = (
+    *("test_documented_commands", "test_studies_executors", "test_training", "test_cli", "test_training_ranks"),
+    *("test_golden", "test_older_results", "test_extending", "test_coverage", "test_views", "test_early"),
+)
+"""Files that take longest, begun first: no process is left with one of them at the end while the others idle."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Files are begun in the order of collection: pytest-xdist would begin with those of the most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, the others as they were."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
 def pytest_collection_finish() -> None:
     """Leaves libraries and collected tests out of garbage collection: they stay, and a look at all of them takes 0.3 s
     each time."""

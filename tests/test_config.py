@@ -70,14 +70,6 @@ def test_every_config_of_a_part_composes(row: int) -> None:
         assert name in parts(part.kind) or (conf_dir() / group / f"{name}.yaml").is_file()
 
 
-@pytest.mark.parametrize("study", groups()["study"])
-def test_every_study_resolves(study: str) -> None:
-    resolved = resolve([f"study={study}"])
-    assert resolved.study.name == study
-    assert resolved.study.baseline in resolved.settings
-    assert len({r.seed for r in resolved.settings.values()}) == 1
-
-
 def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
     method = compose("rollout", ["method=spec_vla", "acceptance=strict", "threshold.r=4"], s.RolloutSettings)
     assert (method.proposer.kind, method.acceptance.kind, method.threshold.r) == ("drafter", "strict", 4)

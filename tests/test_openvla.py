@@ -466,7 +466,7 @@ def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) 
         ({}, ["COPY", "environment=metaworld"], "are of 7 DoFs, the action space has 4 (dx, dy, dz, gripper)"),
         ({}, ["COPY", "environment=kitchen"], "unknown environment 'kitchen'"),
         ({}, ["COPY", "prompt=chat"], "unknown prompt 'chat'"),
-        ({}, ["COPY", "family=compact"], "only openvla is imported"),
+        ({}, ["COPY", "family=compact"], "only openvla"),
         ({}, ["COPY", "prompt_tokens=3"], "at most 3 are taken"),
         (
             {"preprocessor_config.json": {"image_resize_strategy": "letterbox"}},

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from kerv_cli.base.registry import Part, parts
 from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
@@ -196,7 +197,12 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
     sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
     values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
-    return values
+    return values | {name: float(part.built(episodes)) for name, part in own_columns().items()}
+
+
+def own_columns() -> Mapping[str, Part]:
+    """Columns that are not kerv's, by name: registered functions of a setting's episodes."""
+    return parts("column")
 
 
 def _latencies(decode_seconds: pd.Series) -> dict[str, float]:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from kerv_cli.report.measures import MICRO
+from kerv_cli.report.measures import MICRO, own_columns
 from kerv_cli.report.tables import is_number, rows_of
 
 APART = "*"
@@ -89,7 +89,8 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """The rows of one averaging as text: 95 % intervals in brackets, `–` for missing values; columns that no row uses
     are left out."""
     rows = rows_of(table, averaging)
-    used = {key: name for key, name in _WHERE_USED.items() if any(is_number(row[key]) and row[key] for row in rows)}
+    optional = {**_WHERE_USED, **{name: name.replace("_", " ") for name in own_columns()}}
+    used = {key: name for key, name in optional.items() if any(is_number(row[key]) and row[key] for row in rows)}
     limited = any(is_number(row["ceiling"]) for row in rows)
     return pd.DataFrame([_cells(row, _ALWAYS | used, limited) for row in rows])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -52,6 +52,10 @@ class TargetDescription(Description):
     cameras: tuple[str, ...]
     words: tuple[str, ...]
     provenance: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.settings.get("chunk"), int):
+            raise ValueError("settings lack chunk, the control steps of a decode")
 
     @property
     def chunk(self) -> int:
@@ -169,6 +173,30 @@ def save_module(
     digest = sha256_of(folder / WEIGHTS)
     write_json(folder / f"{kind}.json", {"format": FORMAT, "kind": kind, "sha256": digest, **description})
     return digest
+
+
+def target_fields(
+    family: str,
+    settings: Mapping[str, Any],
+    environment: str,
+    actions: ActionSpace,
+    observation: ObservationSpace,
+    cameras: Sequence[str] = (),
+    words: Sequence[str] = (),
+    provenance: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What `save_module` writes into a target.json; the arguments are the fields of `TargetDescription`. settings: what
+    the family's `build` reads, `chunk` among them."""
+    return {
+        "family": family,
+        "environment": environment,
+        "settings": dict(settings),
+        "actions": actions.as_dict(),
+        "observation": observation.as_dict(),
+        "cameras": list(cameras),
+        "words": list(words),
+        "provenance": dict(provenance or {}),
+    }
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:

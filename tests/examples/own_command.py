@@ -1,4 +1,4 @@
-"""A command from outside: `kerv seeds`, registered by `KERV_PLUGINS=own_command`."""
+"""A command from outside: `kerv seeds`, registered by `KERV_PLUGINS=examples.own_command`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def seeds(settings: SeedsSettings, as_json: AsJson = False) -> None:
 add(
     "command",
     "seeds",
-    "own_command:seeds",
+    f"{__name__}:seeds",
     SeedsSettings,
     help="Print the seeds of a task's episodes.",
     keys="task episodes use",
