@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partialmethod
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,8 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
 
     from kerv_cli.base.config import compose
     from kerv_cli.base.settings import DrafterSettings, TrainTargetSettings
-    from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
+    from kerv_cli.methods.artifacts import MadeFor
+    from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact
     from kerv_cli.targets.compact.folder import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
@@ -77,7 +79,8 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     provenance = {"parameters": sum(p.numel() for p in target.parameters())}
     digest = save_target(results / "artifacts" / "target" / name, target, "metaworld", provenance)
     drafter = Drafter.beside(DrafterSettings(), target)
-    save_drafter(results / "artifacts" / "drafter" / name, drafter, target, digest, provenance)
+    folder, made_for = results / "artifacts" / "drafter" / name, MadeFor(digest, target.actions)
+    DrafterArtifact().save(folder, drafter, made_for, provenance, settings=asdict(drafter.settings))
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from examples.own_proposer_table import FollowProposer, FollowTable, save
+from examples.own_proposer_table import FollowArtifact, FollowProposer, FollowTable
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,7 +27,7 @@ from kerv_cli.engine.chunk import Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.lab.policy import identity_of
-from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import check, needs
 from kerv_cli.methods.compose import compose as compose_decoder
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
@@ -51,7 +51,7 @@ def results(policies: Path, tmp_path: Path) -> Path:
     random = np.random.default_rng(0)
     table = FollowTable.fit([random.integers(0, 255, (400, 4))], SPEC.actions)
     description = files_of(settings_of(copied)).description
-    save(copied / "artifacts/follow/mine", table, description)
+    FollowArtifact().save(copied / "artifacts/follow/mine", table, MadeFor.of(description), {})
     return copied
 
 
@@ -152,7 +152,7 @@ def damage(path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda folder: shutil.rmtree(folder), "no follow in"),
+        (lambda folder: shutil.rmtree(folder), "no table in"),
         (lambda folder: damage(folder / "model.safetensors"), "does not match its description"),
         (lambda folder: damage(folder / "follow.json"), "cannot be read as JSON"),
     ],
@@ -166,11 +166,11 @@ def test_what_is_missing_or_damaged_gets_one_line(results: Path, change: Any, sa
 
 def test_a_table_of_another_target_or_action_space_is_refused(results: Path) -> None:
     files = files_of(settings_of(results, "policy.target=nano-vision"))
-    with pytest.raises(CheckpointError, match="is of target"):
+    with pytest.raises(CheckpointError, match="was trained for target"):
         files.check(["follow"])
     own = files_of(settings_of(results)).description
     other = dataclasses.replace(own, actions=dataclasses.replace(own.actions, control_hz=3.0))
-    save(results / "artifacts/follow/slow", FollowTable(4, 255), other)
+    FollowArtifact().save(results / "artifacts/follow/slow", FollowTable(4, 255), MadeFor.of(other), {})
     with pytest.raises(CheckpointError, match="control_hz 3"):
         files_of(settings_of(results, name="slow")).check(["follow"])
 

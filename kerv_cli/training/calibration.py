@@ -21,10 +21,10 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
     BoundarySection,
     Calibration,
+    CalibrationArtifact,
     Demonstrations,
     SkipSection,
     Variability,
-    load_calibration,
     save_calibration,
 )
 from kerv_cli.methods.compose import compose
@@ -231,7 +231,7 @@ class CalibrationRun:
         }
         sections, earlier = self._fill_empty({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target=MadeFor(self.description.sha256, space, chunk),
+            target=MadeFor.of(self.description),
             demos=Demonstrations(self.dataset.sha256, self.windows.episodes),
             window=self.settings.window,
             noise=noise,
@@ -246,7 +246,7 @@ class CalibrationRun:
         """Replaces empty sections by those of an earlier calibration of the same target -> (sections, provenance of the
         replaced ones)."""
         try:
-            earlier = load_calibration(self.path, self.description)
+            earlier = CalibrationArtifact().checked(self.path, self.description)
         except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew
             earlier = None
         reasons = {

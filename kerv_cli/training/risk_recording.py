@@ -198,14 +198,13 @@ class RiskRun:
                     raise KervError(f"the record of {task}, seed {seed}, is gone from {self.records.folder}: run again")
                 rows += record[0]
                 features += record[1]
-        target = self.artifacts.description
         origin = {
             "command": "kerv calibrate risk",
             "settings": as_plain(self.settings),
             **provenance(self.settings.runtime.device),
         }
         manifest = RiskManifest(
-            target=MadeFor(target.sha256, target.actions, target.chunk),
+            target=MadeFor.of(self.artifacts.description),
             sources={name: self._drafts_from(name) for name in self.settings.sources},
             scale=self.settings.scale,
             tasks={task: list(self.seeds) for task in self.tasks},

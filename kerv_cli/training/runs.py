@@ -18,9 +18,9 @@ from kerv_cli.base.places import artifact, find_target
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
-from kerv_cli.methods.artifacts import artifact_folder
-from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
-from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+from kerv_cli.methods.artifacts import MadeFor, Weights
+from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
@@ -252,7 +252,8 @@ class DrafterRun(Run):
         UsageError: `train.init` is set. CheckpointError: no such target or demonstrations.
     """
 
-    kind = noun = "drafter"
+    kind = "drafter"
+    artifact: Weights[Any] = DrafterArtifact()
     settings: TrainDrafterSettings
     target: Any  # a ReadableTarget
     states: TeacherStates | StatesByLength
@@ -265,7 +266,8 @@ class DrafterRun(Run):
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = self.drafter_folder()
+        name = settings.policy.named(self.artifact.kind)
+        self.folder = self.artifact.place(settings.results, name, self.target_folder)
         dataset = open_demos(settings.results, settings.demos)
         self.dataset = subset(dataset, settings.task, settings.starts)
         description = read_target(self.target_folder)
@@ -274,15 +276,11 @@ class DrafterRun(Run):
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
 
-    def drafter_folder(self) -> Path:
-        """Where the drafter is written."""
-        return artifact_folder("drafter")(self.settings.results, self.settings.policy.drafter, self.target_folder)
-
     def plan(self) -> str:
         """One line for --plan: target, observations, steps and folder."""
         s = self.settings
         return (
-            f"{self.folder}: {s.drafter.layers}-layer {self.noun} of {self.target_folder}, greedy decodes of "
+            f"{self.folder}: {s.drafter.layers}-layer {self.artifact.noun} of {self.target_folder}, greedy decodes of "
             f"{s.drafter.samples} observations, {s.train.steps} steps of {s.train.batch}"
         )
 
@@ -330,18 +328,14 @@ class DrafterRun(Run):
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """See `Run.write`."""
-        assert isinstance(module, Drafter)
-        save_drafter(self.folder, module, self.target, self.description.sha256, origin, self.settings.train.stored)
+        made_for, stored = MadeFor.of(self.description), self.settings.train.stored
+        self.artifact.save(self.folder, module, made_for, origin, stored, settings=asdict(self.settings.drafter))
 
 
 class EarlyRun(DrafterRun):
     """`kerv train drafter drafter=early`; its errors are those of DrafterRun."""
 
-    noun = "early drafter"
-
-    def drafter_folder(self) -> Path:
-        """Where the early drafter is written."""
-        return artifact_folder("early")(self.settings.results, self.settings.policy.early, self.target_folder)
+    artifact = EarlyArtifact()
 
     def teach(self, progress: Progress) -> None:
         """Collects the target's tokens and pooled prompts."""
@@ -355,11 +349,6 @@ class EarlyRun(DrafterRun):
         early.standardise(self.training.features)
         run = EarlyDistillation(early.to(self.device), self.training, self.validation, self.settings.train)
         return Job(early, len(self.training), run.loss, run.validate, self.save)
-
-    def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
-        """See `Run.write`."""
-        assert isinstance(module, EarlyDrafter)
-        save_early(self.folder, module, self.description.sha256, origin, self.settings.train.stored)
 
 
 DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": EarlyRun}

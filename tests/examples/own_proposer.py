@@ -22,7 +22,7 @@ class FollowSettings:
     depth: int = number(0, 0, 1024)  # tokens drafted at once, with its range; 0: all that are left
 
 
-register(Part("artifact", "follow", "examples.own_proposer_table:ARTIFACT"))
+register(Part("artifact", "follow", "examples.own_proposer_table:FollowArtifact"))
 register(
     Part(
         "proposer",

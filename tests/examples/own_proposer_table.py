@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +11,11 @@ import torch
 from examples.own_proposer import FollowSettings
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.methods.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
-from kerv_cli.targets.checkpoint import Description, TargetDescription, load_state, read_description, save_module
 
 
 class FollowTable(nn.Module):
@@ -46,39 +42,16 @@ class FollowTable(nn.Module):
         return table
 
 
-@dataclass(frozen=True)
-class FollowDescription(Description):
-    """The JSON beside the weights. target: SHA-256 of the target's weights."""
+class FollowArtifact(Weights[WeightsDescription]):
+    """The table's files: its weights and what every JSON of weights has."""
 
-    target: str
-    actions: ActionSpace
+    kind, noun = "follow", "table"
+    again = "run 'kerv train drafter drafter=follow'"
+    schema = WeightsDescription
+    any_chunk = True
 
-
-def save(folder: Path, table: FollowTable, target: TargetDescription) -> str:
-    """Writes weights and description -> SHA-256 of the weights."""
-    return save_module(folder, "follow", table, {"target": target.sha256, "actions": target.actions.as_dict()})
-
-
-def described(folder: Path, request: Request) -> FollowDescription:
-    """Raises CheckpointError: missing, damaged, or another target's."""
-    own, target = read_description(folder, "follow", FollowDescription), request.description
-    own.actions.check_same(target.actions, f"the table in {folder}", "the target", statistics=True)
-    if own.target != target.sha256:
-        raise CheckpointError(f"the table in {folder} is of target {own.target[:12]}, not of {target.sha256[:12]}")
-    return own
-
-
-def load(folder: Path, request: Request) -> FollowTable:
-    """The weights; errors as `described`."""
-    actions = described(folder, request).actions
-    table = FollowTable(actions.dofs, actions.tokens)
-    load_state(table, folder, "follow")
-    return table
-
-
-ARTIFACT = Artifact(
-    "follow", artifact_folder("follow"), lambda folder, request: described(folder, request).sha256, load
-)
+    def module(self, description: WeightsDescription, target: Any) -> FollowTable:
+        return FollowTable(description.actions.dofs, description.actions.tokens)
 
 
 class FollowProposer(ChainProposer):

@@ -21,6 +21,6 @@ class DrafterProposerSettings:
     nodes: int = number(15, 1, MOST_TOKENS)  # tree nodes kept after reranking
 
 
-add("artifact", "drafter", _DRAFTER + "ARTIFACT")
+add("artifact", "drafter", _DRAFTER + "DrafterArtifact")
 _build = (_DRAFTER + "DrafterProposer.build", DrafterProposerSettings)
 add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES)

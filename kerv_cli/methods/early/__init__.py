@@ -7,7 +7,7 @@ from kerv_cli.base.registry import PREFILL, add
 
 _DRAFTER = "kerv_cli.methods.early.drafter:"
 
-add("artifact", "early", _DRAFTER + "ARTIFACT")
+add("artifact", "early", _DRAFTER + "EarlyArtifact")
 # chains: it drafts whole chains, so that a merged draft can take it as a source
 _build = _DRAFTER + "EarlyProposer.build"
 add("proposer", "early", _build, needs=("early",), colour=0xD4A6C8, when=PREFILL, chains=True)
