@@ -19,13 +19,13 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.settings import (
     BuildDatastoreSettings,
     CalibrateSettings,
-    DrafterSettings,
     PolicySettings,
     RolloutSettings,
 )
 from kerv_cli.lab.policy import check, decoder_for, identity_of, unseen_tasks
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
 from kerv_cli.methods.retrieval import QdrantSearchSettings
 from kerv_cli.methods.retrieval.datastore import Datastore
@@ -216,7 +216,7 @@ def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As `whole`, with an early drafter, a recorded risk and a learned score of it."""
     results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
-    drafter = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
+    drafter = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
     made_for, own = MadeFor.of(described), {"settings": asdict(drafter.settings)}
     early = EarlyArtifact().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
     store = Artifacts(str(results), PolicySettings(target="nano-state")).check(["datastore"])["datastore"]

@@ -17,12 +17,14 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
-from kerv_cli.base.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.settings import PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Request
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
@@ -195,7 +197,7 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     assert {f"l1_{name}" for name in SEVEN.names} <= metrics.keys()
     for drafter in (
         DrafterSettings(samples=12, unroll=2),
-        DrafterSettings(kind="early", layers=1, width=16, rank=4, history=2, samples=30),
+        EarlySettings(layers=1, width=16, rank=4, history=2, samples=30),
     ):
         asked = TrainDrafterSettings(
             policy=PolicySettings(target="arm"), drafter=drafter, train=train, results=str(tmp_path)

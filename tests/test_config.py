@@ -7,9 +7,9 @@ from itertools import chain
 import pytest
 
 from kerv_cli.base import settings as s
-from kerv_cli.base.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.base.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.registry import part_of, parts
+from kerv_cli.base.registry import PART_GROUPS, part_of, parts
 from kerv_cli.lab.resolve import resolve
 
 SCHEMAS = {

@@ -15,10 +15,11 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.settings import TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.cli.app import app
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.methods.artifacts import MadeFor, Request
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (
     EarlyArtifact,
     EarlyDrafter,
@@ -32,6 +33,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.early_distillation import (
     EarlyDistillation,
+    EarlyRun,
     EarlySamples,
     accepted_tokens,
     measure,
@@ -40,7 +42,7 @@ from kerv_cli.training.early_distillation import (
 )
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.observations import split
-from kerv_cli.training.runs import EarlyRun, drafter_run
+from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -49,7 +51,7 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
-SMALL = DrafterSettings(kind="early", layers=2, width=32, rank=8, history=2, samples=1000)
+SMALL = EarlySettings(layers=2, width=32, rank=8, history=2, samples=1000)
 SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10
 STRICT = torch.from_numpy(ACTIONS.strict_tokens(8))
 
@@ -61,7 +63,7 @@ def shaped(settings: TargetSettings = SHAPE) -> CompactTarget:
 FEATURES = shaped().pooled_width
 
 
-def drafter(settings: DrafterSettings = SMALL, target: CompactTarget | None = None) -> EarlyDrafter:
+def drafter(settings: EarlySettings = SMALL, target: CompactTarget | None = None) -> EarlyDrafter:
     torch.manual_seed(0)
     early = EarlyDrafter.beside(settings, target or shaped()).eval()
     for parameter in early.parameters():
@@ -122,7 +124,7 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
 def test_packed_weights_give_the_same_logits(history: int, is_intel: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("kerv_cli.targets.compact.kernels.is_intel", lambda: is_intel)
     torch.manual_seed(0)
-    early = drafter(DrafterSettings(kind="early", layers=2, width=24, rank=6, history=history))
+    early = drafter(EarlySettings(layers=2, width=24, rank=6, history=history))
     for parameter in early.parameters():  # fresh blocks begin as the identity, with gains of one
         parameter.data += 0.3 * torch.randn_like(parameter)
     features = torch.randn(9, early.mean.numel())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 import subprocess
@@ -17,12 +18,15 @@ from examples.own_proposer_table import FollowArtifact, FollowProposer, FollowTa
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_calibration import write_dataset
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
+from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, as_plain, settings_from
 from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
@@ -32,6 +36,7 @@ from kerv_cli.methods.compose import check, needs
 from kerv_cli.methods.compose import compose as compose_decoder
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 
@@ -175,8 +180,43 @@ def test_a_table_of_another_target_or_action_space_is_refused(results: Path) -> 
         files_of(settings_of(results, name="slow")).check(["follow"])
 
 
+def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Path) -> None:
+    write_dataset(results / "artifacts/demos/few")
+    policy = ("policy.target=nano-state", "+policy.others.follow=learnt", f"results={results}")
+
+    def kerv(*words: str) -> str:
+        done = CliRunner().invoke(app, [*words, *policy])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    few = ("demos=few", "drafter.share=0.5", "train.steps=6", "train.batch=8", "train.validate_every=3", "train.lr=0.1")
+    assert "a table of" in kerv("train", "drafter", "drafter=follow", *few, "--plan")
+    assert "score" in kerv("train", "drafter", "drafter=follow", *few)
+    described = json.loads((results / "artifacts/follow/learnt/follow.json").read_text())
+    assert described["settings"] == {"kind": "follow", "share": 0.5}
+    kerv("rollout", "task=[reach]", "prefill_draft=follow", "episodes=1", "world.horizon=12", "record=0")
+    files = files_of(settings_of(results, name="learnt"))
+    assert files.check(["follow"])["follow"] == described["sha256"]
+    assert not torch.equal(files.load("follow").logits, FollowTable(4, 255).logits)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["drafter=folow"], "unknown drafter 'folow': did you mean follow"),
+        (["drafter=follow", "drafter.width=3"], "unknown key 'drafter.width'"),
+        (["drafter=follow", "drafter.share=0"], "drafter.share=0.0: above 0, at most 1"),
+        (["drafter.kind=follow"], "drafter.kind=follow: choose drafter=follow, each has settings of its own"),
+    ],
+)
+def test_its_training_has_settings_of_its_own(words: list[str], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        drafter_run(compose("train_drafter", words, TrainDrafterSettings))
+
+
 def test_it_is_a_choice_like_any_other() -> None:
     known = groups()
+    assert "follow" in known["drafter"]
     assert "follow" in known["proposer"]
     assert "follow" in known["prefill_draft"]
     with pytest.raises(KervError, match="did you mean follow"):

@@ -268,8 +268,8 @@ def kerv(*words: str) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
-    from kerv_cli.base.settings import DrafterSettings
     from kerv_cli.methods.artifacts import MadeFor
+    from kerv_cli.methods.early import EarlySettings
     from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
     from kerv_cli.targets.checkpoint import load_target
 
@@ -278,7 +278,7 @@ def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     target, description = load_target(results / "artifacts/target/nano-state")
     for name, seed in (("nano-state", 0), ("other", 1)):
         torch.manual_seed(seed)
-        early = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
+        early = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
         folder, own = results / "artifacts/early" / name, {"settings": asdict(early.settings)}
         EarlyArtifact().save(folder, early, MadeFor.of(description), {}, **own)
     code, output = kerv("calibrate", "risk", *common(results), "episodes=2", "features=true", "world.horizon=24")

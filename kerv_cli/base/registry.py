@@ -51,6 +51,9 @@ METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifi
 PART_GROUPS = (*METHOD_KINDS, "datastore")
 """Settings of a rollout whose choices are parts; YAML files in conf/<group>/ are further choices."""
 
+SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
+"""All groups of settings whose choices are parts: those of a rollout, and what `kerv train drafter` trains."""
+
 PREFILL, STATES = "prefill", "states"
 """When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
 
@@ -71,9 +74,9 @@ def nothing(settings: Any) -> tuple[str, ...]:
 class Part:
     """One choice among the parts of a kind.
 
-    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
-    environment, stress or executor. build: `module:function` or `module:Class.method`; its arguments are documented
-    where the kind is used, of a method's parts in `methods/context.py`.
+    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, score, artifact, drafter,
+    target, environment, stress or executor. build: `module:function` or `module:Class.method`; its arguments are
+    documented where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
     settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
     and timeline.

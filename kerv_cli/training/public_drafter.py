@@ -9,8 +9,9 @@ from typing import Any
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import BuildDrafterSettings, DrafterSettings
+from kerv_cli.base.settings import BuildDrafterSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterArtifact
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
 

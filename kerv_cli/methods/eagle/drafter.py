@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.protocol import Cache as AnyCache
 from kerv_cli.engine.protocol import ReadableTarget, Target
@@ -26,6 +25,7 @@ from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.engine.unread import Unread
 from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import PublicShape, load_public
 from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.trunk import LayerStack

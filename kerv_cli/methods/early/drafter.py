@@ -17,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
@@ -27,6 +26,7 @@ from kerv_cli.engine.tree import TokenTree
 from kerv_cli.engine.unread import TreeRows, Unread
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.kernels import FastLinear, RowNorm, gain_of
 from kerv_cli.targets.compact.packable import Packable, Packed
 
@@ -71,7 +71,7 @@ class EarlyDrafter(Packable):
     strict: Tensor
     packed: PackedEarly | None
 
-    def __init__(self, settings: DrafterSettings, actions: ActionSpace, chunk: int, features: int) -> None:
+    def __init__(self, settings: EarlySettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
         self.settings, self.actions, self.chunk = settings, actions, chunk
         self.tokens = chunk * actions.dofs
@@ -86,7 +86,7 @@ class EarlyDrafter(Packable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     @classmethod
-    def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> EarlyDrafter:
+    def beside(cls, settings: EarlySettings, target: ReadableTarget) -> EarlyDrafter:
         """A fresh early drafter for the target's action space, H and F."""
         return cls(settings, target.actions, target.chunk, target.pooled_width)
 
@@ -309,7 +309,7 @@ class EarlyProposer(ChainProposer):
 class EarlyDescription(WeightsDescription):
     """An early drafter's JSON."""
 
-    settings: DrafterSettings
+    settings: EarlySettings
 
 
 class EarlyArtifact(Weights[EarlyDescription]):
