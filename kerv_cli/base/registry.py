@@ -58,6 +58,22 @@ PREFILL, STATES = "prefill", "states"
 """When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
 
 
+TRAITS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "score", "artifact", "drafter"), ()),
+    "proposer": ("when", "chains", "sides"),
+    "boundary": ("chooses",),
+    "skip": ("takes_draft", "merges", "retrieves", "parallel"),
+    "predictor": ("fitted",),
+    "target": ("weights", "importer", "images_alone"),
+    "environment": ("names",),
+    "stress": ("needed",),
+    "executor": ("package", "extra"),
+}
+"""Every kind of part -> the traits that one may have."""
+REQUIRED = {"proposer": "when", "stress": "needed"}
+"""Kind -> the trait that each must have."""
+
+
 @dataclass
 class NoSettings:
     """A part without settings but its name."""
@@ -114,13 +130,33 @@ def register(part: Part) -> Part:
     """Adds a part. The same code can register a name again, e.g. when a module is reloaded.
 
     Raises:
-        UsageError: another part of that kind has the name.
+        UsageError: another part of that kind has the name; no such kind, or its traits are not those of its kind.
     """
+    check_traits(part)
     there = _PARTS.setdefault(part.kind, {}).get(part.name)
     if there is not None and there.build != part.build:
         raise UsageError(f"{part.kind} '{part.name}' is registered twice: {there.build} and {part.build}")
     _PARTS[part.kind][part.name] = part
     return part
+
+
+def check_traits(part: Part) -> None:
+    """Refuses a part of an unknown kind, or whose traits are not those of its kind.
+
+    Raises:
+        UnknownName: no such kind. UsageError: a trait is unknown or missing, or settings have no `kind`.
+    """
+    if part.kind not in TRAITS:
+        raise UnknownName("kind of part", part.kind, TRAITS)
+    what, known = f"{part.kind} '{part.name}'", TRAITS[part.kind]
+    has = f"the traits of this kind are {', '.join(known)}" if known else "this kind has none"
+    unknown, required = [name for name in part.traits if name not in known], REQUIRED.get(part.kind)
+    if unknown:
+        raise UsageError(f"{what} has an unknown trait {unknown[0]}: {has}")
+    if required is not None and required not in part.traits:
+        raise UsageError(f"{what} lacks the trait {required}: {has}")
+    if part.kind in SETTINGS_GROUPS and "kind" not in getattr(part.settings, "__dataclass_fields__", ()):
+        raise UsageError(f"{what}: its settings {part.settings.__name__} must be a dataclass with a field kind")
 
 
 def add(
