@@ -32,8 +32,7 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.lab.policy import identity_of
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.compose import check, needs
-from kerv_cli.methods.compose import compose as compose_decoder
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.training.runs import drafter_run
@@ -131,14 +130,14 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     results: Path, overrides: str, wanted: set[str]
 ) -> None:
     asked = settings_of(results, *overrides.split())
-    check(asked.parts(), asked.chunk, 4)
-    assert set(needs(asked.parts())) == wanted
+    method = Method.of(asked)
+    assert set(method.needs) == wanted
     identity = identity_of(asked)
     assert {"target", *wanted} == set(identity) - {"observation"}
     assert settings_from(as_plain(asked)) == asked
     files = files_of(asked)
     assert files.load("follow") is files_of(asked).load("follow")
-    decoder = compose_decoder(asked.parts(), files.target, files.load)
+    decoder = method.decoder(files.target, files.load)
     plain = Decoder(files.target)
     state = np.random.default_rng(1).uniform(0, 0.5, 39)
     for chosen in (decoder, plain):

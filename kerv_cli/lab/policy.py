@@ -22,8 +22,7 @@ from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import check as check_method
-from kerv_cli.methods.compose import check_batch, compose, needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
@@ -58,7 +57,7 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     profile = timing.identity_of(settings)
     artifacts = artifacts_of(settings)
     shown = shown_to(artifacts.description.settings)
-    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: shown}
+    return {**artifacts.check(Method.of(settings).needs), **profile, OBSERVATION: shown}
 
 
 def shown_to(target: Mapping[str, object]) -> str:
@@ -99,18 +98,13 @@ def check(settings: RolloutSettings) -> None:
     artifacts = artifacts_of(settings)
     target = artifacts.description
     target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
-    method = settings.parts()
+    method = Method.of(settings)
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
-    check_method(method, settings.chunk, target.chunk, target.parallel)
-    check_batch(method, settings.method, settings.rollout.batch)
+    method.check(target, settings.rollout.batch)
     timing.check_method(settings, spec, target)
-    kinds = needs(method)
-    artifacts.check(kinds)
-    if "calibration" in kinds and method["threshold"].kind in ("kinematic", "change"):
-        calibration = artifacts.load("calibration")
-        for task in tasks if method["threshold"].k_s is None else ():
-            calibration.k_s(task)
+    artifacts.check(method.needs)
+    method.check_levels(tasks, artifacts.load)
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
@@ -182,7 +176,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         decoder: ActionDecoder = ExpertDecoder()
     else:
         artifacts = artifacts_of(settings)
-        decoder = compose(settings.parts(), artifacts.target, artifacts.load, task, settings.chunk)
+        decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
         if settings.deviation_every > 0:
             reference = Decoder(artifacts.target, chunk=settings.chunk)
             decoder = Sampled(decoder, reference, settings.deviation_every)
@@ -197,7 +191,7 @@ def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
         UsageError, CheckpointError: as `check`.
     """
     artifacts = artifacts_of(settings)
-    decoder = compose(settings.parts(), artifacts.target, artifacts.load, chunk=settings.chunk)
+    decoder = Method.of(settings).decoder(artifacts.target, artifacts.load)
     return BatchDecoder(decoder, settings.deviation_every)
 
 

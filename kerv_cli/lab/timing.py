@@ -8,7 +8,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings, TimingSettings
 from kerv_cli.lab import latency
 from kerv_cli.lab.clock import CHUNK
-from kerv_cli.methods.compose import needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
     if timing.latency == MEASURED:
         return latency.Measured(ar_seconds / measured if ar_seconds else 1.0)
     assert target is not None
-    drafter = latency.DRAFTER if "drafter" in needs(settings.parts()) else ()
+    drafter = latency.DRAFTER if "drafter" in Method.of(settings).needs else ()
     profile = latency.open_profile(settings.results, timing.profile, (*latency.FORWARDS, *drafter))
     if not ar_seconds:
         return latency.Profiled(profile)

@@ -27,7 +27,7 @@ from kerv_cli.methods.calibration import (
     Variability,
     save_calibration,
 )
-from kerv_cli.methods.compose import compose
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.boundary import BoundaryRanges
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.observations import check_frames, check_shown, instruction_of
@@ -210,7 +210,7 @@ class CalibrationRun:
         """The decoder of pre-sampling: the settings' proposer, acceptance and threshold."""
         s = self.settings
         method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
-        return compose(method.parts(), self.artifacts.target, self.artifacts.load)
+        return Method.of(method).decoder(self.artifacts.target, self.artifacts.load)
 
     def finish(
         self, variability: dict[str, Variability], boundary: BoundarySection | None, skip: SkipSection | None

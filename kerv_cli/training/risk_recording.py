@@ -27,7 +27,7 @@ from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.run import close_worlds, open_world
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.compose import compose
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.risk.gate import episode_numbers
 from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, save_risk
@@ -180,7 +180,7 @@ class RiskRun:
         recorder = Recorder(target, sources, scores, self.settings)
         method = RolloutSettings(acceptance=part_of("acceptance", "relaxed").settings()).parts()
         method["prefill_draft"] = _default_settings(self.settings.sources[0])
-        decoder = compose(method, target, self.artifacts.load, task)
+        decoder = Method(method).decoder(target, self.artifacts.load, task)
         return Decoder(target, replace(decoder.parts, skip=recorder)), recorder
 
     def finish(self, draw: Draw | None = None) -> RiskRecording:
