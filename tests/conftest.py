@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partialmethod
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 
 from kerv_cli.base import registry
 from kerv_cli.base.config import Composer, conf_dir
-from kerv_cli.base.registry import PART_GROUPS
+from kerv_cli.base.registry import SETTINGS_GROUPS
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -67,7 +68,9 @@ def compositions() -> Iterator[None]:
 
     def created(self: Composer[Any], command: str, schema: type) -> None:
         create(self, command, schema)
-        parts = tuple((name, part.settings) for group in PART_GROUPS for name, part in registry.parts(group).items())
+        parts = tuple(
+            (name, part.settings) for group in SETTINGS_GROUPS for name, part in registry.parts(group).items()
+        )
         self._composed = kept.setdefault((command, schema, conf_dir(), parts), {})
 
     with pytest.MonkeyPatch.context() as patch:
@@ -80,8 +83,10 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     import torch
 
     from kerv_cli.base.config import compose
-    from kerv_cli.base.settings import DrafterSettings, TrainTargetSettings
-    from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
+    from kerv_cli.base.settings import TrainTargetSettings
+    from kerv_cli.methods.artifacts import MadeFor
+    from kerv_cli.methods.eagle import DrafterSettings
+    from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact
     from kerv_cli.targets.compact.folder import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
@@ -94,7 +99,8 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     provenance = {"parameters": sum(p.numel() for p in target.parameters())}
     digest = save_target(results / "artifacts" / "target" / name, target, "metaworld", provenance)
     drafter = Drafter.beside(DrafterSettings(), target)
-    save_drafter(results / "artifacts" / "drafter" / name, drafter, target, digest, provenance)
+    folder, made_for = results / "artifacts" / "drafter" / name, MadeFor(digest, target.actions)
+    DrafterArtifact().save(folder, drafter, made_for, provenance, settings=asdict(drafter.settings))
 
 
 @pytest.fixture(scope="session")

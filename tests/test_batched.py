@@ -22,7 +22,7 @@ from test_parallel import some_observation, target
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.settings import DrafterSettings, RuntimeSettings
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.sequences import read_study
 from kerv_cli.cli.app import app
@@ -37,6 +37,7 @@ from kerv_cli.lab.plan import Cell, blocks_of, make_cell
 from kerv_cli.lab.run import CellRunner
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.together import Request, run_together
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.unverified import AlwaysSkip
@@ -117,7 +118,7 @@ def test_parallel_passes_of_a_batch_are_those_of_its_rows() -> None:
 def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, history: int) -> None:
     policy = target()
     torch.manual_seed(3)
-    drafter = EarlyDrafter.beside(DrafterSettings(width=32, layers=1), policy).eval()
+    drafter = EarlyDrafter.beside(EarlySettings(layers=1, width=32), policy).eval()
     torch.nn.init.normal_(drafter.head.weight, std=1.0)
     draft = EarlyProposer(drafter, policy)
     parts = Parts(prefill_draft=draft, skip=AlwaysSkip(draft), threshold=Fixed(radius))

@@ -21,7 +21,7 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.cli.app import app
-from kerv_cli.methods.calibration import NEVER, Calibration, Variability, load_calibration, save_calibration
+from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability, save_calibration
 from kerv_cli.methods.heisd.boundary import BoundaryRanges
 from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
@@ -203,7 +203,7 @@ def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
     assert row == task_levels(match(store, "reach-v3"), 1.9, 0.5)
     assert row.share > 0
     assert made.skip_levels("reach-v3", store.content) == (row.low, row.s_min, row.high)
-    assert load_calibration(run.path, run.description) == made
+    assert CalibrationArtifact().checked(run.path, run.description) == made
     with pytest.raises(CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again"):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):

@@ -12,10 +12,10 @@ import yaml
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base import settings as s
-from kerv_cli.base.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.base.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import description
-from kerv_cli.base.registry import part_of, parts
+from kerv_cli.base.registry import PART_GROUPS, part_of, parts
 from kerv_cli.lab.resolve import resolve
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items() if name != "completion"}

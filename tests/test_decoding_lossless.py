@@ -13,12 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.settings import DrafterSettings, TargetSettings
+from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target, save_module, target_fields

@@ -20,10 +20,11 @@ from safetensors.torch import load_file, save_file
 from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
 from typer.testing import CliRunner
 
-from kerv_cli.base.settings import BuildTargetSettings, DrafterSettings
+from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target

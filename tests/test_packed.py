@@ -12,9 +12,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.base.settings import DrafterSettings, TargetSettings
+from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact import kernels
 from kerv_cli.targets.compact.kernels import FastLinear, has_blocked_layouts

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -317,8 +318,9 @@ def kerv(*words: str) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
-    from kerv_cli.base.settings import DrafterSettings
-    from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+    from kerv_cli.methods.artifacts import MadeFor
+    from kerv_cli.methods.early import EarlySettings
+    from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
     from kerv_cli.targets.checkpoint import load_target
 
     results = tmp_path_factory.mktemp("risk")
@@ -326,8 +328,9 @@ def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     target, description = load_target(results / "artifacts/target/nano-state")
     for name, seed in (("nano-state", 0), ("other", 1)):
         torch.manual_seed(seed)
-        early = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
-        save_early(results / "artifacts/early" / name, early, description.sha256, {})
+        early = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
+        folder, own = results / "artifacts/early" / name, {"settings": asdict(early.settings)}
+        EarlyArtifact().save(folder, early, MadeFor.of(description), {}, **own)
     code, output = kerv("calibrate", "risk", *common(results), "episodes=2", "features=true", "world.horizon=24")
     assert code == 0, output
     return results

@@ -22,7 +22,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.files import to_yaml as plain_yaml
 from kerv_cli.base.limits import check_settings, description
-from kerv_cli.base.registry import PART_GROUPS, PREFILL, part_of
+from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, part_of
 from kerv_cli.base.settings import DERIVED_FROM, choices_of
 
 T = TypeVar("T")
@@ -50,7 +50,7 @@ def groups() -> dict[str, list[str]]:
     """Config groups and the names in them: {"method": ["ar", "spec_vla", …], …}."""
     root = conf_dir()
     names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
-    for group in PART_GROUPS:
+    for group in SETTINGS_GROUPS:
         names.setdefault(group, set()).update(_parts_of(group))
     return {group: sorted(names[group]) for group in sorted(names)}
 
@@ -183,7 +183,7 @@ def _set_scalar(nodes: Any, settings: Any, override: Any) -> None:
 def _check_ranges(settings: Any) -> None:
     """Checks every setting against its range, and what only a part knows about its settings."""
     check_settings(settings)
-    for group in PART_GROUPS:
+    for group in SETTINGS_GROUPS:
         part_settings = getattr(settings, group, None)
         part = None if part_settings is None else part_of(group, part_settings.kind)
         # another part's settings are refused by the method's check
@@ -209,14 +209,15 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
     store = ConfigStore.instance()
     base = OmegaConf.structured(schema)
     _open_mappings(base)
-    for group in set(PART_GROUPS) & set(base):
+    for group in set(SETTINGS_GROUPS) & set(base):
         base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
     store.store(name=f"base_{command}", node=base)
     choices = [{group: name} for group, name in choices_of(schema).items()]
     store.store(name=f"own_{command}", node={"defaults": [f"base_{command}", *choices, "_self_"]})
-    for group in PART_GROUPS:
+    for group in SETTINGS_GROUPS:
         for name, part in _parts_of(group).items():
-            _store_part(group, name, part.settings)
+            own_file = (conf_dir() / group / f"{name}.yaml").is_file()  # it begins with the part's settings
+            _store_part(f"base_{group}" if own_file else group, name, part.settings)
     own = not (conf_dir() / f"{command}.yaml").is_file()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return hydra_compose(f"own_{command}" if own else command, overrides=list(overrides))

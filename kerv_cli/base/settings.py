@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from kerv_cli.base import manifests
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, limits, number, setting
-from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, find, part_of
+from kerv_cli.base.registry import METHOD_KINDS, SETTINGS_GROUPS, find, part_of
+
+S = TypeVar("S")
 
 EVALUATION_SEED = 100_000
 """First evaluation seed. Demonstrations use seeds below it, so training and evaluation never share a world."""
@@ -373,23 +375,6 @@ class DemosImportSettings(CommandSettings):
 
 
 @dataclass
-class DrafterSettings:
-    """Shapes of a drafter (docs/methods.md). eagle: decoder layers of the target's width, behind its states (§2.2).
-    early: a residual network from the prompt and the last actions to the whole chunk, before the target runs (§5)."""
-
-    kind: str = setting("eagle", "eagle: behind the target's states; early: before the target runs")
-    layers: int = number(1, 0, 1024, help="decoder layers, or residual blocks")
-    width: int = number(512, 1, 65_536, help="early: hidden units")
-    rank: int = number(64, 1, 65_536, help="early: features per token in front of the bins")
-    history: int = number(2, 0, 1024, help="early: last executed actions it reads")
-    noise: float = number(0.0, 0, 100, help="uniform noise on the input states, training only")
-    unroll: int = number(3, 1, 64, help="passes fed with its own predicted states, as drafting does; 1: the paper's")
-    samples: int = number(12_000, 1, 10**8, help="observations whose greedy decodes it is trained on, at most")
-    state_weight: float = number(1.0, 0, 1e6, help="smooth-L1 on the hidden state")
-    token_weight: float = number(0.1, 0, 1e6, help="soft cross-entropy with the target's distribution")
-
-
-@dataclass
 class TrainDrafterSettings(RunSettings):
     """`kerv train drafter`: policy.target is imitated; policy.drafter, policy.early: name of the new one."""
 
@@ -400,7 +385,7 @@ class TrainDrafterSettings(RunSettings):
     demos: str = setting("mt10", DEMOS)
     task: list[str] = setting([], "tasks and suites whose demonstrations are used; empty: all")
     starts: str = choice("all", "all", "half", help=STARTS)
-    drafter: DrafterSettings = setting(DrafterSettings, "shapes: eagle, early (conf/drafter)")
+    drafter: Any = setting(chosen("drafter", "eagle"), "its shapes and loss: eagle, early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
 
@@ -596,17 +581,22 @@ def as_plain(settings: Any) -> dict[str, Any]:
 
 
 def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSettings:
-    """The inverse of `as_plain` for a rollout; every part's settings become their own class. tolerant: as
-    `manifests.read`.
+    """The inverse of `as_plain` for a rollout; arguments and errors as `read_settings`."""
+    return read_settings(RolloutSettings, plain, tolerant)
+
+
+def read_settings(schema: type[S], plain: Mapping[str, Any], tolerant: bool = False) -> S:
+    """The inverse of `as_plain` for settings of the class `schema`; every part's settings become their own class.
+    tolerant: as `manifests.read`.
 
     Raises:
         CheckpointError: not such settings. UnknownName: a part that is not registered here.
     """
-    settings = manifests.read(RolloutSettings, dict(plain), "a stored setting", tolerant)
-    for group in PART_GROUPS:
-        value = getattr(settings, group)
+    settings = manifests.read(schema, dict(plain), "a stored setting", tolerant)
+    for group in SETTINGS_GROUPS:
+        value = getattr(settings, group, None)
         if not isinstance(value, Mapping):
             continue  # a kind of part that is younger than these settings: its default
-        schema = part_of(group, value["kind"]).settings
-        setattr(settings, group, manifests.read(schema, value, f"a stored setting's {group}", tolerant))
+        part_settings = part_of(group, value["kind"]).settings
+        setattr(settings, group, manifests.read(part_settings, value, f"a stored setting's {group}", tolerant))
     return settings

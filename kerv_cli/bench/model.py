@@ -17,7 +17,6 @@ from kerv_cli.base.places import results_dir, shipped_dir
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.settings import (
     BenchSettings,
-    DrafterSettings,
     PolicySettings,
     TargetSettings,
     TrainTargetSettings,
@@ -26,6 +25,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
 from kerv_cli.bench.machine import median_seconds
 from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact.packed import FastLinear, pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, BlockedLinear, multiplies_bfloat16

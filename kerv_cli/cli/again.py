@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.manifests import read
-from kerv_cli.base.settings import StudySettings, TrainDrafterSettings, TrainTargetSettings, settings_from
+from kerv_cli.base.settings import (
+    StudySettings,
+    TrainDrafterSettings,
+    TrainTargetSettings,
+    read_settings,
+    settings_from,
+)
 from kerv_cli.lab.catalogue import ROLLOUT, RunEntry, description_of, find_run, store_of
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.identity import OBSERVATION
@@ -101,6 +107,6 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
-    settings = read(TrainDrafterSettings, value, str(path))
-    weights: dict[str, Any] = {("drafter" if run.kind == "drafter" else "early"): name}
-    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, **weights)))
+    settings = read_settings(TrainDrafterSettings, value, tolerant=True)
+    others = settings.policy.others | {run.kind: name}
+    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, others=others)))

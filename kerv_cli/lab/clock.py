@@ -19,7 +19,7 @@ from kerv_cli.base.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSet
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.cost import Profile, predicted, read_profile, sequence_of_record
 from kerv_cli.engine.record import DecodeRecord, Delay
-from kerv_cli.methods.compose import needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Noise, Predictor, build_predictor
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -224,7 +224,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
     if timing.latency == MEASURED:
         return Measured(ar_seconds / measured if ar_seconds else 1.0)
     assert target is not None
-    drafter = ("draft", "feed") if "drafter" in needs(settings.parts()) else ()
+    drafter = ("draft", "feed") if "drafter" in Method.of(settings).needs else ()
     profile = _open_profile(settings.results, timing.profile, ("encode", "prefill", "verify", *drafter))
     if not ar_seconds:
         return Profiled(profile)

@@ -22,8 +22,7 @@ from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import check as check_method
-from kerv_cli.methods.compose import check_batch, compose, needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
@@ -60,7 +59,7 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     # every row of a table has it, so that a privileged policy is recognised
     observation = str(artifacts.description.settings.get(OBSERVATION, "vision"))
     observation = "state (privileged)" if observation == "state" else observation
-    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: observation}
+    return {**artifacts.check(Method.of(settings).needs), **profile, OBSERVATION: observation}
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
@@ -93,18 +92,13 @@ def check(settings: RolloutSettings) -> None:
     artifacts = artifacts_of(settings)
     target = artifacts.description
     target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
-    method = settings.parts()
+    method = Method.of(settings)
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
-    check_method(method, settings.chunk, target.chunk, target.parallel)
-    check_batch(method, settings.method, settings.rollout.batch)
+    method.check(target, settings.rollout.batch)
     clock.check(settings, spec, target)
-    kinds = needs(method)
-    artifacts.check(kinds)
-    if "calibration" in kinds and method["threshold"].kind in ("kinematic", "change"):
-        calibration = artifacts.load("calibration")
-        for task in tasks if method["threshold"].k_s is None else ():
-            calibration.k_s(task)
+    artifacts.check(method.needs)
+    method.check_levels(tasks, artifacts.load)
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
@@ -176,7 +170,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         decoder: ActionDecoder = ExpertDecoder()
     else:
         artifacts = artifacts_of(settings)
-        decoder = compose(settings.parts(), artifacts.target, artifacts.load, task, settings.chunk)
+        decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
         if settings.deviation_every > 0:
             reference = Decoder(artifacts.target, chunk=settings.chunk)
             decoder = Sampled(decoder, reference, settings.deviation_every)
@@ -191,7 +185,7 @@ def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
         UsageError, CheckpointError: as `check`.
     """
     artifacts = artifacts_of(settings)
-    decoder = compose(settings.parts(), artifacts.target, artifacts.load, chunk=settings.chunk)
+    decoder = Method.of(settings).decoder(artifacts.target, artifacts.load)
     return BatchDecoder(decoder, settings.deviation_every)
 
 

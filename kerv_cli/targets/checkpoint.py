@@ -92,14 +92,6 @@ class TargetDescription(Description):
 
 T = TypeVar("T", bound=Description)
 
-_TRAINED_BY = {
-    "target": "train target",
-    "drafter": "train drafter",
-    "early": "train drafter drafter=early",
-    "score": "train score",
-}
-"""Kind of a description -> the command that makes one."""
-
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
     """Writes a safetensors file atomically. Raises StorageError: writing failed."""
@@ -214,8 +206,7 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     """The JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
     path = folder / f"{kind}.json"
     if not path.is_file():
-        remedy = f"run 'kerv {_TRAINED_BY[kind]}', or name" if kind in _TRAINED_BY else "name"
-        raise CheckpointError(f"no {kind} in {folder}: {remedy} a folder that holds one")
+        raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
     status = os.stat(path)
     version = status.st_ino, status.st_size, status.st_mtime_ns
     description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]

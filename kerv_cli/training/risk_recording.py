@@ -27,7 +27,7 @@ from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.run import close_worlds, open_world
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.compose import compose
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.risk.gate import episode_numbers
 from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, decoding_of, save_risk
@@ -181,7 +181,7 @@ class RiskRun:
         recorder = Recorder(target, sources, scores, self.settings)
         method = RolloutSettings(acceptance=self.settings.acceptance, threshold=self.settings.threshold).parts()
         method["prefill_draft"] = _default_settings(self.settings.sources[0])
-        decoder = compose(method, target, self.artifacts.load, task, self.settings.chunk)
+        decoder = Method(method, self.settings.chunk).decoder(target, self.artifacts.load, task)
         return Decoder(target, replace(decoder.parts, skip=recorder), self.settings.chunk), recorder
 
     def finish(self, draw: Draw | None = None) -> RiskRecording:
@@ -199,14 +199,13 @@ class RiskRun:
                     raise KervError(f"the record of {task}, seed {seed}, is gone from {self.records.folder}: run again")
                 rows += record[0]
                 features += record[1]
-        target = self.artifacts.description
         origin = {
             "command": "kerv calibrate risk",
             "settings": as_plain(self.settings),
             **provenance(self.settings.runtime.device),
         }
         manifest = RiskManifest(
-            target=MadeFor(target.sha256, target.actions, target.chunk),
+            target=MadeFor.of(self.artifacts.description),
             sources={name: self._drafts_from(name) for name in self.settings.sources},
             scale=self.settings.scale,
             tasks={task: list(self.seeds) for task in self.tasks},

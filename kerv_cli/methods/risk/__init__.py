@@ -48,8 +48,8 @@ def hash_of_recording(path: Path) -> str:
     return hashlib.sha256(f"{sha256_of(path)} {CERTIFICATE}".encode()).hexdigest()
 
 
-add("artifact", "risk", "kerv_cli.methods.risk.recording:ARTIFACT")
-add("artifact", "score", _SCORES + "ARTIFACT")
+add("artifact", "risk", "kerv_cli.methods.risk.recording:RiskArtifact")
+add("artifact", "score", _SCORES + "ScoreArtifact")
 _gate = ("kerv_cli.methods.risk.gate:RiskSkip.build", RiskSkipSettings, needs_of_risk, check_risk)
 add("skip", "risk", *_gate, colour=0x3B6FB6, takes_draft=True, merges=True, retrieves=True)
 for _name, _score, _needs in (

@@ -20,15 +20,13 @@ import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of, write_folder, write_json
-from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import steps_of
-from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
 from kerv_cli.methods.risk import RiskSkipSettings, hash_of_recording
 from kerv_cli.methods.risk.alarm import alarm_level
 from kerv_cli.methods.risk.betting import p_value
 
-FORMAT = 1
 GRID = 40  # candidate levels: quantiles of the scores
 DECODES, FEATURES = "decodes.parquet", "features.npy"
 AGAIN = "run 'kerv calibrate risk'"
@@ -211,43 +209,23 @@ def save_risk(
     return recording
 
 
-def read_risk(folder: Path, request: Request) -> RiskManifest:
-    """The manifest in `folder`, which must have been recorded for this target.
+class RiskArtifact(Artifact[RiskManifest]):
+    """The recording's files."""
 
-    Raises:
-        CheckpointError: none there, damaged, or another target's.
-    """
-    path = folder / "risk.json"
-    if not path.is_file():
-        raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
-    manifest = read_manifest(folder)
-    check_files(folder, manifest.files, AGAIN)
-    target = request.description
-    manifest.target.check_same(
-        MadeFor(target.sha256, target.actions, target.chunk), f"the risk in {folder}", "recorded", AGAIN
-    )
-    return manifest
+    kind, noun, made, again = "risk", "risk recording", "recorded", AGAIN
+    schema = RiskManifest
 
+    def sources(self, description: RiskManifest) -> Mapping[str, str]:
+        """What sources and scores read."""
+        return description.artifacts
 
-def read_manifest(folder: Path) -> RiskManifest:
-    """The manifest in `folder`, unchecked but for its form; raises CheckpointError."""
-    return read_file(RiskManifest, folder / "risk.json", f"a recording of format {FORMAT}: {AGAIN}")
+    def digest(self, place: Path, description: RiskManifest) -> str:
+        """Of the description and of what is made of it: another certificate is other work."""
+        return hash_of_recording(self.json(place))
 
-
-def _sources(folder: Path) -> MadeFrom:
-    return MadeFrom(f"the risk in {folder}", "recorded", AGAIN, read_manifest(folder).artifacts)
-
-
-def _check(folder: Path, request: Request) -> str:
-    read_risk(folder, request)
-    return hash_of_recording(folder / "risk.json")
-
-
-def _load(folder: Path, request: Request) -> RiskRecording:
-    return RiskRecording(read_risk(folder, request), pq.read_table(folder / DECODES))
-
-
-ARTIFACT = Artifact("risk", artifact_folder("risk"), _check, _load, _sources)
+    def load(self, place: Path, request: Request) -> RiskRecording:
+        """The recorded decodes."""
+        return RiskRecording(self.checked(place, request.description), pq.read_table(place / DECODES))
 
 
 # --- levels at which a gate's risk is certified: Learn-then-Test over episodes (Angelopoulos et al. 2021)
