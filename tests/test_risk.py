@@ -29,7 +29,7 @@ from kerv_cli.methods.risk import RiskSkipSettings
 from kerv_cli.methods.risk.alarm import Audit, Evidence, alarm_level, largest_evidence
 from kerv_cli.methods.risk.betting import more_to_decide, p_value, wealth
 from kerv_cli.methods.risk.gate import RiskSkip
-from kerv_cli.methods.risk.recording import RiskRecording, certify, episodes_needed, read_manifest
+from kerv_cli.methods.risk.recording import RiskArtifact, RiskRecording, certify, episodes_needed
 from kerv_cli.methods.risk.scores import Draft
 from kerv_cli.report.risk import coverage
 from kerv_cli.training import risk_recording
@@ -150,7 +150,7 @@ SHIPPED = Path(__file__).parents[1] / "results/pretrained/mt10-vision/risk"
 
 def test_the_alarm_is_false_as_often_as_it_says_on_recorded_episodes_that_set_no_level() -> None:
     """The shipped recording, whose tasks differ in risk: half of its episodes set level and alarm, the others count."""
-    drafts = RiskRecording(read_manifest(SHIPPED), pq.read_table(SHIPPED / "decodes.parquet")).losses("early")
+    drafts = RiskRecording(RiskArtifact().read(SHIPPED), pq.read_table(SHIPPED / "decodes.parquet")).losses("early")
     scores, losses, settings = drafts.scores["odds"], drafts.losses, RiskSkipSettings()
     decodes = [np.flatnonzero(drafts.episodes == number) for number in range(int(drafts.episodes.max()) + 1)]
     random, rates = np.random.default_rng(0), []
