@@ -407,28 +407,21 @@ class BenchSettings(RunSettings):
     model: str = "mt10-vision"  # target=: a policy, or a shape of conf/target with random weights
     dtype: str = "auto"  # of a shape: float32 | bfloat16 | auto, the faster one here; a policy has runtime.dtype
     repeats: int = number(30, 3, 100_000)  # of every measurement; medians and 95th percentiles are over them
-    tokens: list[int] = field(default_factory=lambda: [7, 16], metadata=limits(3, 256))  # N, of a chunk
-    drafter_depth: int = number(6, 1, 1024)  # tokens of the drafter's chain whose time counts in the ceilings
-
-    def check_together(self, prefix: str) -> None:
-        """Raises UsageError without a chunk to measure."""
-        if not self.tokens:
-            raise UsageError(f"{prefix}tokens=[]: name at least one N")
-
-
-@dataclass
-class BenchReplaySettings(BenchSettings):
-    """`kerv bench replay`: a study's recorded decodes, executed on another target."""
-
-    recorded: str = "main"  # study=: whose decodes
-    decodes: int = number(40, 2, 1_000_000)  # of every setting, evenly over tasks and seeds
-    model: str = "vla-150m"
-    profiles: dict[str, str] = field(
-        default_factory=dict
-    )  # name -> a bench's document, of this target on another device
+    tokens: list[int] = field(
+        default_factory=lambda: [7, 16], metadata=limits(4, 256)
+    )  # N, of a chunk; a shape's: most
+    projected: str = ""  # a shape of conf/target whose profiles on `projections` are written too
     projections: dict[str, list[float]] = field(  # device -> published GB/s and dense bfloat16 TFLOP/s
         default_factory=lambda: {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4090": [1008.0, 165.0]}
     )
+
+    def check_together(self, prefix: str) -> None:
+        """Raises UsageError without a chunk to measure, and for a device without its two figures."""
+        if not self.tokens:
+            raise UsageError(f"{prefix}tokens=[]: name at least one N")
+        for name, figures in self.projections.items():
+            if len(figures) != 2 or min(figures) <= 0:
+                raise UsageError(f"{prefix}projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")
 
 
 @dataclass
@@ -437,6 +430,7 @@ class ReportSettings(CommandSettings):
 
     only: str | None = None  # name of one study (study=NAME on the command line); default: all that are there
     against: str | None = None  # results folder with another run of that study: how far the two agree
+    on: list[str] = field(default_factory=list)  # profiles of 'kerv bench' that price the study's decodes
     loss: float = number(3.0, above=0, most=99.9)  # --choose: bound on the loss of success against the baseline, points
 
 

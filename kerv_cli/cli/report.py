@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, console, edge, print_json
+from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, console, edge, print_json, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.base.settings import ReportSettings
@@ -38,26 +38,32 @@ def report(
 
     # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
     words = [f"only={study_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
+    words = [f"on=[{word[3:].strip('[]')}]" if word.startswith("on=") else word for word in words]  # one, or several
     settings = composed("report", words, ReportSettings, cfg)
     from kerv_cli.base.places import results_dir
     from kerv_cli.cli.sweep import tell_table
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.agreement import agreement_summary
     from kerv_cli.report.report import report as write_report
+    from kerv_cli.report.reprice import ASSUMES, repriced_summary
     from kerv_cli.report.tables import rows_of
 
     if choose:
         _choose(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.against)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.against, settings.on)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
-        print_json({"files": output.files, "studies": tables})
+        priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
+        print_json({"files": output.files, "studies": tables, **priced})
         return
     for name, table in output.tables.items():
         tell_table(table, StudyStore(results_dir(settings.results), name), words)
     if output.agreement is not None:
         console().print(agreement_summary(output.agreement))
+    if output.priced is not None:
+        priced = repriced_summary(output.priced)
+        print_table(priced.columns, priced.itertuples(index=False), ASSUMES)
     for path in output.files:
         typer.echo(str(path))
 

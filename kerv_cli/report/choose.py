@@ -37,7 +37,8 @@ class Choice:
     pairs: int
     front: tuple[str, ...]
     chosen: str
-    speedup: float
+    episode_speedup: float
+    speedup: float  # per control step
     loss_at_most: float  # of the chosen one, points of success, 95 % confidence
     undecided: dict[str, float]
 
@@ -65,6 +66,7 @@ def _choice(where: str, rows: Sequence[dict[str, Any]], axis: str, loss: float) 
         pairs=max((int(row["pairs"]) for row in candidates), default=0),
         front=tuple(str(row["label"]) for row in pareto(rows)),
         chosen=str(best["label"]) if best else "",
+        episode_speedup=float(best["episode_speedup"]) if best else math.nan,
         speedup=float(best["speedup"]) if best else math.nan,
         loss_at_most=_loss_at_most(best) if best else math.nan,
         undecided={label: pairs for label, pairs in undecided.items() if math.isfinite(pairs)},
@@ -91,23 +93,25 @@ def _needed(row: Mapping[str, Any], loss: float) -> float:
 
 
 def boldness(row: Mapping[str, Any], axis: str) -> tuple[float, float]:
-    """What a choice maximises: the position on the axis, where `_BOLD` gives it a direction, then the speedup."""
+    """What a choice maximises: the position on the axis, where `_BOLD` gives it a direction, then the speed per
+    episode."""
     value = row.get(axis)
     position = math.inf
     if axis in _BOLD:
         numeric = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
         position = _BOLD[axis][0] * float(value) if numeric else -math.inf  # type: ignore[arg-type]
-    speed = float(row["speedup"]) if is_number(row["speedup"]) else -math.inf
+    speed = float(row["episode_speedup"]) if is_number(row["episode_speedup"]) else -math.inf
     return (position, speed)
 
 
 def pareto(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows that no other one beats in speedup and success at once, the fastest first. The baseline's speedup is 1."""
+    """Rows that no other one beats in speed per episode and success at once, the fastest first. The baseline's speed
+    is 1."""
 
     def point(row: Mapping[str, Any]) -> tuple[float, float]:
-        return (1.0 if row["label"] == row["baseline"] else float(row["speedup"]), float(row["success"]))
+        return (1.0 if row["label"] == row["baseline"] else float(row["episode_speedup"]), float(row["success"]))
 
-    timed = [row for row in rows if row["label"] == row["baseline"] or is_number(row["speedup"])]
+    timed = [row for row in rows if row["label"] == row["baseline"] or is_number(row["episode_speedup"])]
     front = [row for row in timed if not any(_beats(point(other), point(row)) for other in timed)]
     return sorted(front, key=point, reverse=True)
 
@@ -125,7 +129,8 @@ def sentence(choice: Choice, axis: str, loss: float, baseline: str) -> str:
     """The choice for the whole suite in words."""
     bound = f"loses less than {loss:g} points of success against {baseline}, with 95 % confidence"
     if choice.chosen:
-        speed = f", {choice.speedup:.2f} times as fast as {baseline}" if is_number(choice.speedup) else ""
+        speeds = f"{choice.episode_speedup:.2f} times as fast as {baseline} per episode, {choice.speedup:.2f} per step"
+        speed = f", {speeds}" if is_number(choice.episode_speedup) else ""
         return f"{boldest(axis)} that {bound}: {choice.chosen}{speed} ({choice.pairs} pairs)"
     return f"{choice.pairs} pairs do not yet show a setting that {bound}; {_missing(choice)}"
 
