@@ -31,7 +31,6 @@ SCHEMAS = {
     "view": s.ViewSettings,
     "sweep": s.SweepSettings,
     "bench": s.BenchSettings,
-    "bench_replay": s.BenchReplaySettings,
 }
 # which command each group belongs to
 HOMES = {"target": "train_target", "drafter": "train_drafter", "study": "sweep"}

@@ -32,7 +32,6 @@ SCHEMAS = {
     "build_target": s.BuildTargetSettings,
     "build_drafter": s.BuildDrafterSettings,
     "bench": s.BenchSettings,
-    "bench_replay": s.BenchReplaySettings,
     "serve": s.ServeSettings,
     "report": s.ReportSettings,
 }

@@ -40,14 +40,14 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
 
     Args:
         table: `study_table`.
-        axis: column for the x axis, e.g. `threshold.r`; empty, or without two numbers in it: one row per setting.
+        axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: one row per setting.
         title: the study's.
         averaging: the rows that are drawn; named in the figure.
     """
     rows = table[table["averaging"] == averaging].reset_index(drop=True)
     if is_stressed(rows):
         return {"": stress_figure(rows, title, about(rows, averaging), averaging)}
-    numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
+    numbers = any(len(group) > 1 for group in series_of(rows, axis).values())
     with mpl.rc_context(STYLE):
         figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
         if rows["time_per_step_ms"].notna().any():

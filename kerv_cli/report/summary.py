@@ -58,9 +58,7 @@ class SummaryTable:
         yield _printed(frame)
         first, several = self.table["baseline"].iloc[0], self.table["baseline"].nunique() > 1
         against = f"{first}, under the same stress" if several else first
-        yield Text(
-            f"brackets: 95 % intervals; p: exact McNemar test against {against}; per episode, per step: its time over"
-        )
+        yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {against}")
         if frame["per step"].str.endswith(APART).any():
             yield Text(f"{APART} of those pairs alone that were measured in turn")
         untimed = list(dict.fromkeys(self.table.loc[self.table["time_per_step_ms"].isna(), "label"]))
@@ -94,7 +92,7 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
 
 def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
     """Fewer columns, for a terminal, and the shares of decodes in one."""
-    dropped = ["AL", "AFEP", "ms / step", "p95 ms", "ceiling", "forwards / step", "lost/won", "deviation"]
+    dropped = ["AL", "AFEP", "ms / step", "p95 ms", "ceiling", "lost/won", "deviation"]
     frame = frame.drop(columns=dropped, errors="ignore")
     shares = [name for key, name in _WHERE_USED.items() if key in _PERCENT and name in frame]
     if shares:
