@@ -40,7 +40,8 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
 
     Args:
         table: `study_table`.
-        axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: one row per setting.
+        axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: one row per
+            setting.
         title: the study's.
         averaging: the rows that are drawn; named in the figure.
     """

@@ -92,6 +92,7 @@ class _Reporter:
         """The files of one study; errors as `report`."""
         store = StudyStore(self.results, name)
         data = load_study(store)
+        priced = repriced_table(data, self.machines) if self.machines else None
         whole, per_task = study_table(data), per_task_table(data)
         if self.publish:
             check_publishable(data, whole)
@@ -105,7 +106,6 @@ class _Reporter:
             figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, "successes of each task"))
         plots = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
-        priced = repriced_table(data, self.machines) if self.machines else None
         sections = [self.machines_section(priced), self.latency_section(data), self.stress_section(whole, name)]
         sections += [self.prediction_section(target) for target in prediction.predicting_targets(settings)]
         page = store.root / "report.html"
