@@ -18,8 +18,8 @@ from kerv_cli.bench import phases as measuring
 from kerv_cli.bench.ceilings import ceilings
 from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.model import layer_weights, open_model
-from kerv_cli.bench.phases import Dummy, Laps, Phase, costs_of, decoders, flipped, projected
-from kerv_cli.bench.profile import profile_of
+from kerv_cli.bench.phases import Dummy, Laps, Phase, costs_of, decoders, flipped
+from kerv_cli.bench.profile import profile_of, projected, shares
 from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import HOST_PHASES, Profile, Work, prices, read_profile, work_of
 
@@ -44,14 +44,16 @@ def test_a_recorded_decode_becomes_its_forwards() -> None:
     assert found.nodes.tolist() == [0, 14, 0]
     assert found.levels.tolist() == [0, 14, 0]
     assert found.feeds.tolist() == [True, True, False]
-    assert found.host.tolist() == [0.375]  # proposing is the drafter's, whose cost the profile knows
+    assert (found.host.tolist(), found.propose.tolist()) == ([0.375], [0.0])  # the drafter's: by the profile
     assert found.needs == ["encode", "prefill", "verify", "feed", "draft"]
 
 
-def test_others_drafts_count_as_recorded_or_beside_the_drafter_by_the_profile() -> None:
-    alone = work(("verify", 0, 30, 2, "merged"), ("verify", 3, 12, 12, "jacobi"))
-    assert alone.host.tolist() == [0.875]
-    assert alone.needs == ["encode", "prefill", "verify"]
+def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded() -> None:
+    jacobi = work(PREFILL, ("verify", 1, 12, 12, "jacobi"))
+    assert jacobi.propose.tolist() == [0.5]
+    assert jacobi.needs == ["encode", "prefill", "verify"]
+    merged = work(("verify", 0, 30, 2, "merged"), ("verify", 3, 12, 12, "jacobi"))
+    assert merged.needs == ["encode", "prefill", "verify", "early"]
     beside = work(("verify", 0, 15, 2, "early"), ("verify", 3, 12, 12, "drafter"), looked_up=True)
     assert beside.needs == ["encode", "prefill", "verify", "feed", "draft", "early", "retrieval"]
 
@@ -64,7 +66,7 @@ def test_a_parallel_decode_is_one_forward_over_prompt_and_chunk() -> None:
 def test_a_skipped_decode_has_no_forward() -> None:
     found = work(("skip", 0, 0, 16, "early"))
     assert len(found.nodes) == 0
-    assert found.needs == ["encode"]
+    assert found.needs == ["encode", "early"]
 
 
 def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk() -> None:
@@ -83,7 +85,8 @@ def test_bytes_and_operations_of_a_forward() -> None:
     assert read == 4 * weights + 2 * s.layers * 13 * s.width * 4
     assert flops == 2 * weights * 3 + 4 * s.layers * s.width * (3 * 10 + 1 + 2 + 3)
     assert sizes.needs("verify", 3, 10) == (read, flops)
-    assert sizes.needs("tree", 5, 10) == (0, 0)
+    assert sizes.needs("encode", 1, 10) == (0, 0)
+    assert sizes.needs("tree", 5, 10)[1] == 8 * sizes.needs("draft", 5, 10)[1]
 
 
 @pytest.mark.bits
@@ -143,7 +146,10 @@ def test_the_cost_model_adds_the_forwards_up() -> None:
     assert known.seconds("verify", 32) == pytest.approx(1.31)
     drafted = work(PREFILL, ("verify", 1, 5, 5, "drafter"))
     assert prices(drafted, known) == pytest.approx([1 + 4 + 0.3 + 1.05 + 0.4 + 0.375])
-    assert prices(drafted, known, host=2.0) == pytest.approx([1 + 4 + 0.3 + 1.05 + 0.4 + 0.75])
+    skipped = work(("skip", 0, 0, 16, "early"))
+    assert prices(skipped, known) == pytest.approx([1 + 0.5 + 0.375])
+    early = Profile(31, {**known.phases, "early": ((1,), (0.7,))}, 16)
+    assert prices(skipped, early) == pytest.approx([1 + 0.7 + 0.375])
 
 
 def test_ceilings_are_those_of_the_definition() -> None:
@@ -157,13 +163,17 @@ def test_ceilings_are_those_of_the_definition() -> None:
     assert not {"ar", "expert", "early_unverified"} & set(found)
 
 
-def test_a_projection_keeps_the_share_of_the_floor() -> None:
-    phase = Phase("verify", 1, 0.02, 0.02, 0.02, 1e8, 1e6, 0.01)
-    (there,) = projected([phase], Machine(1e10, 1e12), Machine(1e12, 1e14), 0.0)
-    assert there.seconds == pytest.approx(2e-4)
-    assert projected([phase], Machine(1e10, 1e12), Machine(1e12, 1e14), 1e-3)[0].seconds == 1e-3
-    twice = projected([phase], Machine(1e10, 1e12), Machine(1e12, 1e14), 0.0, lambda kind, rows: (2e8, 2e6))
-    assert twice[0].seconds == pytest.approx(4e-4)
+def test_a_projection_keeps_the_shares_of_the_floor() -> None:
+    here, there = Machine(1e10, 1e12), Machine(1e12, 1e14)
+    token = Phase("verify", 1, 0.02, 0.02, 0.02, 1e8, 1e6, 0.01)
+    prefill = Phase("prefill", 31, 0.05, 0.05, 0.05, 1e8, 4e10, 0.04)
+    assert shares([token, prefill], here) == pytest.approx((0.5, 0.8))
+    assert shares([token], here) == pytest.approx((0.5, 0.5))
+    costs = projected([token, prefill], (0.5, 0.8), here, there, 1)
+    assert [p.seconds for p in costs] == pytest.approx([2e-4, 5e-4])
+    assert projected([token], (0.5, 0.8), here, there, 100)[0].seconds == pytest.approx(1.5e-3)
+    encoder = Phase("encode", 1, 0.02, 0.02, 0.02, 0, 0, 0)
+    assert projected([encoder], (0.5, 0.8), here, there, 1)[0].seconds == pytest.approx(2e-4)
 
 
 @pytest.fixture
@@ -192,7 +202,7 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
     assert next(p["name"] for p in document["phases"] if p["kind"] == "verify") == "one token"
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).one_token == single
-    assert (read_profile(path).tokens, read_profile(path).gauge > 0) == (8, True)
+    assert read_profile(path).tokens == 8
     there = read_profile(tmp_path / "bench/vla-150m-bfloat16-h100-sxm.json")
     assert (there.about["projected"], there.about["device_name"], there.prompt) == (True, "H100 SXM", 31)
     assert set(there.phases) == set(read_profile(path).phases)

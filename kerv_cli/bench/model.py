@@ -63,7 +63,8 @@ class Sizes:
         """Bytes and operations of a cost of that kind; 0 where they are not counted. prompt: P."""
         s = self.settings
         drafter = float(layer_weights(s) + 2 * s.width**2 + s.width * self.vocabulary)
-        passes = {"feed": (1, rows), "draft": (rows - 1, rows - 1)}  # over the drafter's weights, and rows in them
+        # passes over the drafter's weights, and rows in them; a level of its tree is eight wide
+        passes = {"feed": (1, rows), "draft": (rows - 1, rows - 1), "tree": (rows - 1, 8 * (rows - 1))}
         if kind in ("prefill", "verify"):
             return self.forward(rows, prompt if kind == "verify" else 0)
         times, tokens = passes.get(kind, (0, 0))

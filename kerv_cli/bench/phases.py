@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.record import Round
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.lab.cells import reference_decode
 from kerv_cli.lab.policy import decoder_for
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.spec_vla.rules import Relaxed
@@ -30,7 +29,7 @@ _WARM_UP = 2  # cycles that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
-_SOURCES = {"early": "early_unverified", "retrieval": "retrieval_unverified"}
+SOURCES = {"early": "early_unverified", "retrieval": "retrieval_unverified"}
 _TASK = "reach-v3"
 
 Key = tuple[str, int]
@@ -63,7 +62,7 @@ class Phase:
         """The phase in words, for tables."""
         if self.kind == "verify":
             return "one token" if self.rows == 1 else f"verify {self.rows}"
-        return self.kind if self.kind in ("encode", *_SOURCES) else f"{self.kind} {self.rows}"
+        return self.kind if self.kind in ("encode", *SOURCES) else f"{self.kind} {self.rows}"
 
     def as_dict(self) -> dict[str, float | str]:
         """For JSON: the fields, and rates in GB/s and GFLOP/s."""
@@ -148,19 +147,17 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
 
 
 @torch.inference_mode()
-def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase], float]:
+def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
     """Times every decoder of `decoders` by turns, a decode each, `repeats` times; then measures the machine again.
 
     Returns:
-        The machine's best rates, the costs with floors from these rates, and the median seconds of the reference
-        workload.
+        The machine's best rates, and the costs with floors from these rates.
     """
     device, evicting = model.target.device, torch.ones(_EVICTING)
-    every, seconds, gauge = decoders(model), dict[Key, list[float]](), []
+    every, seconds = decoders(model), dict[Key, list[float]]()
     sources = source_decoders(settings)
     for turn in range(_WARM_UP + settings.repeats):
         found: list[tuple[Key, float]] = []
-        gauge.append(reference_decode("cpu"))
         for decoder in every:
             evicting.sum()
             clock = Laps(device)
@@ -176,7 +173,7 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
         for key, value in found if turn >= _WARM_UP else ():
             seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
-    return machine, phases_of(seconds, model.sizes, machine), float(np.median(gauge))
+    return machine, phases_of(seconds, model.sizes, machine)
 
 
 def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine) -> list[Phase]:
@@ -190,7 +187,7 @@ def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Mac
     return phases
 
 
-_ORDER = ("encode", "prefill", "verify", "feed", "draft", "tree", *_SOURCES)
+_ORDER = ("encode", "prefill", "verify", "feed", "draft", "tree", *SOURCES)
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
@@ -200,7 +197,7 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     try:
         return {
             kind: decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
-            for kind, method in _SOURCES.items()
+            for kind, method in SOURCES.items()
         }
     except KervError:
         return {}
@@ -220,25 +217,3 @@ def flipped(model: Model, chunks: int) -> tuple[int, int]:
         differ += sum(played.accepted < len(played.drafted) for played in again.rounds)
         compared += len(tokens)
     return differ, compared
-
-
-def projected(phases: Sequence[Phase], here: Machine, there: Machine, least: float, needs: Any = None) -> list[Phase]:
-    """The phases on a device that is not at hand: each needs its floor there, divided by the share of the floor that it
-    reached here; forwards at least `least` seconds. A projection, not a measurement.
-
-    Args:
-        needs: (kind, rows) -> bytes and operations, of another shape; None: those of the phases.
-    """
-    projections = []
-    for phase in phases:
-        read, flops = (phase.read, phase.flops) if needs is None else needs(phase.kind, phase.rows)
-        floor = there.floor(read, flops)
-        if phase.kind in _SOURCES:  # of the small policy, on the host
-            seconds = phase.seconds
-        elif floor > 0 and phase.share > 0:
-            seconds = max(least, floor / min(1.0, phase.share))
-        else:  # without a floor, e.g. encode: scales with bandwidth
-            seconds = phase.seconds * here.bandwidth / there.bandwidth
-        projections.append(replace(phase, seconds=seconds, p95=seconds, least=seconds, read=read, flops=flops,
-                                   floor=floor))  # fmt: skip
-    return projections

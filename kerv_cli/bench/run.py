@@ -105,8 +105,8 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
     began = time.perf_counter()
     Decoder(model.target).decode(model.observation)
     cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
-    machine, phases, gauge = measure(model, machine, settings)
-    profile = profile_of(phases, model.size, gauge)
+    machine, phases = measure(model, machine, settings)
+    profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
     card = card_of(model, machine, max(settings.tokens))
     return Bench(model, machine, card, cold, phases, by_tokens, flipped(model, FLIP_CHUNKS), profile)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ FORMAT = 2
 
 DRAFTER = "drafter"
 _SOURCES = {"early": "early", "merged": "early", "retrieval": "retrieval"}
-"""Proposer -> the cost of its draft, where the drafter drafted in the same decode."""
+"""Proposer -> the cost of its draft. Merged drafts are early ones, and what is retrieved shows otherwise."""
 _WIDE = 32  # nodes from which on a draft of unknown settings is a tree of few levels
 _LEVELS = 5
 _HOST = ("accept", "rectify", "other")
@@ -35,14 +34,13 @@ class Profile:
     """Seconds of every forward by its rows, and of drafts. Between measured rows times are interpolated, behind the
     last ones continued in a straight line.
 
-    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks; 0: not said. gauge: seconds of
-    the reference workload on the CPU at the time; NaN: not measured. about: target, machine, versions.
+    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks; 0: not said. about: target,
+    machine, versions.
     """
 
     prompt: int
     phases: Mapping[str, tuple[tuple[int, ...], tuple[float, ...]]]
     tokens: int = 0
-    gauge: float = math.nan
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def seconds(self, kind: str, rows: int) -> float:
@@ -74,8 +72,7 @@ class Profile:
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
-        gauge = None if math.isnan(self.gauge) else self.gauge
-        return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "gauge": gauge, "phases": phases}
+        return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "phases": phases}
 
 
 def read_profile(path: Path, least: int = 1) -> Profile:
@@ -89,15 +86,8 @@ def read_profile(path: Path, least: int = 1) -> Profile:
         stored = document["profile"]
         form = int(stored.get("format", 1))
         phases = {k: (tuple(v["rows"]), tuple(v["seconds"])) for k, v in stored["phases"].items()}
-        gauge = stored.get("gauge")
         about = {key: value for key, value in document.items() if isinstance(value, str | bool | int | float)}
-        profile = Profile(
-            int(stored["prompt"]),
-            phases,
-            int(stored.get("tokens", 0)),
-            math.nan if gauge is None else float(gauge),
-            about,
-        )
+        profile = Profile(int(stored["prompt"]), phases, int(stored.get("tokens", 0)), about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{path} holds no latency profile: make one with 'kerv bench'") from error
     if not least <= form <= FORMAT:
@@ -115,9 +105,9 @@ class Work:
 
     decode: (n,) which decode. prefill: (n,) bool. nodes, accepted: (n,) of the draft. levels: (n,) of the drafter's
     draft, 0 where it did not draft; tree: (n,) bool, more than a chain. feeds: (n,) bool, the drafter is fed behind it.
-    host: (decodes,) seconds, as recorded, of all that does not depend on the target's size: acceptance, rectification,
-    and proposers other than the drafter. sources: kind -> (decodes,) drafts besides the drafter's, whose seconds cannot
-    be told from its own.
+    host: (decodes,) seconds, as recorded, of acceptance and all else that does not depend on the target's size, but for
+    proposing. propose: the same of proposing, 0 where the drafter, which follows the target's shape, drafted. sources:
+    kind -> (decodes,) bool, whether there was such a draft besides.
     """
 
     decode: np.ndarray
@@ -128,6 +118,7 @@ class Work:
     tree: np.ndarray
     feeds: np.ndarray
     host: np.ndarray
+    propose: np.ndarray
     sources: Mapping[str, np.ndarray]
 
     @property
@@ -171,17 +162,15 @@ def work_of(
     depth, top_k = drafter or (_LEVELS, 0)
     tree = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
     levels = np.where(tree, np.minimum(depth, size - rounds["start"] - 1), nodes) * drafts
-    host = sum(phases[name] for name in _HOST) + np.where(has_drafter, 0.0, phases["propose"])
+    host, propose = sum(phases[name] for name in _HOST), np.where(has_drafter, 0.0, phases["propose"])
     kinds = {kind: [name for name, of in _SOURCES.items() if of == kind] for kind in set(_SOURCES.values())}
-    others = {
-        kind: has_drafter & (np.bincount(every, np.isin(proposer, names), decodes) > 0) for kind, names in kinds.items()
-    }
-    others["retrieval"] |= has_drafter & looked_up
+    others = {kind: np.bincount(every, np.isin(proposer, names), decodes) > 0 for kind, names in kinds.items()}
+    others["retrieval"] |= looked_up
     last = np.diff(every, append=decodes) > 0
     forward = mode != "skip"
     accepted = np.where(parallel, 0, rounds["accepted"])
     arrays = (every, rounds["start"] == 0, nodes, accepted, levels, tree, has_drafter[every] & ~last)
-    return Work(*(array[forward] for array in arrays), host, others)
+    return Work(*(array[forward] for array in arrays), host, propose, others)
 
 
 def sequence_of_record(decode: DecodeRecord) -> Work:
@@ -201,9 +190,10 @@ def predicted(work: Work, profile: Profile) -> float:
     return float(prices(work, profile).sum())
 
 
-def prices(work: Work, profile: Profile, host: float = 1.0) -> np.ndarray:
+def prices(work: Work, profile: Profile) -> np.ndarray:
     """(decodes,) seconds by the cost model: the profile's costs of the forwards, of the drafter's passes and of the
-    states it is fed, and the recorded host seconds times `host`. A draft whose cost the profile lacks is free."""
+    states it is fed, of early and retrieved drafts, and the recorded host seconds. Where the profile lacks the costs of
+    those drafts, they take what was recorded."""
     rows = work.nodes + np.where(work.prefill, profile.prompt, 1)
     seconds = np.zeros(len(rows))
     for kind, chosen in (("prefill", work.prefill), ("verify", ~work.prefill)):
@@ -215,12 +205,12 @@ def prices(work: Work, profile: Profile, host: float = 1.0) -> np.ndarray:
     if work.feeds.any():
         fed = work.accepted + np.where(work.prefill, profile.prompt, 1)
         seconds += np.where(work.feeds, profile.times("feed", fed), 0.0)
-    total = profile.seconds("encode", 1) + host * work.host
-    total = total + np.bincount(work.decode, seconds, len(work.host))
-    for kind, drafts in work.sources.items():
-        if drafts.any() and profile.phases.get(kind, ((), ()))[0]:
-            total = total + drafts * profile.seconds(kind, 1)
-    return np.asarray(total)
+    total = profile.seconds("encode", 1) + work.host + np.bincount(work.decode, seconds, len(work.host))
+    used = {kind: drafts for kind, drafts in work.sources.items() if drafts.any()}
+    if missing(list(used), profile):
+        return np.asarray(total + work.propose)
+    drafting = sum((drafts * profile.seconds(kind, 1) for kind, drafts in used.items()), np.zeros(len(total)))
+    return np.asarray(total + np.where(drafting > 0, drafting, work.propose))
 
 
 def missing(needs: Sequence[str], profile: Profile) -> list[str]:

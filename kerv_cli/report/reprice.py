@@ -28,6 +28,7 @@ ASSUMES = (
     "and target decoded the same tokens in the same control steps; success is the recorded policy's"
 )
 _COLUMNS = ("seed", "index", "rounds", "similarity", *(f"seconds.{phase}" for phase in HOST_PHASES))
+_SHIPPED = "-profile.json"
 _ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
 _SPEEDS = ("episode_speedup", "speedup")
 _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
@@ -57,10 +58,10 @@ def open_machines(results: Path | str, names: Iterable[str]) -> list[Machine]:
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     machines = []
     for name in names:
-        places = (as_path(name), *(folder / f"{name}.json" for folder in folders))
+        places = (as_path(name), *(folder / f"{name}{end}" for folder in folders for end in (".json", _SHIPPED)))
         path = next((place for place in places if place.is_file()), None)
         if path is None:
-            known = sorted({place.stem for folder in folders for place in folder.glob("*.json")})
+            known = sorted({p.name.removesuffix(_SHIPPED) for folder in folders for p in folder.glob(f"*{_SHIPPED}")})
             raise UsageError(
                 f"on={name}: no such profile, make one with 'kerv bench target=TARGET'"
                 + (f", or take one of {', '.join(known)}" if known else "")
@@ -82,7 +83,7 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
     """
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
     labels = [label for label in data.plan.labels if label in episodes and _decodes(episodes[label])]
-    works = {label: _recorded(data, label, episodes[label]) for label in labels}
+    works = {label: _recorded(data, label) for label in labels}
     rows = []
     for machine in machines:
         _check(machine, works)
@@ -129,16 +130,14 @@ def _decodes(episodes: pd.DataFrame) -> bool:
 
 @dataclass(frozen=True)
 class Recorded:
-    """The work of a label's decodes. episode: (decodes,) row of the label's episodes that each belongs to. size: N.
-    gauge: median seconds of the reference workload on the CPU while it was recorded; NaN elsewhere."""
+    """The work of a label's decodes. episode: (decodes,) row of the label's episodes that each belongs to. size: N."""
 
     work: Work
     episode: np.ndarray
     size: int
-    gauge: float
 
 
-def _recorded(data: StudyData, label: str, episodes: pd.DataFrame) -> Recorded:
+def _recorded(data: StudyData, label: str) -> Recorded:
     """The decodes of a label's cells, in the order of its episodes."""
     cells = data.complete[label]
     if (batch := batch_of(cells[0].settings)) > 1:
@@ -160,9 +159,7 @@ def _recorded(data: StudyData, label: str, episodes: pd.DataFrame) -> Recorded:
     proposer = cells[0].settings.get("proposer", {})
     drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
     work, size = _work(whole, drafter)
-    on_cpu = bool((episodes["device"] == "cpu").all())
-    gauge = float(episodes["gauge_seconds"].median()) if on_cpu else math.nan
-    return Recorded(work, np.concatenate(owners), size, gauge)
+    return Recorded(work, np.concatenate(owners), size)
 
 
 def _read(path: Path) -> pa.Table:
@@ -209,10 +206,8 @@ def _check(machine: Machine, works: Mapping[str, Recorded]) -> None:
 
 
 def _priced(episodes: pd.DataFrame, recorded: Recorded, profile: Profile) -> pd.DataFrame:
-    """The episodes, with the seconds that their decodes would take there. Host seconds scale as the reference workload
-    does, where it was measured on both machines."""
-    host = profile.gauge / recorded.gauge
-    seconds = prices(recorded.work, profile, host if math.isfinite(host) else 1.0)
+    """The episodes, with the seconds that their decodes would take there."""
+    seconds = prices(recorded.work, profile)
     whole = np.bincount(recorded.episode, seconds, len(episodes))
     order = np.argsort(recorded.episode, kind="stable")
     stops = np.cumsum(np.bincount(recorded.episode, minlength=len(episodes)))[:-1]
