@@ -123,7 +123,7 @@ def test_without_numbers_on_the_axis_every_setting_is_a_row(boundaries: pd.DataF
 
 
 def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
-    panel = study_figures(boundaries, "", "Title")[""].axes[0]
+    panel = study_figures(boundaries, "", "Title")[""].axes[1]
     known = boundaries[(boundaries["averaging"] == MICRO) & boundaries["ceiling"].notna()]["ceiling"]
     assert len(known) == 6
     marks = [line for line in panel.get_lines() if line.get_marker() == "|"]

@@ -62,8 +62,8 @@ def report(
     if output.agreement is not None:
         console().print(agreement_summary(output.agreement))
     if output.priced is not None:
-        priced = repriced_summary(output.priced)
-        print_table(priced.columns, priced.itertuples(index=False), ASSUMES)
+        summary = repriced_summary(output.priced)
+        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
     for path in output.files:
         typer.echo(str(path))
 

@@ -169,8 +169,18 @@ def work_of(
     last = np.diff(every, append=decodes) > 0
     forward = mode != "skip"
     accepted = np.where(parallel, 0, rounds["accepted"])
-    arrays = (every, rounds["start"] == 0, nodes, accepted, levels, tree, has_drafter[every] & ~last)
-    return Work(*(array[forward] for array in arrays), host, propose, others)
+    return Work(
+        decode=every[forward],
+        prefill=(rounds["start"] == 0)[forward],
+        nodes=nodes[forward],
+        accepted=accepted[forward],
+        levels=levels[forward],
+        tree=tree[forward],
+        feeds=(has_drafter[every] & ~last)[forward],
+        host=np.asarray(host),
+        propose=propose,
+        sources=others,
+    )
 
 
 def sequence_of_record(decode: DecodeRecord) -> Work:

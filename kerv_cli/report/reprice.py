@@ -21,7 +21,7 @@ from kerv_cli.engine.cost import FORMAT, HOST_PHASES, Profile, Work, missing, pr
 from kerv_cli.lab.identity import batch_of
 from kerv_cli.lab.plan import Cell
 from kerv_cli.report.measures import MICRO, measure
-from kerv_cli.report.tables import StudyData
+from kerv_cli.report.tables import StudyData, rows_of
 
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
@@ -101,7 +101,9 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
                     "on": machine.name,
                     "machine": machine.title,
                     "projected": bool(machine.profile.about.get("projected")),
-                    "same": _same(machine.profile.about, data.complete[label][0], episodes[label]),
+                    "same": _same(
+                        machine.profile.about, data.complete.get(reference, data.complete[label])[0], episodes[label]
+                    ),
                     **_speeds(values, ""),
                     **{name: values[name] for name in _TIMES},
                     **_speeds(measured, "measured_"),
@@ -114,7 +116,7 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
 
 
 def _same(about: Mapping[str, Any], cell: Cell, episodes: pd.DataFrame) -> bool:
-    """Whether a profile is of the machine and the target that these episodes ran with."""
+    """Whether a profile is of the machine that these episodes ran on, and of the target of `cell`, the baseline's."""
     here = {name: set(episodes[name]) for name in ("device_name", "dtype", "threads")}
     here["target"] = {cell.settings["policy"]["target"]}
     return not about.get("projected") and all({about.get(name)} == values for name, values in here.items())
@@ -217,7 +219,7 @@ def _priced(episodes: pd.DataFrame, recorded: Recorded, profile: Profile) -> pd.
 def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
     """As text: a row per setting, per episode before per control step; as measured, then a column pair per machine."""
     rows: dict[str, dict[str, str]] = {}
-    for row in table.to_dict("records"):
+    for row in rows_of(table):
         cells = rows.setdefault(row["label"], {"setting": row["label"]})
         is_baseline = row["label"] == row["baseline"]
         for head, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
@@ -230,7 +232,7 @@ def machine_columns(table: pd.DataFrame) -> dict[str, dict[str, str]]:
     """Heading -> label -> speed per episode there: as measured where the study ran on that machine with that target,
     else priced, marked `≈`."""
     columns: dict[str, dict[str, str]] = {}
-    for row in table.to_dict("records"):
+    for row in rows_of(table):
         prefix, mark = ("measured_", "") if row["same"] else ("", "≈ ")
         text = "1" if row["label"] == row["baseline"] else mark + _interval(row, f"{prefix}episode_speedup")
         columns.setdefault(f"per episode, {row['machine']}", {})[row["label"]] = text
