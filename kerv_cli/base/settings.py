@@ -416,6 +416,9 @@ class DoctorSettings(RunSettings):
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
 
+PROJECTIONS = {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4090": [1008.0, 165.0]}
+
+
 @dataclass
 class BenchSettings(RunSettings):
     """`kerv bench`: how far a target is from what the device can do."""
@@ -423,27 +426,17 @@ class BenchSettings(RunSettings):
     model: str = setting("mt10-vision", "a policy, or a shape of conf/target with random weights")
     dtype: str = setting("auto", "of a shape: float32, bfloat16, auto (the faster one); a policy has runtime.dtype")
     repeats: int = number(30, 3, 100_000, help="of every measurement, for medians and 95th percentiles")
-    tokens: list[int] = setting([7, 16], "N, tokens of a chunk", **limits(3, 256))
-    drafter_depth: int = number(6, 1, 1024, help="tokens of the drafter's chain whose time counts in the ceilings")
+    tokens: list[int] = setting([7, 16], "N, tokens of a chunk; of a shape: at most", **limits(4, 256))
+    projected: str = setting("", "a shape of conf/target whose profiles on `projections` are written too")
+    projections: dict[str, list[float]] = setting(PROJECTIONS, "device -> published GB/s and dense bfloat16 TFLOP/s")
 
     def check_together(self, prefix: str) -> None:
-        """Raises UsageError without a chunk to measure."""
+        """Raises UsageError without a chunk to measure, and for a device without its two figures."""
         if not self.tokens:
             raise UsageError(f"{prefix}tokens=[]: name at least one N")
-
-
-PROJECTIONS = {"A100 80GB": [2039.0, 312.0], "H100 SXM": [3350.0, 989.0], "RTX 4090": [1008.0, 165.0]}
-
-
-@dataclass
-class BenchReplaySettings(BenchSettings):
-    """`kerv bench replay`: a study's recorded decodes, executed on another target."""
-
-    recorded: str = setting("main", "the study whose decodes are executed")
-    decodes: int = number(40, 2, 1_000_000, help="of every setting, evenly over tasks and seeds")
-    model: str = setting("vla-150m", "a policy, or a shape of conf/target with random weights")
-    profiles: dict[str, str] = setting({}, "name -> a bench's document, of this target on another device")
-    projections: dict[str, list[float]] = setting(PROJECTIONS, "device -> published GB/s and dense bfloat16 TFLOP/s")
+        for name, figures in self.projections.items():
+            if len(figures) != 2 or min(figures) <= 0:
+                raise UsageError(f"{prefix}projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")
 
 
 @dataclass
@@ -452,6 +445,7 @@ class ReportSettings(CommandSettings):
 
     only: str | None = setting(None, "one study, by name or file; default: all that are there")
     against: str | None = setting(None, "results folder with another run of that study: how far the two agree")
+    on: Any = setting("", "a profile of 'kerv bench' that prices the study's decodes, or a list of them")
     loss: float = number(3.0, above=0, most=99.9, help="--choose: bound on the loss of success, points")
 
 

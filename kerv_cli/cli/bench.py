@@ -1,4 +1,4 @@
-"""`kerv bench`: a target's speed against the device's limits; `kerv bench replay`: recorded decodes on another one."""
+"""`kerv bench`: what a target's decodes cost, against the device's limits."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import typer
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_json, write_json
-from kerv_cli.base.settings import BenchReplaySettings, BenchSettings
+from kerv_cli.base.files import read_json
+from kerv_cli.base.settings import BenchSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import console, print_table
+from kerv_cli.cli.common import print_table
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
 Compare = Annotated[
@@ -23,18 +23,18 @@ Compare = Annotated[
 @command(
     "bench",
     BenchSettings,
-    keys="target dtype tokens repeats drafter_depth runtime.device runtime.dtype runtime.threads results",
-    examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 tokens=[7,28]"),
+    keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
+    examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 projected=openvla-7b"),
     typed={"target": "model"},  # to Hydra target= would be a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = None) -> None:
-    """Measure a target's forwards against the device's limits; target= is a policy or a shape: vla-150m, smolvla,
-    openvla-7b."""
+    """Measure what a target's decodes cost, against the device's limits; target= is a policy or a shape: vla-150m,
+    smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's decodes with it."""
     if compare is not None:
         _compare(*compare)
         return
     from kerv_cli.bench import report
-    from kerv_cli.bench.run import open_and_card, place_of, run
+    from kerv_cli.bench.run import open_and_card, run, write
 
     model, machine, card, opened = open_and_card(settings)
     print_table(("card", ""), report.card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
@@ -47,12 +47,10 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
     print_table(("method", *columns), report.ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
     flipped, compared = done.ties
     typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
-    document, path = done.document(), place_of(settings.results, model.name, done.dtype, ".json")
-    write_json(path, document)
-    report.plot_roofline(path.with_suffix(".png"), done.title, done.machine, done.phases)
-    typer.echo(f"{path}\n{path.with_suffix('.png')}")
+    for path in write(settings, done):
+        typer.echo(str(path))
     if as_json:
-        typer.echo(json.dumps(document, allow_nan=False))
+        typer.echo(json.dumps(done.document(), allow_nan=False))
 
 
 def _compare(a: Path, b: Path) -> None:
@@ -66,23 +64,3 @@ def _compare(a: Path, b: Path) -> None:
         documents.append(document)
     names = [f"{d['target']} {d['dtype']} ms" for d in documents]
     print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
-
-
-@command(
-    "bench replay",
-    BenchReplaySettings,
-    keys="study target decodes dtype tokens repeats profiles runtime.device results",
-    examples=("kerv bench replay study=demo", "kerv bench replay study=main target=openvla-7b runtime.device=cuda"),
-    typed={"target": "model", "study": "recorded"},
-)
-def replay_study(settings: BenchReplaySettings, as_json: AsJson = False) -> None:
-    """Execute a study's recorded decodes on another target."""
-    from kerv_cli.bench.replay_run import replay
-
-    result = replay(settings)
-    for table in result.tables():
-        console().print(table)
-    for path in result.write(settings.results):
-        typer.echo(str(path))
-    if as_json:
-        typer.echo(json.dumps(result.document(), allow_nan=False))

@@ -9,7 +9,7 @@ import typer
 
 from kerv_cli.base.settings import ReportSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, console, print_json
+from kerv_cli.cli.common import AsJson, console, print_json, print_table
 
 Publish = Annotated[
     bool,
@@ -32,7 +32,7 @@ def studies_there() -> list[str]:
 @command(
     "report",
     ReportSettings,
-    keys="study results against loss",
+    keys="study results on against loss",
     examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
     # a folder of results; to Hydra study= would be a choice among the files of conf/study
     typed={"study": "only"},
@@ -49,25 +49,31 @@ def report(
     from kerv_cli.lab.resolve import study_name
 
     settings.only = settings.only and study_name(settings.only)
+    profiles = settings.on if isinstance(settings.on, list) else [settings.on] if settings.on else []
     from kerv_cli.base.places import results_dir
     from kerv_cli.cli.sweep import tell_table
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.agreement import agreement_summary
     from kerv_cli.report.report import report as write_report
+    from kerv_cli.report.reprice import ASSUMES, repriced_summary
     from kerv_cli.report.tables import rows_of
 
     if choose:
         _choose(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.against)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.against, profiles)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
-        print_json({"files": output.files, "studies": tables})
+        priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
+        print_json({"files": output.files, "studies": tables, **priced})
         return
     for name, table in output.tables.items():
         tell_table(table, StudyStore(results_dir(settings.results), name), words)
     if output.agreement is not None:
         console().print(agreement_summary(output.agreement))
+    if output.priced is not None:
+        summary = repriced_summary(output.priced)
+        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
     for path in output.files:
         typer.echo(str(path))
 

@@ -55,6 +55,9 @@ EPISODE_SCHEMA = pa.schema(
         ("carried_steps", pa.int64()),  # control steps during decodes that executed the chunk before
         ("held_steps", pa.int64()),  # … that held the last action
         ("dropped_steps", pa.int64()),  # actions of new chunks that were left out as stale
+        ("path_length", pa.float64()),  # of the end effector, metres
+        ("jerk", pa.float64()),  # of the end effector, root mean square, m/s³
+        ("gripper_switches", pa.int64()),
         ("wall_seconds", pa.float64()),
         ("initial_state", pa.list_(pa.float64())),
         ("repeat", pa.int64()),
@@ -82,7 +85,8 @@ _ROUND = pa.struct(
 )
 _OF_DELAY = ("observed", "carried", "held", "dropped", "predicted")  # fields of Delay
 _MEASURES = ("variability", "similarity", "metric", "deviation")
-_OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds")  # fields of EpisodeRecord
+_MOTION = ("path_length", "jerk", "gripper_switches")
+_OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds", *_MOTION)  # of EpisodeRecord
 _OF_DECODE = ("mode", "forwards", "seconds", "compensated", "skipped", *_MEASURES)  # fields of DecodeRecord
 
 DECODE_SCHEMA = pa.schema(

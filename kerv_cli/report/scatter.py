@@ -1,4 +1,4 @@
-"""Figure of success against speedup: every setting is a labelled point."""
+"""Figure of success against speed per episode: every setting is a labelled point."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ _POINT = 72.0  # per inch
 
 
 def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
-    """Speedup on x, success on y, bars for the 95 % intervals. A setting without a speedup, such as the scripted
-    expert, is a dashed level of success."""
+    """Speed per episode on x, success on y, bars for the 95 % intervals. A setting without a speed, such as the
+    scripted expert, is a dashed level of success."""
     figure = new_figure(11.0, 6.4)
     panel = figure.subplots()
     drawn = rows_of(rows)
-    points = [row for row in drawn if is_number(row["speedup"])]
+    points = [row for row in drawn if is_number(row["episode_speedup"])]
     shades = setting_colours(points)
     for row, shade in zip(points, shades, strict=True):
         _draw_point(panel, row, shade)
     for row in drawn:
-        if not is_number(row["speedup"]):
+        if not is_number(row["episode_speedup"]):
             _draw_level(panel, row)
     panel.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
-    panel.set(xlabel="speedup: time per step, baseline ÷ setting", ylabel="success, % of episodes")
+    panel.set(xlabel="speed: time per episode, baseline ÷ setting", ylabel="success, % of episodes")
     panel.margins(x=0.14)
     panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
     limit_success(panel, rows)
-    panel.set_title("Success against speedup")
+    panel.set_title("Success against speed per episode")
     entitle(figure, title, about)  # before the labels: it moves the panel
-    labels = [(row["speedup"], 100 * row["success"], str(row["label"])) for row in points]
+    labels = [(row["episode_speedup"], 100 * row["success"], str(row["label"])) for row in points]
     place_labels(figure, panel, labels, shades)
     return figure
 
@@ -64,11 +64,11 @@ def limit_success(panel: Axes, rows: pd.DataFrame, axis: str = "y") -> None:
 
 
 def _draw_point(panel: Axes, row: dict[str, Any], shade: str) -> None:
-    x, y = row["speedup"], 100 * row["success"]
+    x, y = row["episode_speedup"], 100 * row["success"]
     bars: Any = {"color": shade, "linewidth": 1.6, "alpha": 0.4}
     panel.plot([x, x], [100 * row["success_low"], 100 * row["success_high"]], **bars)
-    if is_number(row["speedup_low"]):
-        panel.plot([row["speedup_low"], row["speedup_high"]], [y, y], **bars)
+    if is_number(row["episode_speedup_low"]):
+        panel.plot([row["episode_speedup_low"], row["episode_speedup_high"]], [y, y], **bars)
     panel.plot(x, y, "o", color=shade, markersize=7)
 
 

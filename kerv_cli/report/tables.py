@@ -35,6 +35,7 @@ from kerv_cli.report.ceiling import (
     verifies_in_prefill,
 )
 from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, measure
+from kerv_cli.report.motion import motion
 from kerv_cli.worlds import specs
 
 _MACHINE = ("executor", "workers", "device_name", "host")
@@ -190,7 +191,8 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "baseline": data.references[label],
     }
     best = _ceiling(data, cells[0], episodes, averaging)
-    return [head, {**measure(episodes, baseline, averaging), **best.columns()}, *_origin(data, cells)]
+    measures = {**measure(episodes, baseline, averaging), **motion(episodes, baseline, averaging), **best.columns()}
+    return [head, measures, *_origin(data, cells)]
 
 
 def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:
