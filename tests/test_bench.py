@@ -222,7 +222,6 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
         (["tokens=[1]"], "tokens=1: from 4 to 256"),
         (["tokens=[]"], "tokens=[]: name at least one N"),
         (["target=openvla-7b", "dtype=float32"], "GB are free on cpu"),
-        (["replay", "study=main"], "kerv report study=NAME on=PROFILE"),
         (["projections.mine=[1]"], "GB/s and TFLOP/s"),
     ],
 )

@@ -196,7 +196,7 @@ def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
     assert completions("runs list", [], "me") == []
     assert completions("sweep", [], "until=") == ["until=done", "until=decided"]
     assert completions("demos", [], "ex") == ["export", "expert_share="]
-    assert completions("bench replay", [], "stu") == ["study="]
+    assert completions("report", [], "stu") == ["study="]
     assert completions("completion", [], "z") == ["zsh"]
 
 

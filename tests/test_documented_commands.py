@@ -25,6 +25,8 @@ _OPEN = {
     "method=NAME": "method=ar",
     "study=NAME": "study=demo",
     "proposer=NAME": "proposer=hold",
+    "drafter=NAME": "drafter=early",
+    "drafter.KEY=VALUE": "drafter.width=64",
 }
 
 

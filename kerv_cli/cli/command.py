@@ -29,8 +29,8 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
         settings: dataclass of the settings; NoSettings: it takes none.
         keys: the settings that people use, for the help.
         traits: examples: command lines that work, for the help. names: help of words that are no overrides.
-            typed: word on the command line -> the setting it sets, where the two differ. writes: whether it stores
-            results, so that a folder that cannot be written is refused first (default: true). each: the command
+            lists: settings whose lists need no brackets. typed: word on the command line -> the setting it sets, where
+            the two differ. writes: whether it stores results, so that a folder that cannot be written is refused first (default: true). each: the command
             whose settings all other words go to. completes: what makes completions of names.
     """
 
@@ -170,8 +170,10 @@ def _composed(part: Part, words: list[str], cfg: bool) -> Any:
     from kerv_cli.base.places import check_writable
 
     typed = part.traits.get("typed", {})
-    keys = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
-    settings: Any = compose(part.name.replace(" ", "_"), ["".join(word) for word in keys], part.settings)
+    pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
+    lists = part.traits.get("lists", ())
+    plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
+    settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         raise typer.Exit(0)

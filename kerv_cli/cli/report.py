@@ -36,6 +36,7 @@ def studies_there() -> list[str]:
     examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
     # a folder of results; to Hydra study= would be a choice among the files of conf/study
     typed={"study": "only"},
+    lists=("on",),
     values={"study": studies_there},
 )
 def report(
@@ -49,7 +50,6 @@ def report(
     from kerv_cli.lab.resolve import study_name
 
     settings.only = settings.only and study_name(settings.only)
-    profiles = settings.on if isinstance(settings.on, list) else [settings.on] if settings.on else []
     from kerv_cli.base.places import results_dir
     from kerv_cli.cli.sweep import tell_table
     from kerv_cli.lab.store import StudyStore
@@ -61,7 +61,7 @@ def report(
     if choose:
         _choose(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.against, profiles)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.against, settings.on)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
