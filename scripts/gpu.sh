@@ -2,16 +2,15 @@
 # Everything that needs a GPU, in under 25 minutes, on a Linux with CUDA and torch and no network.
 #
 #   scripts/gpu.sh                       writes results/gpu/: one log and the result of every step, as each ends
-#   DEVICE=cpu SHAPES="nano tiny" SCALE=nano DECODES=3 EPISODES=1 scripts/gpu.sh     a trial without a GPU
+#   DEVICE=cpu SHAPES="nano tiny" SCALE=nano EPISODES=1 scripts/gpu.sh     a trial without a GPU
 #
 # PYTHON   the interpreter that has torch                (.venv/bin/python where it exists, else python3)
 # WHEELS   folder of wheels for packages that are missing (wheels)
 # OUT      where results go                               (results/gpu)
-# STUDY    folder of the study whose decodes are replayed (results/studies/main)
+# STUDY    folder of the study whose decodes are priced  (results/studies/main)
 # DEMOS    folder of the demonstrations to train on       (results/artifacts/demos/mt50)
 # SHAPES   shapes that are measured                       (vla-150m smolvla openvla-7b)
-# SCALE    shape of the replay                            (openvla-7b)
-# DECODES  decodes of every setting in the replay         (40)
+# SCALE    shape of the prices                            (openvla-7b)
 # EPISODES per task and setting in the shipped policy's study (2)
 # TRAIN    settings of the training, which goes on from the shipped policy of fifty tasks
 #          (train=mt50 train.init=mt50-vision train.scene_steps=0 train.batch=256)
@@ -26,7 +25,6 @@ STUDY=${STUDY:-results/studies/main}
 DEMOS=${DEMOS:-results/artifacts/demos/mt50}
 SHAPES=${SHAPES:-vla-150m smolvla openvla-7b}
 SCALE=${SCALE:-openvla-7b}
-DECODES=${DECODES:-40}
 EPISODES=${EPISODES:-2}
 TRAIN=${TRAIN:-train=mt50 train.init=mt50-vision train.scene_steps=0 train.batch=256}
 LIMIT=${LIMIT:-1500}
@@ -89,10 +87,11 @@ done
 if [ -d "$STUDY" ]; then
     # under a name of its own: the sweep below makes a study named main
     ln -sfn "$(cd "$STUDY" && pwd)" "$OUT/studies/recorded"
-    kerv replay 420 bench replay study=recorded "target=$SCALE" "tokens=[7,16]" "decodes=$DECODES" --json
+    profile=$(ls "$OUT/bench/$SCALE"-*.json 2>/dev/null | head -1)
+    step price 240 "$PYTHON" -m kerv_cli.cli.app report study=recorded "on=$profile" "results=$OUT"
     rm -f "$OUT/studies/recorded"
 else
-    skip replay "no study in $STUDY: run 'kerv sweep study=main', or set STUDY"
+    skip price "no study in $STUDY: run 'kerv sweep study=main', or set STUDY"
 fi
 kerv sweep 300 sweep study=main task=drawer-open-v3,drawer-close-v3 "episodes=$EPISODES"
 if [ -d "$DEMOS" ]; then

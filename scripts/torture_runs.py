@@ -10,28 +10,26 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 WRITES = ("replace", "rename", "link", "fsync", "mkdir", "unlink", "rmdir")
 """Functions of `os` that change the disk for good, or say that it has changed."""
 
 
-@dataclass(frozen=True)
-class Kill:
+class Kill(NamedTuple):
     """When a command is killed. at: before this write, counted from 1; 0: not at a write. after: seconds; 0: never."""
 
     at: int = 0
     after: float = 0.0
 
-    def __str__(self) -> str:
-        return f"at write {self.at}" if self.at else f"after {self.after:.2f} s"
+
+NEVER = Kill()
 
 
-@dataclass(frozen=True)
-class Ended:
+class Ended(NamedTuple):
     """How a command ended. code: its exit code, negative for a signal. cpu, wall: seconds. left: processes of its group
     outlived it."""
 
@@ -41,19 +39,14 @@ class Ended:
     text: str
     left: bool
 
-    @property
-    def was_killed(self) -> bool:
-        """By SIGKILL."""
-        return self.code == -signal.SIGKILL
 
-
-def run(words: list[str], limit: float, kill: Kill | None = None, log: Path | None = None) -> Ended:
+def run(words: list[str], limit: float, kill: Kill = NEVER, log: Path | None = None) -> Ended:
     """Runs a command in a fork of this process, in its own process group.
 
     limit: seconds after which it is killed as one that hangs. kill: when it is killed on purpose. log: gets a line with
     the number of writes, and one with the name of each module that it loaded.
     """
-    kill, began = kill or Kill(), time.monotonic()
+    began, killed, status = time.monotonic(), False, None
     with tempfile.TemporaryFile() as output:
         child = os.fork()
         if child == 0:
@@ -61,25 +54,18 @@ def run(words: list[str], limit: float, kill: Kill | None = None, log: Path | No
         with contextlib.suppress(OSError):  # the child does the same: whoever is first
             os.setpgid(child, child)
         try:
-            status, cpu = _wait(child, began + (kill.after or limit))
+            while status is None:
+                ended, code, used = os.wait4(child, os.WNOHANG)
+                status = code if ended else None
+                if not (ended or killed) and time.monotonic() > began + (kill.after or limit):
+                    os.killpg(child, signal.SIGKILL)
+                    killed = True
+                time.sleep(0.003)
         finally:
             left = _end_group(child)
         output.seek(0)
         text = output.read().decode(errors="replace")
-    return Ended(os.waitstatus_to_exitcode(status), cpu, time.monotonic() - began, text, left)
-
-
-def _wait(child: int, deadline: float) -> tuple[int, float]:
-    """Waits for a process, kills its group at the deadline -> its status and seconds of CPU."""
-    killed = False
-    while True:
-        ended, status, used = os.wait4(child, os.WNOHANG)
-        if ended:
-            return status, used.ru_utime + used.ru_stime
-        if not killed and time.monotonic() > deadline:
-            os.killpg(child, signal.SIGKILL)
-            killed = True
-        time.sleep(0.003)
+    return Ended(os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, time.monotonic() - began, text, left)
 
 
 def _end_group(group: int) -> bool:
@@ -97,39 +83,17 @@ def _end_group(group: int) -> bool:
 
 
 def _be_command(words: list[str], output: int, kill_at: int, log: Path | None) -> None:
-    """The child: it is the command from here on, and ends."""
+    """The child: it is the command from here on, and ends. It is killed before write number `kill_at`."""
     os.setpgid(0, 0)
     os.dup2(output, 1)
     os.dup2(output, 2)
-    writes = _count_writes(kill_at)
-    code: object = 0
-    try:
-        from kerv_cli.cli.app import app
-
-        app(words)
-    except SystemExit as error:
-        code = error.code or 0
-    except BaseException:  # noqa: BLE001 - told apart by the exit code
-        import traceback
-
-        traceback.print_exc()
-        code = 99
-    done = writes[0]
-    if log is not None:
-        log.write_text("\n".join([str(done), *sys.modules]))
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code if isinstance(code, int) else 98)
-
-
-def _count_writes(kill_at: int) -> list[int]:
-    """Counts this process's WRITES in the list's only entry, and kills it before number `kill_at`."""
-    done = [0]
+    done, code = 0, 0
 
     def counted(function: Callable[..., Any]) -> Callable[..., Any]:
         def counting(*arguments: Any, **keywords: Any) -> Any:
-            done[0] += 1
-            if done[0] == kill_at:
+            nonlocal done
+            done += 1
+            if done == kill_at:
                 os.kill(os.getpid(), signal.SIGKILL)
             return function(*arguments, **keywords)
 
@@ -137,50 +101,28 @@ def _count_writes(kill_at: int) -> list[int]:
 
     for name in WRITES:
         setattr(os, name, counted(getattr(os, name)))
-    return done
+    try:
+        from kerv_cli.cli.app import app
 
-
-def load() -> None:
-    """Imports and computes what every command needs, so that forks need not."""
-    import torch
-
-    from kerv_cli.base.provenance import stamp
-    from kerv_cli.lab.code import code_hash
-    from kerv_cli.worlds.camera import choose_backend
-
-    torch.set_num_threads(1)
-    choose_backend()
-    stamp("cpu")
-    code_hash()
+        app(words)
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 98 if error.code else 0
+    except BaseException:  # noqa: BLE001 - told apart by the exit code
+        traceback.print_exc()
+        code = 99
+    if log is not None:
+        log.write_text("\n".join([str(done), *sys.modules]))
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def learn(log: Path) -> int:
-    """Imports what a command loaded, by its log -> how many writes it did."""
+    """Imports what a command loaded, by its log, so that forks need not -> how many writes it did."""
     writes, *modules = log.read_text().splitlines()
     for name in modules:
-        if name not in sys.modules:
-            with contextlib.suppress(Exception):  # a name that stands for something else, as `six.moves` does
-                importlib.import_module(name)
+        with contextlib.suppress(Exception):  # a name that stands for something else, as `six.moves` does
+            importlib.import_module(name)
     gc.collect()
     gc.freeze()  # forks share these objects as long as nobody touches them
     return int(writes)
-
-
-def warm(task: str) -> None:
-    """Draws the task's placements of the first seeds of training and evaluation, and parses a grid."""
-    from kerv_cli.base.config import expand
-    from kerv_cli.worlds import spec_of
-
-    expand("threshold.r=1,2 world.horizon=range(1,3) task=[a,b] a.b={c:1}")
-    with spec_of(task).open_world(task) as world:
-        for seed in (world.spec.seeds.training.start, world.spec.seeds.evaluation.start):
-            world.reset(seed)
-
-
-def names_below(folder: Path) -> set[str]:
-    """Every file and folder below, relative; of a folder its name with a slash."""
-    found = set()
-    for root, folders, files in os.walk(folder):
-        inside = Path(root).relative_to(folder)
-        found |= {str(inside / name) for name in files} | {f"{inside / name}/" for name in folders}
-    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partialmethod
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,29 @@ import pytest
 
 from kerv_cli.base import registry
 from kerv_cli.base.config import Composer, conf_dir
-from kerv_cli.base.registry import PART_GROUPS
+from kerv_cli.base.registry import SETTINGS_GROUPS
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 ENVIRONMENTS = dict(registry.parts("environment"))
 """kerv's own and the example `insertion`, taken before test modules are imported."""
+
+
+LONGEST = (
+    *("test_documented_commands", "test_studies_executors", "test_training", "test_cli", "test_training_ranks"),
+    *("test_golden", "test_older_results", "test_extending", "test_coverage", "test_views", "test_early"),
+)
+"""Files that take longest, begun first: no process is left with one of them at the end while the others idle."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Files are begun in the order of collection: pytest-xdist would begin with those of the most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, the others as they were."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
 
 
 def pytest_collection_finish() -> None:
@@ -50,7 +68,9 @@ def compositions() -> Iterator[None]:
 
     def created(self: Composer[Any], command: str, schema: type) -> None:
         create(self, command, schema)
-        parts = tuple((name, part.settings) for group in PART_GROUPS for name, part in registry.parts(group).items())
+        parts = tuple(
+            (name, part.settings) for group in SETTINGS_GROUPS for name, part in registry.parts(group).items()
+        )
         self._composed = kept.setdefault((command, schema, conf_dir(), parts), {})
 
     with pytest.MonkeyPatch.context() as patch:
@@ -63,8 +83,10 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     import torch
 
     from kerv_cli.base.config import compose
-    from kerv_cli.base.settings import DrafterSettings, TrainTargetSettings
-    from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
+    from kerv_cli.base.settings import TrainTargetSettings
+    from kerv_cli.methods.artifacts import MadeFor
+    from kerv_cli.methods.eagle import DrafterSettings
+    from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact
     from kerv_cli.targets.compact.folder import save_target
     from kerv_cli.targets.compact.target import CompactTarget
     from kerv_cli.training.imitation import vocabulary
@@ -77,7 +99,8 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     provenance = {"parameters": sum(p.numel() for p in target.parameters())}
     digest = save_target(results / "artifacts" / "target" / name, target, "metaworld", provenance)
     drafter = Drafter.beside(DrafterSettings(), target)
-    save_drafter(results / "artifacts" / "drafter" / name, drafter, target, digest, provenance)
+    folder, made_for = results / "artifacts" / "drafter" / name, MadeFor(digest, target.actions)
+    DrafterArtifact().save(folder, drafter, made_for, provenance, settings=asdict(drafter.settings))
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ import numpy as np
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RolloutSettings, StudySettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.lab.block import Prepare, RunEpisode
+from kerv_cli.lab.execute import Prepare, RunEpisode
 from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC

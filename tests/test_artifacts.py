@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +19,18 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.settings import (
     BuildDatastoreSettings,
     CalibrateSettings,
-    DrafterSettings,
     PolicySettings,
     RolloutSettings,
 )
 from kerv_cli.lab.policy import check, decoder_for, identity_of, unseen_tasks
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
-from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+from kerv_cli.methods.early import EarlySettings
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
 from kerv_cli.methods.retrieval import QdrantSearchSettings
 from kerv_cli.methods.retrieval.datastore import Datastore
 from kerv_cli.methods.risk.recording import RiskManifest, save_risk
-from kerv_cli.methods.risk.scores import LearnedScore, save_score
+from kerv_cli.methods.risk.scores import LearnedScore, ScoreArtifact
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
@@ -215,12 +216,14 @@ def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """As `whole`, with an early drafter, a recorded risk and a learned score of it."""
     results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
-    drafter = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
-    early = save_early(results / "artifacts/early/nano-state", drafter, described.sha256, {})
-    made_for = MadeFor(described.sha256, described.actions, described.chunk)
+    drafter = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
+    made_for, own = MadeFor.of(described), {"settings": asdict(drafter.settings)}
+    early = EarlyArtifact().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
     store = Artifacts(str(results), PolicySettings(target="nano-state")).check(["datastore"])["datastore"]
     model, read = LearnedScore(["odds"], 4), {"early": early, "datastore": store}
-    score = save_score(results / "artifacts/score/nano-state", model, made_for, ("early", early), read, {})
+    drafts = {"source": "early", "source_sha256": early, "made_from": read}
+    folder = results / "artifacts/score/nano-state"
+    score = ScoreArtifact().save(folder, model, made_for, {}, inputs=["odds"], features=4, **drafts)
     rows = [{"source": "early", "task": "reach-v3", "seed": 50_000, "index": 0, "loss": 0.0, "score.odds": 0.0}]
     manifest = RiskManifest(
         made_for, {"early": early}, 0.1, {"reach-v3": [50_000]}, ["odds"], {}, made_from={**read, "score": score}

@@ -22,26 +22,27 @@ from test_parallel import some_observation, target
 from typer.testing import CliRunner
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.settings import DrafterSettings, RuntimeSettings
+from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.bench.sequences import read_study
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder, Lane
+from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab import run
-from kerv_cli.lab.block import RunEpisode
-from kerv_cli.lab.cells import CellRunner
-from kerv_cli.lab.execute import execute
+from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.plan import Cell, blocks_of, make_cell
+from kerv_cli.lab.run import CellRunner
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.lab.together import Request, run_together
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.plots import study_figures
+from kerv_cli.report.reprice import Machine, repriced_table
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study, study_table
 from kerv_cli.targets.compact.packed import pack
@@ -118,7 +119,7 @@ def test_parallel_passes_of_a_batch_are_those_of_its_rows() -> None:
 def test_early_drafts_of_a_batch_follow_each_episodes_own_history(radius: int, history: int) -> None:
     policy = target()
     torch.manual_seed(3)
-    drafter = EarlyDrafter.beside(DrafterSettings(width=32, layers=1), policy).eval()
+    drafter = EarlyDrafter.beside(EarlySettings(layers=1, width=32), policy).eval()
     torch.nn.init.normal_(drafter.head.weight, std=1.0)
     draft = EarlyProposer(drafter, policy)
     parts = Parts(prefill_draft=draft, skip=AlwaysSkip(draft), threshold=Fixed(radius))
@@ -363,17 +364,17 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) ->
     assert (methods["pairs"] > 0).all()
     assert methods["success"].notna().all()
     printed = summary_frame(table).set_index("setting")
-    assert (printed.loc[methods["label"], "speedup"] == "–").all()
-    assert printed.loc["ar", "speedup"] == ("1" if which == "method" else "–")
+    assert (printed.loc[methods["label"], "per step"] == "–").all()
+    assert printed.loc["ar", "per episode"] == ("1" if which == "method" else "–")
     assert study_figures(table, "threshold.r", "threshold")
 
 
-def test_replay_refuses_decodes_without_host_times(tmp_path: Path) -> None:
+def test_decodes_without_host_times_have_no_price(tmp_path: Path) -> None:
     cells, store = ar_cells(), StudyStore(tmp_path, "threshold")
     store.write_plan(threshold_settings(), cells)
     execute(cells, Prepared(), store)
     with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
-        read_study(store, 4, 10)
+        repriced_table(load_study(store), [Machine("there", Profile(31, {}))])
 
 
 # --- the command

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import typer
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
@@ -23,7 +22,7 @@ from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CalibrateSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.cli.calibrate import calibrate
+from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.record import Round
@@ -31,12 +30,11 @@ from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (
     BoundarySection,
     Calibration,
+    CalibrationArtifact,
     Demonstrations,
     SkipLevel,
     SkipSection,
     Variability,
-    calibration_place,
-    load_calibration,
     save_calibration,
 )
 from kerv_cli.methods.context import Context
@@ -237,9 +235,9 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     assert {row.decodes for row in variability.values()} == {4}
     made = run.finish(variability, run.boundary(lambda done, total: None), run.skip(lambda done, total: None))
     folder = find_target(str(results), target)
-    assert run.path == calibration_place(str(results), None, folder)
+    assert run.path == CalibrationArtifact().place(str(results), None, folder)
     assert run.path == results / f"artifacts/calibration/{target}/calibration.json"
-    loaded = load_calibration(run.path, read_target(folder))
+    loaded = CalibrationArtifact().checked(run.path, read_target(folder))
     assert loaded == made
     assert loaded.demos.sha256 == run.dataset.sha256
     assert loaded.provenance["versions"]["numpy"] == np.__version__
@@ -340,12 +338,12 @@ def test_what_does_not_fit_is_refused_in_one_line(
 ) -> None:
     path = tmp_path / "calibration.json"
     save_calibration(path, calibration({"reach-v3": 0.7}))
-    assert load_calibration(path, description()) == calibration({"reach-v3": 0.7})
+    assert CalibrationArtifact().checked(path, description()) == calibration({"reach-v3": 0.7})
     value = copy.deepcopy(read_json(path))
     change(value)
     path.write_text(json.dumps(value))
     with pytest.raises(CheckpointError, match=says) as caught:
-        load_calibration(path, description())
+        CalibrationArtifact().checked(path, description())
     assert "\n" not in str(caught.value)
     assert "kerv calibrate" in str(caught.value)
 
@@ -356,16 +354,16 @@ def test_a_calibration_of_another_action_space_is_refused(change: dict[str, Any]
     save_calibration(path, calibration({}))
     other = description(actions=dataclasses.replace(SPACE, **change))
     with pytest.raises(CheckpointError, match="they were made for different actions") as caught:
-        load_calibration(path, other)
+        CalibrationArtifact().checked(path, other)
     assert "\n" not in str(caught.value)
 
 
 def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="run 'kerv calibrate'"):
-        load_calibration(tmp_path / "calibration.json", description())
+        CalibrationArtifact().checked(tmp_path / "calibration.json", description())
     (tmp_path / "list.json").write_text("[1]")
     with pytest.raises(CheckpointError, match="not a calibration"):
-        load_calibration(tmp_path / "list.json", description())
+        CalibrationArtifact().checked(tmp_path / "list.json", description())
 
 
 @pytest.mark.parametrize(
@@ -400,9 +398,14 @@ def test_windows_longer_than_every_episode_are_refused(results: Path) -> None:
 
 
 def test_the_command_prints_what_it_found(results: Path) -> None:
-    app = typer.Typer()
-    app.command()(calibrate)
-    common = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "policy.target=nano-state", f"results={results}"]
+    common = [
+        "calibrate",
+        "task=reach,drawer-close",
+        "demos=few",
+        "held_out=0.4",
+        "policy.target=nano-state",
+        f"results={results}",
+    ]
     done = CliRunner().invoke(app, [*common, "decodes=0", "name=without"])
     assert done.exit_code == 0, done.output
     for word in ("K_S", "fitted q / r", "held-out error", "hold", "damped", "h=4", "without", "radius R, minimum"):

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from examples.own_target import SEVEN
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -21,8 +20,8 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.files import write_json
 from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.cli.calibrate import calibrate
-from kerv_cli.methods.calibration import NEVER, Calibration, Variability, load_calibration, save_calibration
+from kerv_cli.cli.app import app
+from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability, save_calibration
 from kerv_cli.methods.heisd.boundary import BoundaryRanges
 from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
@@ -204,7 +203,7 @@ def test_the_skip_levels_belong_to_one_datastore(copy: Path) -> None:
     assert row == task_levels(match(store, "reach-v3"), 1.9, 0.5)
     assert row.share > 0
     assert made.skip_levels("reach-v3", store.content) == (row.low, row.s_min, row.high)
-    assert load_calibration(run.path, run.description) == made
+    assert CalibrationArtifact().checked(run.path, run.description) == made
     with pytest.raises(CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again"):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):
@@ -249,9 +248,7 @@ def test_a_datastore_of_another_target_is_refused_before_anything_is_read(copy: 
 
 
 def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
-    app = typer.Typer()
-    app.command()(calibrate)
-    done = CliRunner().invoke(app, words(copy, "epsilon=1.9", "confidence=0.5"))
+    done = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=1.9", "confidence=0.5")])
     assert done.exit_code == 0, done.output
     for word in (
         "ranges of the boundary's metric",
@@ -262,6 +259,6 @@ def test_the_command_prints_ranges_and_levels(copy: Path) -> None:
         "144",
     ):
         assert word in done.output
-    assert "skip levels from" in CliRunner().invoke(app, words(copy, "--plan")).output
-    never = CliRunner().invoke(app, words(copy, "epsilon=0.0001"))
+    assert "skip levels from" in CliRunner().invoke(app, ["calibrate", *words(copy, "--plan")]).output
+    never = CliRunner().invoke(app, ["calibrate", *words(copy, "epsilon=0.0001")])
     assert never.output.count("never") == 2

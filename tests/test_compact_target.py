@@ -17,12 +17,15 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
-from kerv_cli.base.settings import DrafterSettings, PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.settings import PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.eagle.drafter import DrafterProposer, load_drafter, read_drafter
-from kerv_cli.methods.early.drafter import EarlyProposer, load_early
+from kerv_cli.methods.artifacts import Request
+from kerv_cli.methods.eagle import DrafterSettings
+from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
+from kerv_cli.methods.early import EarlySettings
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
@@ -96,8 +99,9 @@ def test_the_shipped_targets_load_with_metaworlds_spaces(name: str) -> None:
     assert target.observation == SPEC.observation
     assert target.cameras == (("corner4",) if name == "mt10-vision" else ())
     assert target.max_prompt == (31 if name == "mt10-vision" else 15)
-    drafter, _ = load_drafter(shipped_dir() / name / "drafter", target, target.sha256)
-    early, _ = load_early(shipped_dir() / name / "early", target, description)
+    request = Request(description, target)
+    drafter = DrafterArtifact().load(shipped_dir() / name / "drafter", request)
+    early = EarlyArtifact().load(shipped_dir() / name / "early", request)
     assert (drafter.width, early.tokens) == (target.width, target.chunk * 4)
 
 
@@ -119,9 +123,9 @@ def damaged(folder: Path, **changes: object) -> Path:
         ({"actions": {"names": []}}, r"target\.json is damaged: actions"),
         ({"actions": 3}, "damaged: actions"),
         ({"observation": None}, "damaged: observation"),
-        ({"settings": {"width": 16, "colour": 1}}, "damaged: colour"),
+        ({"settings": {"chunk": 2, "colour": 1}}, "damaged: colour"),
         ({"settings": {"chunk": 2, "observation": "state", "width": 32, "heads": 2}}, "does not fit its own settings"),
-        ({"settings": {"width": 32, "heads": 6}}, "width=32 must be a multiple of 2 x heads=6"),
+        ({"settings": {"chunk": 2, "width": 32, "heads": 6}}, "width=32 must be a multiple of 2 x heads=6"),
         ({"words": "insert"}, "damaged: words"),
         ({"format": 9}, "written by another version"),
     ],
@@ -193,7 +197,7 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     assert {f"l1_{name}" for name in SEVEN.names} <= metrics.keys()
     for drafter in (
         DrafterSettings(samples=12, unroll=2),
-        DrafterSettings(kind="early", layers=1, width=16, rank=4, history=2, samples=30),
+        EarlySettings(layers=1, width=16, rank=4, history=2, samples=30),
     ):
         asked = TrainDrafterSettings(
             policy=PolicySettings(target="arm"), drafter=drafter, train=train, results=str(tmp_path)
@@ -208,8 +212,9 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(seven: Path) -> None:
     target, description = load_target(seven / "artifacts/target/arm")
     target.actions.check_same(SEVEN, "the target", "the arm")
-    drafter, _ = load_drafter(seven / "artifacts/drafter/arm", target, description.sha256)
-    early, _ = load_early(seven / "artifacts/early/arm", target, description)
+    request = Request(description, target)
+    drafter = DrafterArtifact().load(seven / "artifacts/drafter/arm", request)
+    early = EarlyArtifact().load(seven / "artifacts/early/arm", request)
     assert early.strict.tolist() == [dof == 6 for dof in range(7)] * 2
     random = np.random.default_rng(0)
     shown = Observation(random.normal(0, 0.1, 8), random.normal(0, 0.1, 14), "insert the peg")
@@ -228,10 +233,10 @@ def test_a_drafter_of_other_actions_is_refused(seven: Path) -> None:
     shutil.copytree(folder, seven / "copied")
     rigid = dataclasses.replace(description.actions, strict=("droll",))
     with pytest.raises(CheckpointError, match="strict gripper, the target one with droll"):
-        read_drafter(folder, description.sha256, rigid)
+        DrafterArtifact().checked(folder, dataclasses.replace(description, actions=rigid))
     wider = dataclasses.replace(description.actions, high=tuple(2 * x for x in description.actions.high))
     with pytest.raises(CheckpointError, match="action space with high"):
-        read_drafter(folder, description.sha256, wider)
+        DrafterArtifact().checked(folder, dataclasses.replace(description, actions=wider))
 
 
 @pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
 from kerv_cli.lab.policy import check as check_rollout
-from kerv_cli.methods.compose import check, needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
 from kerv_cli.methods.heisd import (
     FusedBoundarySettings,
@@ -126,7 +127,7 @@ def composed(*overrides: str) -> RolloutSettings:
 
 def checked(overrides: str) -> None:
     asked = composed(*overrides.split())
-    check(asked.parts(), asked.chunk, 4)
+    Method.of(asked).check(SimpleNamespace(chunk=4))
 
 
 def test_every_method_has_a_row_here() -> None:
@@ -140,7 +141,7 @@ def test_a_preset_is_the_parts_that_its_name_promises(method: str) -> None:
     assert asked.policy.kind == ("expert" if method == "expert" else "model")
     assert asked.parts() == {**AR, **PRESETS[method]}
     assert (asked.chunk, asked.datastore) == (0, NoSettings("exact"))
-    check(asked.parts(), asked.chunk, 4, parallel=method == "parallel")
+    Method.of(asked).check(SimpleNamespace(chunk=4, parallel=method == "parallel"))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -241,7 +242,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill() -> None:
     # a part from elsewhere can still be named in settings that Hydra did not compose
     method = {**AR, "prefill_draft": HybridProposerSettings()}
     with pytest.raises(UsageError, match="prefill_draft=hybrid: it reads the target's states"):
-        check(method, 0, 4)
+        Method(method).check(SimpleNamespace(chunk=4))
 
 
 @pytest.mark.parametrize(
@@ -303,5 +304,5 @@ def test_an_expert_needs_nothing_else() -> None:
     ],
 )
 def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides: str, wanted: tuple[str, ...]) -> None:
-    assert set(needs(composed(*overrides.split()).parts())) == set(wanted)
-    assert len(needs(composed(*overrides.split()).parts())) == len(wanted)
+    assert set(Method.of(composed(*overrides.split())).needs) == set(wanted)
+    assert len(Method.of(composed(*overrides.split())).needs) == len(wanted)

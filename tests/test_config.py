@@ -2,46 +2,48 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import fields, is_dataclass
 from itertools import chain
+from pathlib import Path
 
 import pytest
+import yaml
 
+import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base import settings as s
-from kerv_cli.base.config import PART_GROUPS, compose, conf_dir, expand, groups, swept_keys, to_yaml
+from kerv_cli.base.config import compose, conf_dir, expand, groups, swept_keys, to_yaml
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.registry import part_of, parts
+from kerv_cli.base.limits import description
+from kerv_cli.base.registry import PART_GROUPS, part_of, parts
 from kerv_cli.lab.resolve import resolve
 
-SCHEMAS = {
-    "rollout": s.RolloutSettings,
-    "demos": s.DemosSettings,
-    "train_target": s.TrainTargetSettings,
-    "train_drafter": s.TrainDrafterSettings,
-    "calibrate": s.CalibrateSettings,
-    "calibrate_risk": s.CalibrateRiskSettings,
-    "train_score": s.TrainScoreSettings,
-    "build_datastore": s.BuildDatastoreSettings,
-    "build_drafter": s.BuildDrafterSettings,
-    "build_target": s.BuildTargetSettings,
-    "demos_export": s.DemosExportSettings,
-    "demos_import": s.DemosImportSettings,
-    "serve": s.ServeSettings,
-    "doctor": s.DoctorSettings,
-    "report": s.ReportSettings,
-    "view": s.ViewSettings,
-    "sweep": s.SweepSettings,
-    "bench": s.BenchSettings,
-    "bench_replay": s.BenchReplaySettings,
-}
+SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items() if name != "completion"}
 # which command each group belongs to
 HOMES = {"target": "train_target", "drafter": "train_drafter", "study": "sweep"}
 
 
-def test_every_command_has_a_schema_and_composes() -> None:
-    assert {p.stem for p in conf_dir().glob("*.yaml")} == set(SCHEMAS)
+def test_every_command_composes_and_shows_what_every_setting_is() -> None:
     for command, schema in SCHEMAS.items():
         settings = compose(command, [], schema)
-        assert "results: results" in to_yaml(settings)
+        shown = to_yaml(settings)
+        assert "results: results" in shown
+        assert yaml.safe_load(shown) == s.as_plain(settings)  # the descriptions are comments
+
+
+def test_every_setting_has_a_description() -> None:
+    kinds = [kind for kind in vars(s).values() if is_dataclass(kind) and kind.__module__ == s.__name__]
+    assert [f"{kind.__name__}.{at.name}" for kind in kinds for at in fields(kind) if not description(at)] == []
+
+
+def test_a_configuration_of_ones_own_may_choose_for_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`conf/<command>.yaml`, as older versions had them."""
+    shutil.copytree(conf_dir(), tmp_path / "conf")
+    text = "defaults:\n  - base_train_target\n  - target: tiny\n  - train: target\n  - _self_\nname: mine\n"
+    (tmp_path / "conf/train_target.yaml").write_text(text)
+    monkeypatch.setenv("KERV_CONF_DIR", str(tmp_path / "conf"))
+    settings = compose("train_target", ["train.steps=7"], s.TrainTargetSettings)
+    assert (settings.name, settings.target.size, settings.train.steps) == ("mine", "tiny", 7)
 
 
 WHOLE = {group: names for group, names in groups().items() if group not in PART_GROUPS}
@@ -68,14 +70,6 @@ def test_every_config_of_a_part_composes(row: int) -> None:
         assert name in parts(part.kind) or (conf_dir() / group / f"{name}.yaml").is_file()
 
 
-@pytest.mark.parametrize("study", groups()["study"])
-def test_every_study_resolves(study: str) -> None:
-    resolved = resolve([f"study={study}"])
-    assert resolved.study.name == study
-    assert resolved.study.baseline in resolved.settings
-    assert len({r.seed for r in resolved.settings.values()}) == 1
-
-
 def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
     method = compose("rollout", ["method=spec_vla", "acceptance=strict", "threshold.r=4"], s.RolloutSettings)
     assert (method.proposer.kind, method.acceptance.kind, method.threshold.r) == ("drafter", "strict", 4)
@@ -94,7 +88,9 @@ def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
         (["method=spec_vla", "proposer.neighbours=3"], "unknown key 'proposer.neighbours'"),
         (["threshold.r=half"], "threshold.r: Value 'half'"),
         (["proposer=drafter", "proposer.depth=1.5"], "proposer.depth: Value '1.5'"),
-        (["nonsense"], "'nonsense' is not an override: write key=value"),
+        (["nonsense"], "'nonsense' is not an override: write key=value, see 'kerv rollout --cfg' for the keys"),
+        (["episode:"], "'episode:' is not an override: write key=value, did you mean episodes=?"),
+        (["method=ar", "method=kerv"], "method= is given twice, ar and kerv: leave one out"),
         (["task=[reach"], "input"),
     ],
 )

@@ -24,7 +24,7 @@ from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.cli import build as command
+from kerv_cli.cli.app import app
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.methods.retrieval import QdrantSearchSettings
 from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
@@ -434,7 +434,7 @@ def test_a_datastore_that_does_not_belong_here_is_refused(copy: Path, change: Ch
         (lambda f: cut(f / "payload.parquet"), "payload.parquet does not match its manifest"),
         (lambda f: (f / "payload.parquet").unlink(), "payload.parquet cannot be read"),
         (lambda f: cut(f / "manifest.json"), "cannot be read as JSON"),
-        (lambda f: (f / "manifest.json").write_text("[]"), "is not a datastore's manifest"),
+        (lambda f: (f / "manifest.json").write_text("[]"), "is not a datastore"),
         (lambda f: shutil.rmtree(f), "no datastore in"),
     ],
 )
@@ -536,18 +536,25 @@ def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy: Path) -> N
 
 
 def test_the_command_builds_and_reports(copy: Path) -> None:
-    words = ["datastore", "policy.target=nano-state", "demos=few", "task=reach,drawer-close", f"results={copy}"]
-    run = CliRunner().invoke(command.app, [*words, "--cfg"])
+    words = [
+        "build",
+        "datastore",
+        "policy.target=nano-state",
+        "demos=few",
+        "task=reach,drawer-close",
+        f"results={copy}",
+    ]
+    run = CliRunner().invoke(app, [*words, "--cfg"])
     assert run.exit_code == 0, run.output
-    assert "key:\n- scene" in run.output
-    run = CliRunner().invoke(command.app, [*words, "--plan"])
+    assert "\n- scene" in run.output
+    run = CliRunner().invoke(app, [*words, "--plan"])
     assert "6 demonstrations of 2 tasks, 52 control steps" in run.output
     shutil.rmtree(folder_of(copy))
-    run = CliRunner().invoke(command.app, words)
+    run = CliRunner().invoke(app, words)
     assert run.exit_code == 0, run.output
     assert "token_agreement" in run.output
     assert opened(copy)[0].manifest.rows == 52
-    run = CliRunner().invoke(command.app, [*words, "key=[smell]"])
+    run = CliRunner().invoke(app, [*words, "key=[smell]"])
     assert run.exit_code == 2
     assert run.output.startswith("kerv: unknown key 'smell'")
 

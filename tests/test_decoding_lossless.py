@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +12,17 @@ from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.base.files import sha256_of
-from kerv_cli.base.settings import DrafterSettings, TargetSettings
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
-from kerv_cli.targets.checkpoint import load_target, save_tensors
+from kerv_cli.targets.checkpoint import load_target, save_module, target_fields
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -318,22 +318,16 @@ def test_the_mock_sees_a_wrong_mask_position_or_cache() -> None:
 
 
 def test_a_target_of_your_own_is_loaded_by_its_family(tmp_path: Path) -> None:
-    save_tensors(tmp_path / "model.safetensors", {"nothing": torch.zeros(1)})
-    description = {
-        "format": 2,
-        "kind": "target",
-        "sha256": sha256_of(tmp_path / "model.safetensors"),
-        "family": "mock",
-        "environment": "metaworld",
-        "settings": {"chunk": 3},
-        "actions": SEVEN.as_dict(),
-        "observation": OBSERVATION.as_dict(),
-        "cameras": [],
-        "words": [],
-        "provenance": {},
-    }
-    (tmp_path / "target.json").write_text(json.dumps(description))
+    fields = target_fields("mock", {"chunk": 3}, "metaworld", SEVEN, OBSERVATION)
+    save_module(tmp_path, "target", torch.nn.Module(), fields)
     target, described = load_target(tmp_path)
     assert isinstance(target, MockTarget)
     assert target.actions == described.actions == SEVEN
     assert target.chunk == 3
+
+
+def test_a_description_without_a_chunk_gets_one_line(tmp_path: Path) -> None:
+    save_module(tmp_path, "target", torch.nn.Module(), target_fields("mock", {}, "metaworld", SEVEN, OBSERVATION))
+    with pytest.raises(CheckpointError, match=r"target\.json is damaged: .*settings lack chunk") as refused:
+        load_target(tmp_path)
+    assert "\n" not in str(refused.value)

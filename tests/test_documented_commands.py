@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from kerv_cli.base.config import groups
 from kerv_cli.cli.app import app
+from kerv_cli.lab.resolve import resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results/README.md"]
@@ -23,6 +25,8 @@ _OPEN = {
     "method=NAME": "method=ar",
     "study=NAME": "study=demo",
     "proposer=NAME": "proposer=hold",
+    "drafter=NAME": "drafter=early",
+    "drafter.KEY=VALUE": "drafter.width=64",
 }
 
 
@@ -74,3 +78,12 @@ def test_documented_rules_of_make_are_there() -> None:
         words = command.split()
         if words[0] == "make":
             assert words[1] in rules, command
+
+
+@pytest.mark.parametrize("study", groups()["study"])
+def test_every_study_resolves(study: str) -> None:
+    """Beside the documented commands: what one composes, the other has."""
+    resolved = resolve([f"study={study}"])
+    assert resolved.study.name == study
+    assert resolved.study.baseline in resolved.settings
+    assert len({r.seed for r in resolved.settings.values()}) == 1

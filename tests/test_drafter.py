@@ -6,8 +6,8 @@ import pytest
 import torch
 from test_decoding_lossless import random_prompt, random_target
 
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DraftState, draft_tree, observe
 from kerv_cli.targets.compact.target import CompactTarget
 

@@ -15,18 +15,17 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.settings import TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.cli.app import app
 from kerv_cli.engine.history import ActionHistory
-from kerv_cli.methods.artifacts import artifact_folder
+from kerv_cli.methods.artifacts import MadeFor, Request
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (
+    EarlyArtifact,
     EarlyDrafter,
     choose,
     choose_with_odds,
-    load_early,
     padded,
-    read_early,
-    save_early,
 )
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
@@ -34,6 +33,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.early_distillation import (
     EarlyDistillation,
+    EarlyRun,
     EarlySamples,
     accepted_tokens,
     measure,
@@ -42,7 +42,7 @@ from kerv_cli.training.early_distillation import (
 )
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.observations import split
-from kerv_cli.training.runs import EarlyRun, drafter_run
+from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -51,7 +51,7 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
-SMALL = DrafterSettings(kind="early", layers=2, width=32, rank=8, history=2, samples=1000)
+SMALL = EarlySettings(layers=2, width=32, rank=8, history=2, samples=1000)
 SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10
 STRICT = torch.from_numpy(ACTIONS.strict_tokens(8))
 
@@ -63,7 +63,7 @@ def shaped(settings: TargetSettings = SHAPE) -> CompactTarget:
 FEATURES = shaped().pooled_width
 
 
-def drafter(settings: DrafterSettings = SMALL, target: CompactTarget | None = None) -> EarlyDrafter:
+def drafter(settings: EarlySettings = SMALL, target: CompactTarget | None = None) -> EarlyDrafter:
     torch.manual_seed(0)
     early = EarlyDrafter.beside(settings, target or shaped()).eval()
     for parameter in early.parameters():
@@ -122,7 +122,7 @@ def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -
 @pytest.mark.parametrize("history", [0, 2])
 def test_packed_weights_give_the_same_logits(history: int) -> None:
     torch.manual_seed(0)
-    early = drafter(DrafterSettings(kind="early", layers=2, width=24, rank=6, history=history))
+    early = drafter(EarlySettings(layers=2, width=24, rank=6, history=history))
     for parameter in early.parameters():  # fresh blocks begin as the identity, with gains of one
         parameter.data += 0.3 * torch.randn_like(parameter)
     features = torch.randn(9, early.mean.numel())
@@ -330,7 +330,8 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert done.exit_code == 0, done.output
     assert "accepted_r9" in done.stdout
     target, description = load_target(results / "artifacts/target/nano-vision")
-    early, own = load_early(results / "artifacts/early/whole", target, description)
+    files, folder = EarlyArtifact(), results / "artifacts/early/whole"
+    own, early = files.checked(folder, description), files.load(folder, Request(description, target))
     assert own.target == description.sha256
     assert own.chunk == target.chunk
     assert own.provenance["settings"]["drafter"]["width"] == early.settings.width == 32
@@ -341,13 +342,13 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert all(0 <= token < 255 for token in drafted)
     other = load_target(results / "artifacts/target/nano-state")[1]
     with pytest.raises(CheckpointError, match="was trained for target"):
-        read_early(results / "artifacts/early/whole", other)
+        files.checked(folder, other)
     longer = dataclasses.replace(description, settings={**description.settings, "chunk": 8})
     with pytest.raises(CheckpointError, match="chunks of 4"):
-        read_early(results / "artifacts/early/whole", longer)
+        files.checked(folder, longer)
     foreign = dataclasses.replace(description, actions=dataclasses.replace(ACTIONS, strict=()))
     with pytest.raises(CheckpointError, match="action space with strict gripper, the target one with none"):
-        read_early(results / "artifacts/early/whole", foreign)
+        files.checked(folder, foreign)
 
 
 @pytest.mark.bits
@@ -381,19 +382,19 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
     early = drafter(SMALL, target)
     early.standardise(torch.randn(20, target.pooled_width))
     with pytest.raises(CheckpointError, match="kerv train drafter drafter=early"):
-        load_early(tmp_path, target, description)
-    save_early(tmp_path, early, description.sha256, {})
-    loaded, _ = load_early(tmp_path, target, description)
+        EarlyArtifact().load(tmp_path, Request(description, target))
+    EarlyArtifact().save(tmp_path, early, MadeFor.of(description), {}, settings=dataclasses.asdict(early.settings))
+    loaded = EarlyArtifact().load(tmp_path, Request(description, target))
     features, history = torch.randn(1, target.pooled_width), np.zeros((1, 4))
     assert loaded.drafted(features, history, 0).tokens == early.drafted(features, history, 0).tokens
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     with pytest.raises(CheckpointError, match="does not match"):
-        load_early(tmp_path, target, description)
+        EarlyArtifact().load(tmp_path, Request(description, target))
 
 
 def test_the_folder_is_beside_the_target(policies: Path) -> None:
-    place = artifact_folder("early")
+    place = EarlyArtifact().place
     assert place("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
     assert place("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
     assert place("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")

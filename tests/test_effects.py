@@ -6,7 +6,7 @@ import pytest
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.settings import RolloutSettings, StudySettings
-from kerv_cli.lab.effects import without_effect
+from kerv_cli.lab.identity import without_effect
 from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
 
 

@@ -81,6 +81,6 @@ def test_a_plugin_is_named_by_an_environment_variable(plugin: str, suite: str, t
 
 
 def test_rollouts_do_not_need_rerun() -> None:
-    modules = "kerv_cli.lab.cells, kerv_cli.lab.run, kerv_cli.lab.expert"
+    modules = "kerv_cli.lab.run, kerv_cli.lab.expert"
     code = f"import sys, {modules}; sys.exit('rerun' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -9,33 +9,17 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
+import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base import settings as s
-from kerv_cli.base.config import MOST_POINTS, PART_GROUPS, compose, expand
+from kerv_cli.base.config import MOST_POINTS, compose, expand
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.base.places import artifact, find_target, results_dir
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import SETTINGS_GROUPS, parts
 from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.kinematics.prediction import MINIMUM
 
-SCHEMAS = {
-    "rollout": s.RolloutSettings,
-    "sweep": s.SweepSettings,
-    "train_target": s.TrainTargetSettings,
-    "train_drafter": s.TrainDrafterSettings,
-    "demos": s.DemosSettings,
-    "doctor": s.DoctorSettings,
-    "build_datastore": s.BuildDatastoreSettings,
-    "calibrate": s.CalibrateSettings,
-    "demos_export": s.DemosExportSettings,
-    "demos_import": s.DemosImportSettings,
-    "build_target": s.BuildTargetSettings,
-    "build_drafter": s.BuildDrafterSettings,
-    "bench": s.BenchSettings,
-    "bench_replay": s.BenchReplaySettings,
-    "serve": s.ServeSettings,
-    "report": s.ReportSettings,
-}
+SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 
 
 def numbers(kind: type) -> Iterator[tuple[type, Field[Any]]]:
@@ -52,7 +36,7 @@ def numbers(kind: type) -> Iterator[tuple[type, Field[Any]]]:
 
 def test_every_number_has_limits_and_its_default_lies_within_them() -> None:
     kinds = list(SCHEMAS.values())
-    kinds += [part.settings for group in (*PART_GROUPS, "executor") for part in parts(group).values()]
+    kinds += [part.settings for group in (*SETTINGS_GROUPS, "executor") for part in parts(group).values()]
     open_ended = [f"{kind.__name__}.{at.name}" for k in kinds for kind, at in numbers(k) if "limits" not in at.metadata]
     assert open_ended == []
     for kind in kinds:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from dataclasses import replace
@@ -19,15 +20,16 @@ from safetensors.torch import load_file, save_file
 from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
 from typer.testing import CliRunner
 
-from kerv_cli.base.settings import BuildTargetSettings, DrafterSettings
+from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Language, Shape, Statistics, action_space, read_shape
-from kerv_cli.targets.openvla.image import cropped, pixels_of
+from kerv_cli.targets.openvla.image import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.importing import import_checkpoint
 from kerv_cli.targets.openvla.layout import layout, published, unread
 from kerv_cli.targets.openvla.loading import OpenVLAModel
@@ -296,6 +298,33 @@ def test_a_dof_without_a_mask_keeps_its_value(target: OpenVLATarget) -> None:
     assert target.actions.decode(np.full((1, 7), 255))[0, -1] == pytest.approx(254 / 255, abs=1e-6)
 
 
+def lanczos(pixels: np.ndarray, size: int) -> np.ndarray:
+    """pixels (n, m, 3) -> (size, m, 3): windowed sinc of three lobes, widened when it shrinks (ScaleAndTranslate of
+    TensorFlow's resize with antialias)."""
+    n = len(pixels)
+    scale = max(1.0, n / size)
+    at = (np.arange(size) + 0.5) * n / size
+    x = (np.arange(n) + 0.5 - at[:, None]) / scale
+    weights = np.where(abs(x) < 3, np.sinc(x) * np.sinc(x / 3), 0.0)
+    return np.tensordot(weights / weights.sum(1, keepdims=True), pixels, 1)
+
+
+def test_a_frame_is_prepared_as_in_openvlas_evaluation_on_libero() -> None:
+    smooth = np.linspace(40, 200, 64)[:, None, None] + np.array([0.0, 20.0, -30.0]) + np.zeros((64, 64, 3))
+    image = smooth.round().astype(np.uint8)
+    wanted = lanczos(lanczos(smooth, 56).swapaxes(0, 1), 56).swapaxes(0, 1)
+    prepared = as_in_libero(image, 56)
+    assert prepared.shape == (56, 56, 3)
+    assert np.abs(prepared - wanted).max() < 4  # JPEG's own error on a smooth frame
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(noise).save(file, "JPEG", quality=95, subsampling=2)
+    read = np.asarray(Image.open(file)).astype(float)
+    assert np.abs(read - noise).mean() > 10  # colour at half resolution does not survive as noise
+    wanted = np.clip(lanczos(lanczos(read, 56).swapaxes(0, 1), 56).swapaxes(0, 1).round(), 0, 255)
+    assert np.abs(as_in_libero(noise, 56) - wanted).max() <= 1
+
+
 def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
     image = np.random.default_rng(3).integers(0, 256, (90, 61, 3), dtype=np.uint8)
     side = math.sqrt(0.9)
@@ -438,7 +467,7 @@ def test_an_import_is_a_target_like_any_other(checkpoint: Path, tmp_path: Path) 
         ({}, ["COPY", "environment=metaworld"], "are of 7 DoFs, the action space has 4 (dx, dy, dz, gripper)"),
         ({}, ["COPY", "environment=kitchen"], "unknown environment 'kitchen'"),
         ({}, ["COPY", "prompt=chat"], "unknown prompt 'chat'"),
-        ({}, ["COPY", "family=compact"], "only openvla is imported"),
+        ({}, ["COPY", "family=compact"], "only openvla"),
         ({}, ["COPY", "prompt_tokens=3"], "at most 3 are taken"),
         (
             {"preprocessor_config.json": {"image_resize_strategy": "letterbox"}},

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.cli.app import app
-from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+from kerv_cli.methods.artifacts import MadeFor
+from kerv_cli.methods.early import EarlySettings
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 
@@ -40,8 +42,9 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for task, name in (("drawer-close-v3", "drawer"), ("insert-peg", "pegs")):
         record(DemoConfig((task,), 4, frame_stride=16, workers=1), results / "artifacts/demos" / name)
     target, described = load_target(results / "artifacts/target/nano-state")
-    early = EarlyDrafter.beside(DrafterSettings(kind="early", layers=1, width=16, rank=4, history=2), target)
-    save_early(results / "artifacts/early/nano-state", early, described.sha256, {})
+    early = EarlyDrafter.beside(EarlySettings(layers=1, width=16, rank=4, history=2), target)
+    folder, own = results / "artifacts/early/nano-state", {"settings": asdict(early.settings)}
+    EarlyArtifact().save(folder, early, MadeFor.of(described), {}, **own)
     common = [TARGET, "task=drawer-close", "demos=drawer", f"results={results}"]
     assert kerv("build", "datastore", *common) == (0, [])
     assert kerv("calibrate", *common, "held_out=0.5", "decodes=0") == (0, [])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,25 +15,28 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from examples.own_proposer_table import FollowProposer, FollowTable, save
+from examples.own_proposer_table import FollowArtifact, FollowProposer, FollowTable
 from examples.own_target import SEVEN, MockTarget
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_calibration import write_dataset
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
+from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, as_plain, settings_from
 from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.lab.policy import identity_of
-from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import check, needs
-from kerv_cli.methods.compose import compose as compose_decoder
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
+from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 
@@ -51,7 +56,7 @@ def results(policies: Path, tmp_path: Path) -> Path:
     random = np.random.default_rng(0)
     table = FollowTable.fit([random.integers(0, 255, (400, 4))], SPEC.actions)
     description = files_of(settings_of(copied)).description
-    save(copied / "artifacts/follow/mine", table, description)
+    FollowArtifact().save(copied / "artifacts/follow/mine", table, MadeFor.of(description), {})
     return copied
 
 
@@ -126,14 +131,14 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     results: Path, overrides: str, wanted: set[str]
 ) -> None:
     asked = settings_of(results, *overrides.split())
-    check(asked.parts(), asked.chunk, 4)
-    assert set(needs(asked.parts())) == wanted
+    method = Method.of(asked)
+    assert set(method.needs) == wanted
     identity = identity_of(asked)
     assert {"target", *wanted} == set(identity) - {"observation"}
     assert settings_from(as_plain(asked)) == asked
     files = files_of(asked)
     assert files.load("follow") is files_of(asked).load("follow")
-    decoder = compose_decoder(asked.parts(), files.target, files.load)
+    decoder = method.decoder(files.target, files.load)
     plain = Decoder(files.target)
     state = np.random.default_rng(1).uniform(0, 0.5, 39)
     for chosen in (decoder, plain):
@@ -152,7 +157,7 @@ def damage(path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda folder: shutil.rmtree(folder), "no follow in"),
+        (lambda folder: shutil.rmtree(folder), "no table in"),
         (lambda folder: damage(folder / "model.safetensors"), "does not match its description"),
         (lambda folder: damage(folder / "follow.json"), "cannot be read as JSON"),
     ],
@@ -166,17 +171,52 @@ def test_what_is_missing_or_damaged_gets_one_line(results: Path, change: Any, sa
 
 def test_a_table_of_another_target_or_action_space_is_refused(results: Path) -> None:
     files = files_of(settings_of(results, "policy.target=nano-vision"))
-    with pytest.raises(CheckpointError, match="is of target"):
+    with pytest.raises(CheckpointError, match="was trained for target"):
         files.check(["follow"])
     own = files_of(settings_of(results)).description
     other = dataclasses.replace(own, actions=dataclasses.replace(own.actions, control_hz=3.0))
-    save(results / "artifacts/follow/slow", FollowTable(4, 255), other)
+    FollowArtifact().save(results / "artifacts/follow/slow", FollowTable(4, 255), MadeFor.of(other), {})
     with pytest.raises(CheckpointError, match="control_hz 3"):
         files_of(settings_of(results, name="slow")).check(["follow"])
 
 
+def test_it_is_trained_from_the_command_line_and_drafts_in_a_rollout(results: Path) -> None:
+    write_dataset(results / "artifacts/demos/few")
+    policy = ("policy.target=nano-state", "+policy.others.follow=learnt", f"results={results}")
+
+    def kerv(*words: str) -> str:
+        done = CliRunner().invoke(app, [*words, *policy])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    few = ("demos=few", "drafter.share=0.5", "train.steps=6", "train.batch=8", "train.validate_every=3", "train.lr=0.1")
+    assert "a table of" in kerv("train", "drafter", "drafter=follow", *few, "--plan")
+    assert "score" in kerv("train", "drafter", "drafter=follow", *few)
+    described = json.loads((results / "artifacts/follow/learnt/follow.json").read_text())
+    assert described["settings"] == {"kind": "follow", "share": 0.5}
+    kerv("rollout", "task=[reach]", "prefill_draft=follow", "episodes=1", "world.horizon=12", "record=0")
+    files = files_of(settings_of(results, name="learnt"))
+    assert files.check(["follow"])["follow"] == described["sha256"]
+    assert not torch.equal(files.load("follow").logits, FollowTable(4, 255).logits)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["drafter=folow"], "unknown drafter 'folow': did you mean follow"),
+        (["drafter=follow", "drafter.width=3"], "unknown key 'drafter.width'"),
+        (["drafter=follow", "drafter.share=0"], "drafter.share=0.0: above 0, at most 1"),
+        (["drafter.kind=follow"], "drafter.kind=follow: choose drafter=follow, each has settings of its own"),
+    ],
+)
+def test_its_training_has_settings_of_its_own(words: list[str], says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        drafter_run(compose("train_drafter", words, TrainDrafterSettings))
+
+
 def test_it_is_a_choice_like_any_other() -> None:
     known = groups()
+    assert "follow" in known["drafter"]
     assert "follow" in known["proposer"]
     assert "follow" in known["prefill_draft"]
     with pytest.raises(KervError, match="did you mean follow"):
@@ -195,5 +235,6 @@ def test_the_command_knows_it_without_loading_anything_heavy() -> None:
         text=True,
         check=True,
     )
-    assert "proposer:\n  kind: follow\n  depth: 3\n" in done.stdout
+    plain = re.sub(r" +#.*", "", done.stdout)
+    assert "proposer:\n  kind: follow\n  depth: 3\n" in plain
     assert done.stdout.endswith("False\n")

@@ -6,14 +6,16 @@ import copy
 import pickle
 
 import numpy as np
+import plain_decoder
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kerv_cli.base.settings import DrafterSettings, TargetSettings
+from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact import kernels
 from kerv_cli.targets.compact.kernels import FastLinear, has_blocked_layouts
@@ -264,3 +266,8 @@ def test_one_row_behind_a_mask_sees_what_the_modules_see() -> None:
             trunk(x[:, :5], torch.arange(5), cache)
             outputs.append(trunk(x[:, 5:], torch.tensor([4]), cache, seen))
     assert close(*outputs)
+
+
+def test_a_plain_decoder_in_numpy_gives_the_shipped_policys_tokens(capsys: pytest.CaptureFixture[str]) -> None:
+    assert plain_decoder.main("mt10-vision", 3)
+    assert "ratio" in capsys.readouterr().out

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.tree import TokenTree
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.early.drafter import EarlyDraft, EarlyProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings

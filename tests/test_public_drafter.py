@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -17,8 +18,10 @@ from test_decoding_lossless import decode, plain_greedy
 from test_openvla import imported, kerv, loaded, shown
 from torch import Tensor
 
-from kerv_cli.methods.eagle.drafter import DrafterProposer, load_drafter
+from kerv_cli.methods.artifacts import Request
+from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
+from kerv_cli.targets.checkpoint import read_target
 from kerv_cli.targets.openvla.config import Language
 from kerv_cli.targets.openvla.target import OpenVLATarget
 
@@ -118,7 +121,8 @@ def test_it_is_imported_beside_its_target(
     assert kerv("build", "drafter", *words, "positions=text")[0] == 0
     description = json.loads((results / "artifacts/drafter/openvla/drafter.json").read_text())
     assert description["public"]["convention"] == {"positions": "text", "mask": "causal"}
-    own, _ = load_drafter(results / "artifacts/drafter/openvla", target, description["target"])
+    described = read_target(results / "artifacts/target/openvla")
+    own: Any = DrafterArtifact().load(results / "artifacts/drafter/openvla", Request(described, target))
     assert (own.draft_position(40), drafter.draft_position(40)) == (24, 40)
     for name, tensor in own.state_dict().items():
         torch.testing.assert_close(tensor, drafter.state_dict()[name])

@@ -24,9 +24,8 @@ from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab import run
-from kerv_cli.lab.clock import RealClock, displacement, predictor
+from kerv_cli.lab.clock import Constant, Measured, Profiled, RealClock, displacement, predictor, steps_of
 from kerv_cli.lab.episode import run_episode
-from kerv_cli.lab.latency import Constant, Measured, Profiled, steps_of
 from kerv_cli.lab.rows import Circumstances, decode_rows, episode_row
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 
@@ -413,7 +412,7 @@ def test_an_impossible_profile_is_refused(results: Path, phases: dict[str, Any],
 
 
 def test_settings_without_effect_are_named(policies: Path) -> None:
-    from kerv_cli.lab.effects import without_effect
+    from kerv_cli.lab.identity import without_effect
 
     def idle(*words: str) -> list[str]:
         return list(without_effect(compose("rollout", words, RolloutSettings), words))

@@ -49,17 +49,46 @@ EVERY = [(kind, name) for kind in kinds() for name, part in parts(kind).items() 
 
 
 def test_a_name_belongs_to_one_piece_of_code(shelf: dict[str, dict[str, Part]]) -> None:
-    first = register(Part("proposer", "mine", "one:build"))
-    again = register(Part("proposer", "mine", "one:build", colour=1))
+    first = register(Part("proposer", "mine", "one:build", traits={"when": PREFILL}))
+    again = register(Part("proposer", "mine", "one:build", colour=1, traits={"when": PREFILL}))
     assert find("proposer", "mine") is again is not first
     with pytest.raises(UsageError, match="proposer 'mine' is registered twice: one:build and two:build") as refused:
-        register(Part("proposer", "mine", "two:build"))
+        register(Part("proposer", "mine", "two:build", traits={"when": PREFILL}))
     assert "\n" not in str(refused.value)
     with pytest.raises(UsageError, match="proposer 'drafter' is registered twice"):
-        register(Part("proposer", "drafter", "elsewhere:build"))
+        register(Part("proposer", "drafter", "elsewhere:build", traits={"when": STATES}))
     assert find("proposer", "drafter").build == "kerv_cli.methods.eagle.drafter:DrafterProposer.build"
     register(Part("threshold", "mine", "two:build"))  # another kind: another name
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
+
+
+@pytest.mark.parametrize(
+    ("part", "says"),
+    [
+        (Part("propser", "mine", "one:build"), "unknown kind of part 'propser': did you mean proposer"),
+        (
+            Part("proposer", "mine", "one:build"),
+            "proposer 'mine' lacks the trait when: the traits of this kind",
+        ),
+        (
+            Part("proposer", "mine", "one:build", traits={"when": PREFILL, "chain": True}),
+            "proposer 'mine' has an unknown trait chain: the traits of this kind are when, chains, sides",
+        ),
+        (Part("threshold", "mine", "one:build", traits={"when": PREFILL}), "unknown trait when: this kind has none"),
+        (Part("stress", "mine", "one:build"), "stress 'mine' lacks the trait needed"),
+        (
+            Part("threshold", "mine", "one:build", settings=int),
+            "its settings int must be a dataclass with a",
+        ),
+    ],
+)
+def test_a_part_that_is_not_of_its_kind_is_refused_in_one_line(
+    shelf: dict[str, dict[str, Part]], part: Part, says: str
+) -> None:
+    with pytest.raises(UsageError, match=says) as refused:
+        register(part)
+    assert "\n" not in str(refused.value)
+    assert part.name not in shelf.get(part.kind, {})
 
 
 def test_an_unknown_name_lists_the_near_ones() -> None:
@@ -116,8 +145,8 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path: Path) -> None:
     words = ["rollout", "--cfg", "proposer=mine", "prefill_draft=mine"]
     shown = kerv(*words, "proposer.width=3", folder=tmp_path, plugins="my_parts")
     assert shown.returncode == 0, shown.stderr
-    assert "proposer:\n  kind: mine\n  width: 3\n" in shown.stdout
-    assert "prefill_draft:\n  kind: mine\n  width: 17\n" in shown.stdout
+    assert "\n  kind: mine\n  width: 3\n" in shown.stdout
+    assert "\n  kind: mine\n  width: 17\n" in shown.stdout
     wrong = kerv("rollout", "--cfg", "proposer=mien", folder=tmp_path, plugins="my_parts")
     assert (wrong.returncode, wrong.stderr) == (2, "kerv: unknown proposer 'mien': did you mean mine?\n")
     without = kerv(*words, folder=tmp_path)

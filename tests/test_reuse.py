@@ -27,7 +27,6 @@ from kerv_cli.lab import identity
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.lab.reuse import Covered, Stock, cover, disagreements, take_over
-from kerv_cli.lab.run_file import interrupted_since, note_finished, note_invocation
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study, study_table
@@ -133,11 +132,11 @@ def test_a_rerun_keeps_the_older_measurement_beside_it(store: StudyStore) -> Non
 def test_an_interrupted_rerun_goes_on(store: StudyStore) -> None:
     cells, words = threshold_study(["reach-v3"]), ["sweep", "rerun=all"]
     swept(store, cells)
-    note_invocation(store.root, ["sweep"])
-    note_finished(store.root)
-    assert interrupted_since(store.root, words) == ""
-    note_invocation(store.root, words)
-    since = interrupted_since(store.root, words)
+    store.note_command(["sweep"])
+    store.note_finished()
+    assert store.interrupted_since(words) == ""
+    store.note_command(words)
+    since = store.interrupted_since(words)
     begun = cover(cells, Stock(store), "all", since)
     execute([cell for cell in begun.cells if cell.label == "ar"], prepare, store)
     status = store.cells / begun.cells[0].id / "status.json"

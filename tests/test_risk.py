@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
-import scipy.stats
 import torch
 from examples.own_target import MockTarget
 from test_streak import ByPlace, near
@@ -24,8 +26,10 @@ from kerv_cli.engine.loss import auc, chunk_loss, target_tokens
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.methods.risk import RiskSkipSettings
-from kerv_cli.methods.risk.gate import Audit, Evidence, RiskSkip
-from kerv_cli.methods.risk.recording import certify, episodes_needed, hoeffding_bentkus, p_value
+from kerv_cli.methods.risk.alarm import Audit, Evidence, alarm_level, largest_evidence
+from kerv_cli.methods.risk.betting import more_to_decide, p_value, wealth
+from kerv_cli.methods.risk.gate import RiskSkip
+from kerv_cli.methods.risk.recording import RiskArtifact, RiskRecording, certify, episodes_needed
 from kerv_cli.methods.risk.scores import Draft
 from kerv_cli.report.risk import coverage
 from kerv_cli.training import risk_recording
@@ -42,21 +46,49 @@ def population(seed: int, episodes: int, decodes: int = 12) -> tuple[np.ndarray,
     return scores, (random.random(len(scores)) < odds).astype(float), np.repeat(np.arange(episodes), decodes)
 
 
-def test_hoeffding_bentkus_against_its_formula() -> None:
-    n, mean, alpha = 40, 0.05, 0.2
-    bentkus = math.e * sum(math.comb(n, k) * alpha**k * (1 - alpha) ** (n - k) for k in range(3))
-    divergence = scipy.stats.entropy([mean, 1 - mean], [alpha, 1 - alpha])
-    assert hoeffding_bentkus(mean, alpha, n) == pytest.approx(min(bentkus, math.exp(-n * divergence)))
-    assert hoeffding_bentkus(0.2, 0.2, n) == 1.0
+def lost_and_won(random: np.random.Generator, pairs: int, lost: float, won: float) -> np.ndarray:
+    """v of paired episodes of which these shares are solved by the baseline, by the method alone."""
+    return random.choice([1.0, 0.5, 0.0], size=pairs, p=[lost, 1 - lost - won, won])
 
 
-def test_the_test_errs_no_oftener_than_it_says() -> None:
-    """Means just above ε, of a skewed and of a two-point distribution."""
-    random = np.random.default_rng(0)
-    skewed = [p_value(random.beta(0.2, 1.75, 80), 0.1) for _ in range(400)]
-    points = [p_value((random.random(80) < 0.101).astype(float), 0.1) for _ in range(400)]
-    for p in (skewed, points):
-        assert np.mean(np.array(p) <= 0.1) <= 0.1 + 3 * math.sqrt(0.09 / 400)
+@pytest.mark.parametrize("groups", [1, 10])
+def test_a_bet_against_a_true_hypothesis_errs_no_oftener_than_it_says(groups: int) -> None:
+    """Means at the bound: skewed ones, two-point ones, those of tasks that differ in random order, and of pairs."""
+    random, bound = np.random.default_rng(0), 0.1
+    hard = np.repeat(np.linspace(0, 2 * bound, groups) if groups > 1 else [bound], 200 // groups)
+
+    def share(draw: Callable[[], np.ndarray], at: float = bound) -> float:
+        return float(np.mean([p_value(draw(), at, 0.1) <= 0.1 for _ in range(400)]))
+
+    most = 0.1 + 3 * math.sqrt(0.09 / 400)
+    assert share(lambda: random.permutation(random.beta(0.2 * hard + 1e-9, 0.2 * (1 - hard)))) <= most
+    assert share(lambda: (random.random(200) < random.permutation(hard)).astype(float)) <= most
+    for lost, won in ((0.05, 0.0), (0.08, 0.03), (0.15, 0.1)):
+        assert share(lambda lost=lost, won=won: lost_and_won(random, 210, lost, won), 0.525) <= most  # type: ignore[misc]
+
+
+def test_bets_show_that_pairs_that_seldom_differ_lose_less_than_five_points() -> None:
+    random = np.random.default_rng(1)
+    shown = [p_value(lost_and_won(random, 210, 0.01, 0.01), 0.525, 0.1) <= 0.1 for _ in range(300)]
+    assert np.mean(shown) >= 0.95
+
+
+def test_bets_know_nothing_of_the_values_to_come() -> None:
+    values = np.random.default_rng(2).random(30)
+    changed = np.concatenate([values[:20], 1 - values[20:]])
+    assert wealth(values, 0.5, 0.1)[:20] == pytest.approx(wealth(changed, 0.5, 0.1)[:20])
+    assert p_value(np.zeros(0), 0.5, 0.1) == 1.0
+
+
+def test_how_many_values_more_would_decide() -> None:
+    """Pairs that agree: each multiplies the wealth by as much, so that the number is exact up to the first bets."""
+    short = np.full(60, 0.5)
+    more = more_to_decide(short, 0.525, 0.1)
+    growth = math.log1p(0.75 / 0.475 * 0.025)
+    assert more == math.ceil((math.log(10) - math.log(wealth(short, 0.525, 0.1)[-1])) / growth)
+    assert more_to_decide(np.full(200, 0.5), 0.525, 0.1) == 0
+    assert more_to_decide(np.full(60, 0.6), 0.525, 0.1) == math.inf
+    assert more_to_decide(np.zeros(0), 0.525, 0.1) == math.inf
 
 
 def test_a_certified_risk_holds_in_repeated_calibrations() -> None:
@@ -111,6 +143,25 @@ def test_evidence_is_seldom_large_where_there_is_no_shift() -> None:
             largest = [max(largest[0], evidence.above), max(largest[1], evidence.below)]
         reached = [count + (value >= 10) for count, value in zip(reached, largest, strict=True)]
     assert max(reached) <= 500 * 0.1
+
+
+SHIPPED = Path(__file__).parents[1] / "results/pretrained/mt10-vision/risk"
+
+
+def test_the_alarm_is_false_as_often_as_it_says_on_recorded_episodes_that_set_no_level() -> None:
+    """The shipped recording, whose tasks differ in risk: half of its episodes set level and alarm, the others count."""
+    drafts = RiskRecording(RiskArtifact().read(SHIPPED), pq.read_table(SHIPPED / "decodes.parquet")).losses("early")
+    scores, losses, settings = drafts.scores["odds"], drafts.losses, RiskSkipSettings()
+    decodes = [np.flatnonzero(drafts.episodes == number) for number in range(int(drafts.episodes.max()) + 1)]
+    random, rates = np.random.default_rng(0), []
+    for _ in range(8):
+        order = random.permutation(len(decodes))
+        seen, fresh = ([decodes[number] for number in half] for half in np.split(order, 2))
+        rows, numbers = np.concatenate(seen), np.repeat(np.arange(len(seen)), [len(part) for part in seen])
+        trusted = scores >= certify(scores[rows], losses[rows], numbers, settings.epsilon, settings.delta).level
+        raised = alarm_level([(trusted[part], losses[part]) for part in seen], settings)
+        rates += [(largest_evidence(trusted[part], losses[part], settings, random) > raised).mean() for part in fresh]
+    assert 0.05 <= np.mean(rates) <= settings.delta + 0.03
 
 
 def test_an_alarm_comes_within_ten_audits_and_goes_when_losses_stay_away() -> None:
@@ -267,8 +318,9 @@ def kerv(*words: str) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the policy `nano-state`, an early drafter and a recording of its risk."""
-    from kerv_cli.base.settings import DrafterSettings
-    from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+    from kerv_cli.methods.artifacts import MadeFor
+    from kerv_cli.methods.early import EarlySettings
+    from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
     from kerv_cli.targets.checkpoint import load_target
 
     results = tmp_path_factory.mktemp("risk")
@@ -276,8 +328,9 @@ def recorded(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     target, description = load_target(results / "artifacts/target/nano-state")
     for name, seed in (("nano-state", 0), ("other", 1)):
         torch.manual_seed(seed)
-        early = EarlyDrafter.beside(DrafterSettings(kind="early", width=16, layers=1), target)
-        save_early(results / "artifacts/early" / name, early, description.sha256, {})
+        early = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
+        folder, own = results / "artifacts/early" / name, {"settings": asdict(early.settings)}
+        EarlyArtifact().save(folder, early, MadeFor.of(description), {}, **own)
     code, output = kerv("calibrate", "risk", *common(results), "episodes=2", "features=true", "world.horizon=24")
     assert code == 0, output
     return results
@@ -314,6 +367,32 @@ def test_another_drafter_than_the_recorded_one_is_refused(recorded: Path) -> Non
     assert code == 1
     assert "was recorded for early drafter" in output
     assert "not for" in output
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("threshold.r=5", "threshold.r=9, not 5"),
+        ("acceptance=strict", "acceptance.kind=relaxed, not strict"),
+        ("chunk=2", "chunk=4, not 2"),
+        ("runtime.dtype=bfloat16", "runtime.dtype=float32, not bfloat16"),
+    ],
+)
+def test_a_level_of_another_decoding_is_refused_with_the_command_that_records_anew(
+    recorded: Path, word: str, message: str
+) -> None:
+    code, output = rollout(recorded, "skip.epsilon=0.9", "skip.delta=0.5", word)
+    assert code == 1
+    assert f"the risk was recorded with {message}: run 'kerv calibrate risk {word} " in output
+
+
+def test_a_recording_of_the_method_s_own_decoding_is_used(recorded: Path) -> None:
+    decoding = ("threshold.r=5", "acceptance.strict_dofs=false", "chunk=2")
+    code, output = kerv("calibrate", "risk", *common(recorded), *decoding, "name=own", "episodes=1", "world.horizon=24")
+    assert code == 0, output
+    gate = ("skip.epsilon=0.9", "skip.delta=0.5", "policy.risk=own", *decoding)
+    code, output = rollout(recorded, *gate)
+    assert code == 0, output
 
 
 @pytest.mark.parametrize(

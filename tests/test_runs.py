@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
 from kerv_cli.lab.catalogue import find_runs, matching
-from kerv_cli.lab.cells import CellRunner
+from kerv_cli.lab.run import CellRunner
 from kerv_cli.report.export import TRACKERS, export
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
@@ -305,8 +305,7 @@ def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from kerv_cli.lab.catalogue import find_run
-from kerv_cli.lab.removal import remove
+from kerv_cli.lab.catalogue import find_run, remove
 
 left = int(sys.argv[3])
 

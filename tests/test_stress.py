@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import subprocess
-import sys
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,9 +14,10 @@ import pytest
 from examples.insertion import SPEC as INSERTION
 from typer.testing import CliRunner
 
+from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import Part, parts
 from kerv_cli.base.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
 from kerv_cli.cli.app import app
 from kerv_cli.lab.identity import stress_of, work_of
@@ -387,19 +386,13 @@ def test_what_an_environment_cannot_do_is_refused() -> None:
     check(settings("world.stress.kind=object", "world.stress.level=4"))
 
 
-def kerv(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words]
-    paths = [str(TESTS), str(TESTS.parent), os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "KERV_PLUGINS": "examples.insertion", "PYTHONPATH": os.pathsep.join(paths)}
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, env=environment)
-
-
 WORDS = ["policy=expert", "task=insert-peg", "episodes=2", "record=0", "world.stress.kind=push"]
 
 
 def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path: Path) -> None:
-    run = kerv("rollout", "-m", *WORDS, "world.stress.level=0,2", "--json", cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
+    words = ["rollout", "-m", *WORDS, f"results={tmp_path}"]
+    run = CliRunner().invoke(app, [*words, "world.stress.level=0,2", "--json"])
+    assert run.exit_code == 0, run.stderr
     rows = json.loads(run.stdout)["settings"]
     assert [(row["stress"], row["stress_level"]) for row in rows] == [("none", 0), ("push", 2)]
     wrong = CliRunner().invoke(app, ["rollout", *WORDS, "world.stress.level=5", f"results={tmp_path}"])
@@ -414,3 +407,27 @@ def test_the_plan_and_the_figures_say_which_stress_it_is(tmp_path: Path, capsys:
     assert capsys.readouterr().out.startswith("expert, stress push 2: 1 tasks, 2 episodes")
     rollout(words)
     assert "stress push 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("traits", "builds", "says"),
+    [
+        (
+            {},
+            "Drift",
+            "needs the trait needed, a tuple of actions, position, images, model, range: it is None",
+        ),
+        ({"needed": ("wings",)}, "Drift", "it is ('wings',)"),
+        ({"needed": "actions"}, "Drift", "it is actions"),
+        ({"needed": ()}, "LEVELS.count", "stress 'odd' builds int, which is no subclass of Stress"),
+    ],
+)
+def test_a_kind_that_does_not_fit_gets_one_line(
+    traits: dict[str, Any], builds: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd = Part("stress", "odd", f"examples.own_stress:{builds}", traits=traits)
+    monkeypatch.setitem(registry._PARTS, "stress", {**parts("stress"), "odd": odd})
+    refuse = stressing.build if builds == "LEVELS.count" else lambda asked: stressing.check(asked, METAWORLD)
+    with pytest.raises(UsageError, match=re.escape(says)) as refused:
+        refuse(StressSettings("odd", 1))
+    assert "\n" not in str(refused.value)

@@ -116,7 +116,7 @@ def test_summaries_show_it_beside_the_speedup(tmp_path: Path) -> None:
     table = write(tmp_path, plan(settings(), ["reach-v3"], IDENTITY, baseline="ar"))
     frame = summary_frame(table)
     columns = list(frame.columns)
-    assert columns[columns.index("speedup") + 1] == "ceiling"
+    assert columns[columns.index("per step") + 1] == "ceiling"
     assert dict(zip(frame["setting"], frame["ceiling"], strict=True)) == {
         "ar": "–",
         "kerv": "1.30",

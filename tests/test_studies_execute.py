@@ -31,13 +31,11 @@ from kerv_cli.base.errors import StorageError, UsageError
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.progress import ProgressDisplay
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.block import RunEpisode
 from kerv_cli.lab.claims import is_claimed
-from kerv_cli.lab.estimate import estimate
 from kerv_cli.lab.events import BlockStarted, CellDone, CellFailed, CellReused, Event, SweepFinished, SweepStarted
-from kerv_cli.lab.execute import execute
+from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.plan import Cell, blocks_of
-from kerv_cli.lab.reuse import Stock, cover
+from kerv_cli.lab.reuse import Stock, cover, estimate
 from kerv_cli.lab.store import StudyStore
 
 
@@ -229,7 +227,7 @@ KILLED_PARENT = """
 import sys
 from studies_synthetic import slow_elsewhere, threshold_study
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.lab.execute import execute
+from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.store import StudyStore
 
 cells = threshold_study(["reach-v3", "push-v3"])

@@ -17,8 +17,17 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, as_plain
 from kerv_cli.lab.code import _meaning, code_hash
 from kerv_cli.lab.identity import ENGINE, hash_of, work_of
-from kerv_cli.lab.plan import blocks_of, parse_seeds, plan, seeds_text, unique_cells
-from kerv_cli.lab.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+from kerv_cli.lab.plan import (
+    StudyPlan,
+    blocks_of,
+    merge_plans,
+    parse_seeds,
+    plan,
+    plan_from_text,
+    plan_text,
+    seeds_text,
+    unique_cells,
+)
 
 
 def only_id(settings: RolloutSettings, task: str = "reach-v3", identity: dict[str, str] | None = None) -> str:

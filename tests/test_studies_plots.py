@@ -77,7 +77,7 @@ def test_what_the_axis_does_not_touch_is_a_level(boundaries: pd.DataFrame) -> No
     lines = {line.get_label(): line for line in panel.get_lines()}
     assert list(lines["fused"].get_xdata()) == [0.1, 0.3, 0.7]
     beside = dict(zip((t.get_text() for t in panel.get_xticklabels()), panel.get_xticks(), strict=True))
-    level = float(rows[rows["label"] == "always drafter"]["speedup"].iloc[0])
+    level = float(rows[rows["label"] == "always drafter"]["episode_speedup"].iloc[0])
     points = {(line.get_xdata()[0], line.get_ydata()[0]) for line in panel.get_lines() if line.get_marker() == "D"}
     assert (beside["always drafter"], level) in points
     assert min(beside["always drafter"], beside["radius alone"], beside["unused"]) > 0.7
@@ -86,7 +86,7 @@ def test_what_the_axis_does_not_touch_is_a_level(boundaries: pd.DataFrame) -> No
 def test_success_is_drawn_from_where_it_matters(boundaries: pd.DataFrame) -> None:
     figure = study_figures(boundaries, "boundary.f_star", "Title")[""]
     lowest = 100 * boundaries[boundaries["averaging"] == MICRO]["success_low"].min()
-    assert lowest - 10 <= figure.axes[1].get_ylim()[0] <= max(0.0, lowest)
+    assert lowest - 10 <= figure.axes[2].get_ylim()[0] <= max(0.0, lowest)
 
 
 def ticks(figure: Figure) -> set[str]:
@@ -123,7 +123,7 @@ def test_without_numbers_on_the_axis_every_setting_is_a_row(boundaries: pd.DataF
 
 
 def test_ceilings_are_marked(boundaries: pd.DataFrame) -> None:
-    panel = study_figures(boundaries, "", "Title")[""].axes[0]
+    panel = study_figures(boundaries, "", "Title")[""].axes[1]
     known = boundaries[(boundaries["averaging"] == MICRO) & boundaries["ceiling"].notna()]["ceiling"]
     assert len(known) == 6
     marks = [line for line in panel.get_lines() if line.get_marker() == "|"]

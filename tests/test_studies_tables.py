@@ -31,9 +31,9 @@ from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.measures import MACRO, MICRO
+from kerv_cli.report.measures import MACRO, MICRO, _realised_risk
 from kerv_cli.report.report import report
-from kerv_cli.report.statistics import PairedCounts, paired_difference, wilson
+from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import not_in_turn, summary_frame, summary_table
 from kerv_cli.report.tables import StudyData, csv_text, load_study, per_task_table, study_table
 
@@ -138,9 +138,8 @@ def test_one_task_by_hand(data: StudyData) -> None:
         "ms.verify": 0.0,
     }
     assert {name: row[name] for name in expected} == pytest.approx(expected)
-    # every one of the 4 draws of two pairs is one of three ratios
-    assert row["speedup_low"] == pytest.approx(0.5 / 0.25)
-    assert row["speedup_high"] == pytest.approx(0.3 / 0.05)
+    found = speedup(np.array([0.5, 0.3]), np.array([0.25, 0.05]), ["reach", "reach"])
+    assert (row["speedup_low"], row["speedup_high"]) == pytest.approx((found.low, found.high))
 
 
 def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData) -> None:
@@ -169,14 +168,37 @@ def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> 
     for row in (micro, macro):
         assert (row["both"], row["only_baseline"], row["only_method"], row["neither"]) == (3, 1, 0, 1)
         assert row["mcnemar_p"] == 1.0
-        assert row["difference"] == pytest.approx(3 / 5 - 4 / 5)
-        found = paired_difference(PairedCounts(3, 1, 0, 1))
-        assert (row["difference_low"], row["difference_high"]) == pytest.approx((found.low, found.high))
         assert (row["margin"], row["non_inferior"]) == (0.03, False)
         assert row["pairs_to_settle"] == math.inf  # the difference itself lies below the margin
         assert row["task"] == "push-v3;reach-v3"
         assert row["difficulty"] == "easy;hard"
         assert (row["tasks"], row["episodes"], row["pairs"]) == (2, 5, 5)
+    pooled = paired_difference(PairedCounts(3, 1, 0, 1))
+    groups = mean_of([paired_difference(PairedCounts(*counts)) for counts in ((2, 0, 0, 0), (1, 1, 0, 1))])
+    for row, found in ((micro, pooled), (macro, groups)):
+        assert (row["difference"], row["difference_low"], row["difference_high"]) == pytest.approx(found)
+
+
+def test_every_interval_of_a_row_contains_the_row_s_own_figure(data: StudyData) -> None:
+    table = study_table(data)
+    for low in (name for name in table if name.endswith("_low")):
+        name = low.removesuffix("_low")
+        known = table[table[low].notna()]
+        assert (known[low] <= known[name] + 1e-12).all(), name
+        assert (known[name] <= known[f"{name}_high"] + 1e-12).all(), name
+
+
+def test_the_realised_risk_counts_episodes_alike_whatever_their_length() -> None:
+    """Two episodes of 4 and 40 trusted decodes, all and a tenth of which were audited, with losses of 0.1 and 0.5."""
+    episodes = pd.DataFrame({
+        "task": "a", "difficulty": ["easy", "hard"], "seed": [1, 2], "skipped_decodes": [0, 36], "audits": [4, 4],
+        "audit_loss": [0.4, 2.0],
+    })  # fmt: skip
+    alike = _realised_risk(episodes)
+    assert alike.value == pytest.approx((0.1 * 1 + 0.5 * 0.1) / (1 + 0.1))
+    same = _realised_risk(episodes.assign(skipped_decodes=[36, 36]))
+    assert same.value == pytest.approx(0.3)
+    assert 0 <= alike.low <= alike.value <= alike.high <= 1
 
 
 def test_a_row_says_everything(data: StudyData) -> None:
@@ -276,7 +298,7 @@ def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:
 def test_success_is_compared_with_another_run_and_times_are_not(tmp_path: Path) -> None:
     row = write_reach(tmp_path, run="r2")
     table = study_table(load_study(StudyStore(tmp_path, "hand")))
-    assert summary_frame(table)["speedup"].tolist() == ["1", "–"]
+    assert summary_frame(table)["per step"].tolist() == ["1", "–"]
     assert not_in_turn(table) == ["kerv"]
     assert math.isnan(row["speedup"])
     assert row["same_run"] is False
@@ -293,7 +315,7 @@ def test_without_the_baselines_cell_there_is_a_row_but_no_speedup(tmp_path: Path
     table = study_table(data)
     assert list(table["label"]) == ["kerv", "kerv"]
     assert table["speedup"].isna().all()
-    assert summary_frame(table)["speedup"].tolist() == ["–"]
+    assert summary_frame(table)["per step"].tolist() == ["–"]
 
 
 def test_two_labels_of_one_cell_are_two_rows(tmp_path: Path) -> None:
@@ -328,7 +350,7 @@ def test_summary_on_a_terminal(data: StudyData) -> None:
     assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
     at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
     words = " ".join(lines[at : at + 2]).split()
-    assert {"60", "(23–88)", "4.22", "180", "2.57", "1.86", "14/21/14/14"} <= set(words)
+    assert {"60", "(23–88)", "4.22", "1.86", "14/21/14/14"} <= set(words)
     assert "/ compensated" in " ".join(lines)
 
 
@@ -396,7 +418,7 @@ def test_the_page_stands_alone(results: Path) -> None:
     assert "prefers-color-scheme: dark" in page
     assert 'href="../../report/tables/threshold_per_task.csv"' in page
     tables = re.findall(r"<thead><tr>(.*?)</tr>", page)
-    assert len(tables) == len(set(tables)) == 2, "a table that repeats another"
+    assert len(tables) == len(set(tables)) == 3, "a table that repeats another"
     assert "Prediction of" not in page
     ids = [part.split('"')[0] for part in page.split(' id="')[1:]]
     assert len(ids) == len(set(ids))
@@ -411,7 +433,7 @@ def test_figures_show_the_axis_and_the_references(results: Path) -> None:
     assert {name: list(group["x"]) for name, group in series.items()} == {"naive_sd": [0], "spec_vla": [3, 9]}
     speedup = study_figures(table, "threshold.r", "Title")[""].axes[0]
     lines = {line.get_label(): list(np.atleast_1d(line.get_ydata())) for line in speedup.get_lines()}
-    assert lines["spec_vla"] == list(rows[rows["method"] == "spec_vla"]["speedup"])
+    assert lines["spec_vla"] == list(rows[rows["method"] == "spec_vla"]["episode_speedup"])
     assert lines["ar"] == [1.0, 1.0]
     by_setting = study_figures(table, "", "Title")[""].axes[0]
     assert [label.get_text() for label in by_setting.get_yticklabels()] == list(rows["label"])

@@ -21,14 +21,15 @@ from typer.testing import CliRunner
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
-from kerv_cli.base.settings import DrafterSettings, TargetSettings, TrainSettings
+from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.cli.app import app
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
+from kerv_cli.training.recorded import greedy
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -271,7 +272,7 @@ def train(results: Path, *arguments: str) -> str:
 @pytest.mark.bits
 def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results: Path) -> None:
     settings = ["target=nano", "target.observation=state", "task=drawer-close"]
-    settings += ["train.batch=8", "train.validate_every=5", "train.steps=25"]
+    settings += ["train.batch=4", "train.validate_every=4", "train.steps=16"]
     train(results, "target", "name=whole", *settings)
     words = ["train", "target", "name=cut", *settings, f"results={results}", "demos=few"]
     command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words]
@@ -282,7 +283,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
         time.sleep(0.02)
     os.kill(killed.pid, signal.SIGKILL)
     killed.wait()
-    assert 5 <= read_state(folder / "resume.safetensors")[1].step <= 25
+    assert 4 <= read_state(folder / "resume.safetensors")[1].step <= 16
     train(results, "target", "name=cut", *settings)
     a, b = (load_file(results / f"artifacts/target/{n}/model.safetensors") for n in ("whole", "cut"))
     assert a.keys() == b.keys()
@@ -291,10 +292,10 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 
 @pytest.mark.usefixtures("few_validations")
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
-    settings = ["target=nano", "task=drawer-close", "train.batch=4", "train.steps=6", "train.scene_steps=2"]
-    settings += ["train.validate_every=3", "train.closed_loop=1", "world.horizon=8"]
+    settings = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=4", "train.scene_steps=1"]
+    settings += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4"]
     assert "closed_loop_success" in train(results, "target", "name=seen", *settings)
-    drafter = ["train.steps=4", "train.batch=4", "train.validate_every=2", "drafter.samples=20", "drafter.noise=0.1"]
+    drafter = ["train.steps=2", "train.batch=2", "train.validate_every=2", "drafter.samples=8", "drafter.noise=0.1"]
     assert "acceptance_length_r9" in train(results, "drafter", "policy.target=seen", *drafter)
     described = json.loads((results / "artifacts/drafter/seen/drafter.json").read_text())
     target = json.loads((results / "artifacts/target/seen/target.json").read_text())

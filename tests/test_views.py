@@ -211,7 +211,7 @@ def test_from_recording_to_rollout_and_export(tmp_path: Path) -> None:
     assert frames.shape[1:] == (SIZE, 2 * SIZE, 3)
     assert np.asarray(frames).shape == frames.shape
     sizes = ["target=nano", "target.image_size=32"]
-    steps = ["train.steps=2", "train.batch=4", "train.validate_every=1"]
+    steps = ["train.steps=2", "train.batch=2", "train.validate_every=2"]
     one = [word for word in common if "camera.name" not in word]
     run("demos", "name=one", "episodes=3", "frame_stride=4", "runtime.workers=1", *one)
     run("train", "target", "name=first", "demos=one", *sizes, *steps, *one)

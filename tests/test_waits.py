@@ -12,9 +12,10 @@ from pretended_device import DEVICE, Device, There, move
 from test_decoding_lossless import random_prompt, random_target
 from test_proposers import HELD, D, situation, stored
 
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.heisd.boundary import Always
 from kerv_cli.methods.heisd.rules import HybridProposer
@@ -53,7 +54,7 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
     retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 24)
     torch.manual_seed(1)
     drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
-    network = EarlyDrafter.beside(DrafterSettings(width=16, layers=1, history=2, rank=4), target).eval()
+    network = EarlyDrafter.beside(EarlySettings(width=16, layers=1, history=2, rank=4), target).eval()
     chain, tree = (DrafterProposer(drafter, target, *sizes) for sizes in ((5, 1, 5), (3, 4, 9)))
     early = EarlyProposer(network.requires_grad_(False), target)
     hold = PredictionProposer(Hold(HELD, minimum=1, horizon=CHUNK))

@@ -1,4 +1,4 @@
-"""The only module that uses Hydra: it composes a command's YAML files, checks overrides, expands a grid.
+"""The only module that uses Hydra: it composes a command's settings, checks overrides, expands a grid.
 
 Typer owns the process and the messages. Overrides are checked before torch or MuJoCo load; a wrong one is answered by
 one line with the nearest known keys.
@@ -12,16 +12,18 @@ import functools
 import itertools
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml
-from kerv_cli.base.limits import check_settings
-from kerv_cli.base.registry import PART_GROUPS, PREFILL, part_of
-from kerv_cli.base.settings import DERIVED_FROM
+from kerv_cli.base.files import to_yaml as plain_yaml
+from kerv_cli.base.limits import check_settings, description
+from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, part_of
+from kerv_cli.base.settings import DERIVED_FROM, choices_of
 
 T = TypeVar("T")
 
@@ -39,7 +41,7 @@ def conf_dir() -> Path:
     package = Path(__file__).resolve().parents[1]
     folders = [Path(folder).resolve()] if folder else [package.parent / "conf", package / "conf"]
     for path in folders:
-        if (path / "rollout.yaml").is_file():
+        if (path / "method").is_dir():
             return path
     raise UsageError(f"no configuration in {' or '.join(map(str, folders))}: set KERV_CONF_DIR to a folder like conf/")
 
@@ -48,7 +50,7 @@ def groups() -> dict[str, list[str]]:
     """Config groups and the names in them: {"method": ["ar", "spec_vla", …], …}."""
     root = conf_dir()
     names = {d.name: {p.stem for p in d.glob("*.yaml")} for d in sorted(root.iterdir()) if d.is_dir()}
-    for group in PART_GROUPS:
+    for group in SETTINGS_GROUPS:
         names.setdefault(group, set()).update(_parts_of(group))
     return {group: sorted(names[group]) for group in sorted(names)}
 
@@ -61,11 +63,13 @@ def _parts_of(group: str) -> dict[str, registry.Part]:
 
 
 def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
-    """The command's settings: the dataclass `schema`, `conf/<command>.yaml`, its groups and the overrides.
+    """The command's settings: the dataclass `schema`, its groups of `conf/` and the overrides. A `<command>.yaml` in
+    `KERV_CONF_DIR` chooses the groups instead, and what it sets outranks them.
 
     Raises:
         UsageError: an override that cannot be parsed, an unknown key or name, a value of another type or out of range.
     """
+    check_once(overrides, groups())
     return Composer(command, schema).compose(overrides)
 
 
@@ -83,8 +87,9 @@ class Composer(Generic[T]):
 
         overrides, method = method_of_file(overrides)
         overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
-        _check(self.command, overrides, self.groups)
-        words = [_task_list(word) for word in overrides]
+        self._check(overrides)
+        many = any(at.name == "task" and str(at.type).startswith("list") for at in fields(self.schema))  # type: ignore[arg-type]
+        words = [_task_list(word) if many else word for word in overrides]
         try:
             settings = self._settings([_parsed(word) for word in words])
         except (HydraException, OmegaConfBaseException) as error:
@@ -115,6 +120,28 @@ class Composer(Generic[T]):
         for override in values:
             OmegaConf.update(nodes, override.key_or_group, override.value(), merge=True)
         return cast(T, OmegaConf.to_object(nodes))
+
+    def _check(self, overrides: Sequence[str]) -> None:
+        """Refuses what Hydra would answer at length or not at all: words that are no overrides, unknown group choices,
+        several choices where the command takes one."""
+        for word in overrides:
+            key, equals, value = word.partition("=")
+            if not equals or not key or key[0] == "~":  # nothing is taken away from settings
+                raise UsageError(f"'{word}' is not an override: write key=value, {self._hint(word)}")
+            if key not in self.groups or value in self.groups[key]:
+                continue
+            several = [name.strip() for name in value.split(",")]
+            if len(several) > 1 and set(several) <= set(self.groups[key]):
+                grid = self.command == "rollout"
+                hint = "run each in turn with 'kerv rollout -m', or" if grid else "this command takes one:"
+                raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
+            raise UnknownName(key, value, self.groups[key])
+
+    def _hint(self, word: str) -> str:
+        """What the writer of a word without `=` may have meant, e.g. `episodes:`."""
+        keys = [*choices_of(self.schema), *(at.name for at in fields(self.schema))]  # type: ignore[arg-type]
+        near = difflib.get_close_matches(word.rstrip(":"), dict.fromkeys(keys), n=1)
+        return f"did you mean {near[0]}=?" if near else f"see 'kerv {spoken(self.command)} --cfg' for the keys"
 
     def _is_value(self, override: Any) -> bool:
         """Whether an override sets one key to one value."""
@@ -156,7 +183,7 @@ def _set_scalar(nodes: Any, settings: Any, override: Any) -> None:
 def _check_ranges(settings: Any) -> None:
     """Checks every setting against its range, and what only a part knows about its settings."""
     check_settings(settings)
-    for group in PART_GROUPS:
+    for group in SETTINGS_GROUPS:
         part_settings = getattr(settings, group, None)
         part = None if part_settings is None else part_of(group, part_settings.kind)
         # another part's settings are refused by the method's check
@@ -182,14 +209,18 @@ def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
     store = ConfigStore.instance()
     base = OmegaConf.structured(schema)
     _open_mappings(base)
-    for group in set(PART_GROUPS) & set(base):
+    for group in set(SETTINGS_GROUPS) & set(base):
         base[group] = MISSING  # the defaults list chooses the part, and with it the class of its settings
     store.store(name=f"base_{command}", node=base)
-    for group in PART_GROUPS:
+    choices = [{group: name} for group, name in choices_of(schema).items()]
+    store.store(name=f"own_{command}", node={"defaults": [f"base_{command}", *choices, "_self_"]})
+    for group in SETTINGS_GROUPS:
         for name, part in _parts_of(group).items():
-            _store_part(group, name, part.settings)
+            own_file = (conf_dir() / group / f"{name}.yaml").is_file()  # it begins with the part's settings
+            _store_part(f"base_{group}" if own_file else group, name, part.settings)
+    own = not (conf_dir() / f"{command}.yaml").is_file()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra_compose(command, overrides=list(overrides))
+        return hydra_compose(f"own_{command}" if own else command, overrides=list(overrides))
 
 
 def _open_mappings(node: Any) -> None:
@@ -319,29 +350,32 @@ def swept_keys(overrides: str | Sequence[str]) -> list[str]:
     return [word.split("=", 1)[0] for i, word in enumerate(first) if len({p[i] for p in points}) > 1]
 
 
-def to_yaml(settings: Any) -> str:
-    """A settings dataclass as YAML, for `--cfg`."""
-    from omegaconf import OmegaConf
+def to_yaml(settings: Any, indent: str = "") -> str:
+    """A settings dataclass as YAML, for `--cfg`: behind a key what it is."""
+    lines = []
+    for at in fields(settings):
+        value = getattr(settings, at.name)
+        text = f"{at.name}:" if is_dataclass(value) else _one_yaml(at.name, value)
+        first, *rest = text.splitlines()
+        comment = description(at) if not rest or not isinstance(value, str) else ""
+        lines += [f"{first}  # {comment}" if comment else first, *rest]
+        if is_dataclass(value):
+            lines += to_yaml(value, "  ").splitlines()
+    return "".join(f"{indent}{line}\n" for line in lines)
 
-    return OmegaConf.to_yaml(OmegaConf.structured(settings))
+
+def _one_yaml(key: str, value: Any) -> str:
+    """A key and its value; a string without line breaks is one line."""
+    return plain_yaml({key: value}, width=2**30, default_flow_style=False, allow_unicode=True)
 
 
-def _check(command: str, overrides: Sequence[str], names: Mapping[str, Sequence[str]]) -> None:
-    """Refuses what Hydra would answer at length or not at all: words that are no overrides, unknown group choices,
-    several choices where the command takes one."""
-    for word in overrides:
-        key, equals, value = word.partition("=")
-        if not equals or not key or key[0] == "~":  # nothing is taken away from settings
-            raise UsageError(
-                f"'{word}' is not an override: write key=value, see 'kerv {spoken(command)} --cfg' for the keys"
-            )
-        if key not in names or value in names[key]:
-            continue
-        several = [name.strip() for name in value.split(",")]
-        if len(several) > 1 and set(several) <= set(names[key]):
-            hint = "run each in turn with 'kerv rollout -m', or" if command == "rollout" else "this command takes one:"
-            raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
-        raise UnknownName(key, value, names[key])
+def check_once(overrides: Iterable[str], names: Iterable[str]) -> None:
+    """Refuses two choices from one group; of a key that is given twice, the last value counts."""
+    first: dict[str, str] = {}
+    for key, value in (word.lstrip("+").split("=", 1) for word in overrides if "=" in word):
+        if key in names and key in first:
+            raise UsageError(f"{key}= is given twice, {first[key]} and {value}: leave one out")
+        first[key] = value
 
 
 def spoken(command: str) -> str:

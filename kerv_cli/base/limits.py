@@ -19,20 +19,38 @@ PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
 """Names of folders below `results`: no separators, not hidden, never `..`."""
 
 
+def setting(default: Any, help: str = "", **metadata: Any) -> Any:
+    """A field of a settings dataclass. default: a value, or what makes one: a dataclass, a function. help: what it is,
+    in one line without the default, for `--help` and `--cfg`."""
+    metadata |= {"help": help} if help else {}
+    if callable(default):
+        return field(default_factory=default, metadata=metadata)
+    if isinstance(default, list | dict):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
     """Metadata of a field whose numbers lie in least ≤ value ≤ most and value > above: itself, or every element of a
     list. None is let through, NaN never."""
     return {"limits": (least, most, above)}
 
 
-def number(default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> Any:
-    """A field with `limits`."""
-    return field(default=default, metadata=limits(least, most, above))
+def number(
+    default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf, help: str = ""
+) -> Any:
+    """A `setting` with `limits`."""
+    return setting(default, help, **limits(least, most, above))
 
 
-def choice(default: str, *names: str) -> Any:
-    """A field that is one of `names`; the default among them."""
-    return field(default=default, metadata={"names": names})
+def choice(default: str, *names: str, help: str = "") -> Any:
+    """A `setting` that is one of `names`; the default among them."""
+    return setting(default, help, names=names)
+
+
+def description(at: Field[Any]) -> str:
+    """What a setting is: its `help`, behind the names of a `choice`."""
+    return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
 
 
 def check_name(name: str, what: str) -> str:

@@ -51,8 +51,30 @@ METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifi
 PART_GROUPS = (*METHOD_KINDS, "datastore")
 """Settings of a rollout whose choices are parts; YAML files in conf/<group>/ are further choices."""
 
+SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
+"""All groups of settings whose choices are parts: those of a rollout, and what `kerv train drafter` trains."""
+
 PREFILL, STATES = "prefill", "states"
 """When a proposer can draft: before the prefill, or only behind it because it reads the target's hidden states."""
+
+
+TRAITS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(
+        ("acceptance", "threshold", "rectifier", "datastore", "score", "artifact", "drafter", "column"), ()
+    ),
+    "proposer": ("when", "chains", "sides"),
+    "boundary": ("chooses",),
+    "skip": ("takes_draft", "merges", "retrieves", "parallel"),
+    "predictor": ("fitted",),
+    "target": ("weights", "importer", "images_alone"),
+    "environment": ("names",),
+    "stress": ("needed",),
+    "executor": ("package", "extra"),
+    "command": ("help", "keys", "examples", "names", "typed", "writes", "each", "completes", "values", "lists"),
+}
+"""Every kind of part -> the traits that one may have."""
+REQUIRED = {"proposer": "when", "stress": "needed"}
+"""Kind -> the trait that each must have."""
 
 
 @dataclass
@@ -71,9 +93,9 @@ def nothing(settings: Any) -> tuple[str, ...]:
 class Part:
     """One choice among the parts of a kind.
 
-    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, target,
-    environment, stress or executor. build: `module:function` or `module:Class.method`; its arguments are documented
-    where the kind is used, of a method's parts in `methods/context.py`.
+    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, score, artifact, drafter,
+    target, environment, stress, executor, column or command. build: `module:function` or `module:Class.method`; its
+    arguments are documented where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
     settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
     and timeline.
@@ -111,13 +133,33 @@ def register(part: Part) -> Part:
     """Adds a part. The same code can register a name again, e.g. when a module is reloaded.
 
     Raises:
-        UsageError: another part of that kind has the name.
+        UsageError: another part of that kind has the name; no such kind, or its traits are not those of its kind.
     """
+    check_traits(part)
     there = _PARTS.setdefault(part.kind, {}).get(part.name)
     if there is not None and there.build != part.build:
         raise UsageError(f"{part.kind} '{part.name}' is registered twice: {there.build} and {part.build}")
     _PARTS[part.kind][part.name] = part
     return part
+
+
+def check_traits(part: Part) -> None:
+    """Refuses a part of an unknown kind, or whose traits are not those of its kind.
+
+    Raises:
+        UnknownName: no such kind. UsageError: a trait is unknown or missing, or settings have no `kind`.
+    """
+    if part.kind not in TRAITS:
+        raise UnknownName("kind of part", part.kind, TRAITS)
+    what, known = f"{part.kind} '{part.name}'", TRAITS[part.kind]
+    has = f"the traits of this kind are {', '.join(known)}" if known else "this kind has none"
+    unknown, required = [name for name in part.traits if name not in known], REQUIRED.get(part.kind)
+    if unknown:
+        raise UsageError(f"{what} has an unknown trait {unknown[0]}: {has}")
+    if required is not None and required not in part.traits:
+        raise UsageError(f"{what} lacks the trait {required}: {has}")
+    if part.kind in SETTINGS_GROUPS and "kind" not in getattr(part.settings, "__dataclass_fields__", ()):
+        raise UsageError(f"{what}: its settings {part.settings.__name__} must be a dataclass with a field kind")
 
 
 def add(

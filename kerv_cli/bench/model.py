@@ -17,7 +17,6 @@ from kerv_cli.base.places import results_dir, shipped_dir
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.settings import (
     BenchSettings,
-    DrafterSettings,
     PolicySettings,
     TargetSettings,
     TrainTargetSettings,
@@ -26,6 +25,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
 from kerv_cli.bench.machine import median_seconds
 from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact.packed import FastLinear, pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, BlockedLinear, multiplies_bfloat16
@@ -35,6 +35,40 @@ from kerv_cli.training.imitation import vocabulary
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 _SPARE = 1.15  # memory that must be free, over the weights: the prompt's encoder, caches, one layer twice
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """A target's shape. vocabulary: tokens; weight, slot: bytes of a weight and of a number in the cache."""
+
+    settings: TargetSettings
+    vocabulary: int
+    weight: int
+    slot: int
+
+    @property
+    def trunk_weights(self) -> int:
+        """Weights that every forward reads: the layers' matrices and the head."""
+        return layer_weights(self.settings) * self.settings.layers + self.settings.width * self.vocabulary
+
+    def forward(self, rows: int, cached: int) -> tuple[float, float]:
+        """Bytes and operations of a forward of `rows` tokens behind `cached` ones: every weight once, every key and
+        value once; two operations per weight and row, four per attended key's number."""
+        s, weights = self.settings, self.trunk_weights
+        read = weights * self.weight + 2.0 * s.layers * (cached + rows) * s.width * self.slot
+        attended = rows * cached + rows * (rows + 1) / 2
+        return read, 2.0 * weights * rows + 4.0 * s.layers * s.width * attended
+
+    def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
+        """Bytes and operations of a cost of that kind; 0 where they are not counted. prompt: P."""
+        s = self.settings
+        drafter = float(layer_weights(s) + 2 * s.width**2 + s.width * self.vocabulary)
+        # passes over the drafter's weights, and rows in them; a level of its tree is eight wide
+        passes = {"feed": (1, rows), "draft": (rows - 1, rows - 1), "tree": (rows - 1, 8 * (rows - 1))}
+        if kind in ("prefill", "verify"):
+            return self.forward(rows, prompt if kind == "verify" else 0)
+        times, tokens = passes.get(kind, (0, 0))
+        return times * drafter * self.weight, 2.0 * tokens * drafter
 
 
 @dataclass(frozen=True)
@@ -49,10 +83,15 @@ class Model:
     is_shape: bool
 
     @property
-    def trunk_weights(self) -> int:
-        """Weights that every forward reads: the layers' matrices and the head."""
-        s: TargetSettings = self.target.settings
-        return layer_weights(s) * s.layers + s.width * self.target.actions.tokens
+    def sizes(self) -> Sizes:
+        """The target's; caches are float32 on a CPU."""
+        size = 4 if self.target.device.type == "cpu" else self.dtype.itemsize
+        return Sizes(self.target.settings, self.target.actions.tokens, self.dtype.itemsize, size)
+
+    @property
+    def size(self) -> int:
+        """N, tokens of a chunk."""
+        return int(self.target.chunk * self.target.actions.dofs)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -146,8 +185,7 @@ def _policies(results: str) -> list[str]:
 def _shape(settings: BenchSettings) -> Model:
     if settings.dtype not in ("auto", *DTYPES):
         raise UsageError(f"dtype={settings.dtype}: known are auto, {', '.join(DTYPES)}")
-    words = [f"target={settings.model}"]
-    shape = compose("train_target", words, TrainTargetSettings).target
+    shape = shape_of(settings.model, max(settings.tokens))
     device, _ = set_up(settings.runtime)
     dtype = DTYPES[settings.dtype] if settings.dtype != "auto" else fastest(torch.device(device))
     needed = _SPARE * dtype.itemsize * layer_weights(shape) * (shape.layers + 1)
@@ -160,6 +198,12 @@ def _shape(settings: BenchSettings) -> Model:
     with torch.inference_mode():
         target = ShapeTarget(shape, torch.device(device), dtype)
         return Model(settings.model, target, _drafter(target), blank(target), True)
+
+
+def shape_of(name: str, tokens: int) -> TargetSettings:
+    """A shape of conf/target that decodes chunks of so many tokens or a few more."""
+    shape = compose("train_target", [f"target={name}"], TrainTargetSettings).target
+    return replace(shape, chunk=-(-tokens // SPEC.actions.dofs))
 
 
 def _drafter(target: Any) -> Drafter:

@@ -1,28 +1,47 @@
-"""The phases of a decode as functions that can be timed alone, their bytes and operations, and their measurement."""
+"""The costs of a decode, measured inside whole decodes of the engine's own loop on dummy drafts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
-from kerv_cli.bench.machine import Machine, measure_machine, timed
-from kerv_cli.bench.model import Model
-from kerv_cli.engine.transfer import read
-from kerv_cli.methods.eagle.drafter import DraftState, draft_chain, observe
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.settings import BenchSettings, RolloutSettings
+from kerv_cli.bench.machine import Machine, measure_machine
+from kerv_cli.bench.model import Model, Sizes, blank
+from kerv_cli.engine.chunk import Chunk, Clock
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.parts import Fixed
+from kerv_cli.engine.proposer import Stateless
+from kerv_cli.engine.record import Round
+from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.lab.policy import decoder_for
+from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.methods.spec_vla.rules import Relaxed
 
-Seen = np.ndarray | torch.Tensor | None
-"""The argument `seen` of `Target.forward`: which tokens of a draft each of its tokens attends to; None: a chain."""
+_WARM_UP = 2  # cycles that do not count
+_EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches
+_TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
+_MERGED = 30  # nodes of a merged in-prefill draft
+SOURCES = {"early": "early_unverified", "retrieval": "retrieval_unverified"}
+_TASK = "reach-v3"
+
+Key = tuple[str, int]
+"""Kind of a cost, and its rows."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """One measured phase. kind: encode, prefill, verify (1 row: a single token), feed (the target's states into the
-    drafter), draft (rows: tokens of the drafter's chain), eager (one token without a captured graph). rows: forwarded
-    tokens. seconds: median; read, flops: bytes and operations that it cannot do without; floor: the seconds that the
-    device needs for them; share: floor over median."""
+    """One measured cost. kind: encode, prefill, verify (1 row: a single token), feed (the target's states into the
+    drafter), draft (rows: tokens of the drafter's chain), tree (rows: levels of its tree), early, retrieval (a draft of
+    the shipped policy's). rows: forwarded tokens. seconds: median; read, flops: bytes and operations that it cannot do
+    without; floor: the seconds that the device needs for them; share: floor over median."""
 
     kind: str
     rows: int
@@ -43,7 +62,7 @@ class Phase:
         """The phase in words, for tables."""
         if self.kind == "verify":
             return "one token" if self.rows == 1 else f"verify {self.rows}"
-        return self.kind if self.kind == "encode" else f"{self.kind} {self.rows}"
+        return self.kind if self.kind in ("encode", *SOURCES) else f"{self.kind} {self.rows}"
 
     def as_dict(self) -> dict[str, float | str]:
         """For JSON: the fields, and rates in GB/s and GFLOP/s."""
@@ -51,178 +70,150 @@ class Phase:
         return {"name": self.name, **asdict(self), **rates, "share": self.share}
 
 
-class Stage:
-    """Runs a model's forwards on dummy tokens: prompts, verifications and drafts of any size, one at a time.
+class Laps(Clock):
+    """A clock that keeps every lap, (phase, seconds)."""
 
-    A forward ends as in a decode: the argmax of its rows reaches the host.
-    """
+    def __init__(self, device: torch.device) -> None:
+        self.laps: list[tuple[str, float]] = []
+        super().__init__(device)
 
-    def __init__(self, model: Model, room: int = 64) -> None:
-        """room: most tokens behind the prompt."""
-        self.model, self.target, self.device = model, model.target, model.target.device
-        with torch.inference_mode():
-            self.prompt = self.target.encode(model.observation)
-        self.length = self.prompt.shape[1]
-        self.cache = self.target.new_cache(1, self.length + room + 1)
-        state = model.drafter.new_cache(1, self.length + 2 * room)
-        self.draft_state = DraftState(state, torch.empty(0))
-        self.hidden = self.prompt
+    def lap(self, phase: str) -> None:
+        """As `Clock.lap`."""
+        before = self.phases[phase]
+        super().lap(phase)
+        self.laps.append((phase, self.phases[phase] - before))
 
-    def tokens(self, count: int) -> torch.Tensor:
-        """(1, count) tokens, any."""
-        return torch.arange(count, device=self.device)[None] % self.target.actions.tokens
-
-    def encode(self) -> None:
-        """Observation -> prompt."""
-        self.prompt = self.target.encode(self.model.observation)
-
-    def prefill(self, drafted: int = 0, seen: Seen = None) -> list[int]:
-        """The prompt and `drafted` tokens behind it -> argmax of the prompt's last row and of the drafted rows. seen:
-        see `Seen`."""
-        x = self.prompt
-        if drafted:
-            x = torch.cat([x, self.target.embed(self.tokens(drafted))], 1)
-        self.cache.length = 0
-        self.hidden = self.target.forward(x, torch.arange(x.shape[1], device=self.device), self.cache, seen)
-        argmax: list[int] = self.target.head(self.hidden[0, self.length - 1 :]).argmax(-1).tolist()
-        return argmax
-
-    def verify(
-        self,
-        drafted: int = 0,
-        committed: int = 1,
-        seen: Seen = None,
-        beside: torch.Tensor | None = None,
-        reads: bool = True,
-    ) -> list[int]:
-        """The last of `committed` tokens and `drafted` tokens behind it -> argmax of every row.
-
-        Args:
-            drafted: tokens of the draft.
-            committed: tokens of the chunk that are committed before this forward.
-            seen: see `Seen`.
-            beside: (m,) numbers that reach the host in the same transfer as the argmax.
-            reads: whether the argmax reaches the host at all; without, the list is empty.
-        """
-        start = self.cache.length = self.length + committed - 1
-        positions = torch.arange(start, start + 1 + drafted, device=self.device)
-        x = self.target.embed(self.tokens(1 + drafted))
-        self.hidden = self.target.forward(x, positions, self.cache, seen)
-        argmax = self.target.head(self.hidden)[0].argmax(-1)
-        if not reads:
-            return []
-        tokens: list[int] = read(argmax)[0].tolist() if beside is None else read(argmax, beside)[0].tolist()
-        return tokens
-
-    def feed(self, hidden: torch.Tensor, first: int) -> None:
-        """The target's states hidden (1, T, E) at positions first … go into the drafter."""
-        following = self.target.embed(self.tokens(hidden.shape[1]))
-        observe(self.model.drafter, self.draft_state, following, hidden, first)
-
-    def draft(self, depth: int) -> list[int]:
-        """A chain of `depth` tokens from the drafter."""
-        chain: list[int] = draft_chain(self.model.drafter, self.target, self.draft_state, depth).tolist()
-        return chain
+    def stop(self) -> float:
+        """As `Clock.stop`."""
+        seconds = super().stop()
+        if self.events is not None:
+            pairs = itertools.pairwise(self.events)
+            self.laps = [(phase, begin.elapsed_time(end) / 1000.0) for (_, begin), (phase, end) in pairs]
+        return seconds
 
 
-def costs(model: Model, rows: int, cached: int) -> tuple[float, float]:
-    """Bytes and operations of a forward of `rows` tokens behind `cached` ones: every weight once, every key and value
-    once; two operations per weight and row, four per attended key's number."""
-    s = model.target.settings
-    weights = model.trunk_weights
-    slots = cached + rows
-    size = 4 if model.target.device.type == "cpu" else model.dtype.itemsize  # CPU caches are float32
-    read = weights * model.dtype.itemsize + 2.0 * s.layers * slots * s.width * size
-    attended = rows * cached + rows * (rows + 1) / 2
-    return read, 2.0 * weights * rows + 4.0 * s.layers * s.width * attended
+class Dummy(Stateless):
+    """Drafts so many nodes: a chain, and where that has no room for them further children of the root. tokens: of the
+    chain, by their index in the chunk; None: any."""
+
+    name = "dummy"
+
+    def __init__(self, nodes: int, tokens: Sequence[int] | None = None) -> None:
+        self.nodes, self.tokens = nodes, tokens
+
+    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        """As `Proposer.propose`."""
+        first, chain = len(chunk.tokens), min(self.nodes, depth)
+        tokens = range(self.nodes) if self.tokens is None else self.tokens[first : first + self.nodes]
+        return TokenTree.build(tokens, [*range(-1, chain - 1), *[ROOT] * (len(tokens) - chain)])
 
 
-def _phase(kind: str, rows: int, seconds: np.ndarray, needs: tuple[float, float], machine: Machine) -> Phase:
-    read, flops = needs
-    median, p95 = np.percentile(seconds, [50, 95])
-    floor = machine.floor(read, flops)
-    return Phase(kind, rows, float(median), float(p95), float(seconds.min()), read, flops, floor)
+def decoders(model: Model) -> list[Decoder]:
+    """Decoders whose rounds have all the sizes that a chunk of N tokens can have. Everything drafted is accepted."""
+    target, size = model.target, model.size
+    rule, everything = Relaxed(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
+
+    def decoder(in_prefill: int = 0, proposer: Any = None) -> Decoder:
+        draft = Dummy(in_prefill) if in_prefill else None
+        return Decoder(target, Parts(rule, everything, draft, proposer))
+
+    equal = [n - 1 for n in range(2, size) if size % n == 0]  # rounds of as many rows as the prefill commits tokens
+    every = [decoder(), *(decoder(n, Dummy(n)) for n in equal), decoder(0, Dummy(size - 2))]
+    every += [decoder(size - 1), decoder(max(_MERGED, size - 1))]
+    shapes = ((size - 2, 1, size - 2), (min(3, size - 2), 1, 3), _TREE)
+    return every + [decoder(0, DrafterProposer(model.drafter, target, *shape)) for shape in shapes]
+
+
+def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[tuple[str, float]]) -> Iterator[
+    tuple[Key, float]
+]:  # fmt: skip
+    """The costs that a decode shows, each with its seconds; a forward ends when its argmax is on the host."""
+    seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
+    yield ("encode", 1), seconds["vision"]
+    yield ("prefill", prompt + rounds[0].tree_size), seconds["prefill"]
+    nodes = {played.tree_size for played in rounds[1:]}
+    if len(nodes) == 1:
+        yield ("verify", 1 + nodes.pop()), seconds["verify"] / (len(rounds) - 1)
+    drafter = decoder.parts.proposer
+    if isinstance(drafter, DrafterProposer):
+        # behind the limits of acceptance: the prompt's states, then by turns a draft and the states of its tokens
+        _, prompt_states, *turns = (s for name, s in laps if name == "propose")
+        yield ("feed", prompt), prompt_states
+        for played, drafting in zip(rounds[1:], turns[::2], strict=False):
+            levels = min(drafter.depth, decoder.steps * decoder.target.actions.dofs - played.start - 1)
+            yield ("tree" if drafter.top_k > 1 else "draft", levels), drafting
+        for played, feeding in zip(rounds[1:], turns[1::2], strict=False):
+            yield ("feed", 1 + played.accepted), feeding
 
 
 @torch.inference_mode()
-def measure(
-    model: Model, machine: Machine, tokens: Sequence[int], depth: int, repeats: int
-) -> tuple[Machine, list[Phase]]:
-    """Times every phase that a chunk of N tokens can have, for each N: one token, verify(1 + n), prefill(P + n) and
-    drafts; then measures the machine again.
+def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
+    """Times every decoder of `decoders` by turns, a decode each, `repeats` times; then measures the machine again.
 
     Returns:
-        The machine's best rates, and the phases with floors from these rates.
+        The machine's best rates, and the costs with floors from these rates.
     """
-    stage = Stage(model, max(tokens) + 2)
-    most = max(tokens)
-    device, length = stage.device, stage.length
-    counts = sorted({1, 2, 4, 8, *tokens, most})
-    phases: list[Phase] = []
-
-    def add(kind: str, rows: int, needs: tuple[float, float], work: Callable[[], object]) -> None:
-        phases.append(_phase(kind, rows, timed(work, device, repeats), needs, machine))
-
-    add("encode", 1, (0.0, 0.0), stage.encode)
-    for drafted in (0, *(n - 1 for n in counts if n > 2)):
-        rows = length + drafted
-        add("prefill", rows, costs(model, rows, 0), lambda n=drafted: stage.prefill(n))  # type: ignore[misc]
-    stage.prefill()
-    for rows in counts:
-        add("verify", rows, costs(model, rows, length), lambda n=rows: stage.verify(n - 1))  # type: ignore[misc]
-    stage.prefill()
-    if device.type == "cuda":
-        eager = Stage(model, most + 2)
-        eager.cache = eager.target.new_cache(1, eager.cache.capacity, fixed=False)
-        eager.prefill()
-        add("eager", 1, costs(model, 1, length), eager.verify)  # what the captured graph saves
-    _measure_drafter(model, stage, depth, add)
+    device, evicting = model.target.device, torch.ones(_EVICTING)
+    every, seconds = decoders(model), dict[Key, list[float]]()
+    sources = source_decoders(settings)
+    for turn in range(_WARM_UP + settings.repeats):
+        found: list[tuple[Key, float]] = []
+        for decoder in every:
+            evicting.sum()
+            clock = Laps(device)
+            prompt = model.target.encode(model.observation)
+            clock.lap("vision")
+            chunk = decoder.decode_prompt(prompt, clock)
+            decoder.actions_of(chunk)
+            clock.stop()
+            found += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
+        for kind, source in sources.items():
+            evicting.sum()
+            found.append(((kind, 1), source.decode(blank(source.target)).phases["propose"]))
+        for key, value in found if turn >= _WARM_UP else ():
+            seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
-    return machine, [replace(phase, floor=machine.floor(phase.read, phase.flops)) for phase in phases]
+    return machine, phases_of(seconds, model.sizes, machine)
 
 
-Add = Callable[[str, int, tuple[float, float], Callable[[], object]], None]
-"""Measures a phase: kind, rows, bytes and operations, what to run."""
+def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine) -> list[Phase]:
+    """The costs by kind and rows. seconds: of every repeat."""
+    phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
+    for (kind, rows), times in sorted(seconds.items(), key=lambda item: (_ORDER.index(item[0][0]), item[0][1])):
+        read, flops = sizes.needs(kind, rows, prompt)
+        median, p95 = np.percentile(times, [50, 95])
+        floor = machine.floor(read, flops)
+        phases.append(Phase(kind, rows, float(median), float(p95), float(min(times)), read, flops, floor))
+    return phases
 
 
-def _measure_drafter(model: Model, stage: Stage, depth: int, add: Add) -> None:
-    """Times feeding the drafter with one state and with the prompt's states, and its chains, after a prefill."""
-    stage.feed(stage.hidden, 0)
-    s = model.target.settings
-    per_token = (layer_numbers(model) + 2 * s.width**2 + s.width * model.target.actions.tokens) * model.dtype.itemsize
-    hidden, length = stage.hidden[:, : stage.length], stage.length
-    for rows in (1, length):
-        needs = per_token * 1.0, 2.0 * rows * per_token / model.dtype.itemsize
-        add("feed", rows, needs, lambda n=rows: stage.feed(hidden[:, :n], 0))  # type: ignore[misc]
-    for count in sorted({2, max(2, depth)}):  # the first token comes from the state that is there: no forward
-        needs = per_token * (count - 1), 2.0 * (count - 1) * per_token / model.dtype.itemsize
-        add("draft", count, needs, lambda n=count: stage.draft(n))  # type: ignore[misc]
+_ORDER = ("encode", "prefill", "verify", "feed", "draft", "tree", *SOURCES)
 
 
-def layer_numbers(model: Model) -> int:
-    """Weights of the drafter's layers."""
-    return sum(part.weight.numel() for layer in model.drafter.layers for part in _linears(layer))
-
-
-def _linears(layer: torch.nn.Module) -> list[torch.nn.Linear]:
-    return [part for part in layer.modules() if isinstance(part, torch.nn.Linear)]
+def source_decoders(settings: BenchSettings) -> dict[str, Any]:
+    """The shipped policy's decoders that execute an early draft and a stored chunk: whatever the target, these drafts
+    do not grow with it. Empty where that policy is not there."""
+    words = [f"runtime.{name}={getattr(settings.runtime, name)}" for name in ("device", "threads")]
+    try:
+        return {
+            kind: decoder_for(compose("rollout", [f"method={method}", *words], RolloutSettings), _TASK)
+            for kind, method in SOURCES.items()
+        }
+    except KervError:
+        return {}
 
 
 @torch.inference_mode()
-def flipped(model: Model, chunks: int, tokens: int) -> tuple[int, int]:
+def flipped(model: Model, chunks: int) -> tuple[int, int]:
     """Tokens whose argmax in one verification differs from that of single forwards, and tokens compared: ties that the
-    number format flips. The prompt is the model's own, the chunks' tokens random."""
-    stage = Stage(model, tokens + 2)
-    generator = torch.Generator().manual_seed(0)
-    differ = 0
+    number format flips. The images are noise."""
+    generator, differ, compared = np.random.default_rng(0), 0, 0
     for _ in range(chunks):
-        chunk = torch.randint(model.target.actions.tokens, (1, tokens), generator=generator).to(stage.device)
-        stage.tokens = lambda count, chunk=chunk: chunk[:, :count]  # type: ignore[misc,method-assign]
-        stage.prefill()
-        together = stage.verify(tokens - 1)
-        stage.cache.length = stage.length
-        for i in range(tokens):
-            at = torch.tensor([stage.length + i], device=stage.device)
-            hidden = stage.target.forward(stage.target.embed(chunk[:, i : i + 1]), at, stage.cache, None)
-            differ += int(stage.target.head(hidden)[0, 0].argmax()) != together[i]
-    return differ, chunks * tokens
+        images = {name: generator.integers(0, 256, image.shape, np.uint8) for name, image in
+                  model.observation.images.items()}  # fmt: skip
+        observation = model.observation.with_images(images)
+        tokens = Decoder(model.target).decode(observation).tokens
+        again = Decoder(model.target, Parts(proposer=Dummy(len(tokens), tokens))).decode(observation)
+        differ += sum(played.accepted < len(played.drafted) for played in again.rounds)
+        compared += len(tokens)
+    return differ, compared

@@ -1,32 +1,92 @@
-"""Latency profiles from measured phases, here or projected onto another device."""
+"""Latency profiles from measured costs, here or projected onto another device and shape."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import statistics
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
+from kerv_cli.base.settings import BenchSettings, TargetSettings
 from kerv_cli.bench.machine import Machine
-from kerv_cli.bench.phases import Phase
+from kerv_cli.bench.model import Model, Sizes, shape_of
+from kerv_cli.bench.phases import SOURCES, Phase
 from kerv_cli.engine.cost import KINDS, Profile
 
-
-def profile_of(prompt: int, phases: Sequence[Phase]) -> Profile:
-    """The profile of measured phases, their medians. prompt: P."""
-    latencies = {}
-    for kind in KINDS:
-        points = sorted((p.rows, p.seconds) for p in phases if p.kind == kind)
-        latencies[kind] = tuple(rows for rows, _ in points), tuple(seconds for _, seconds in points)
-    return Profile(prompt, latencies)
+_PER_LAYER = 15e-6  # seconds per layer and pass below which projections do not go: kernels of a captured graph
+_HALF = 2  # bytes of a bfloat16
 
 
-def projected(phases: Sequence[Phase], here: Machine, there: Machine, overhead: float = 0.0) -> list[Phase]:
-    """The phases on a device that is not at hand: each needs its floor there, divided by the share of the floor that it
-    reached here, and at least `overhead` seconds. A projection, not a measurement."""
+def profile_of(phases: Sequence[Phase], tokens: int = 0) -> Profile:
+    """The profile of measured costs, their medians. tokens: N."""
+    points = {kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in KINDS}
+    costs = {kind: tuple(zip(*found, strict=True)) for kind, found in points.items() if found}
+    prompt = costs["prefill"][0][0] if "prefill" in costs else 0
+    return Profile(int(prompt), {kind: (rows, seconds) for kind, (rows, seconds) in costs.items()}, tokens)
+
+
+def projections(
+    settings: BenchSettings, model: Model, machine: Machine, phases: Sequence[Phase]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """(device, document) of every device of `projections`, for the shape `projected` in bfloat16. Its rows behind the
+    prompt are those measured here."""
+    shape = shape_of(settings.projected, model.size)
+    there = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
+    here, prompt = min(p.rows for p in phases if p.kind == "prefill"), prompt_of(shape)
+    longer = [replace(p, rows=p.rows - here + prompt) if _counts_prompt(p, here) else p for p in phases]
+    moved = [
+        replace(p, read=read, flops=flops) for p in longer for read, flops in [there.needs(p.kind, p.rows, prompt)]
+    ]
+    for name, (bandwidth, flops) in settings.projections.items():
+        device = Machine(bandwidth * 1e9, flops * 1e12)
+        costs = projected(moved, shares(phases, machine), machine, device, shape.layers)
+        document = {
+            "target": settings.projected,
+            "dtype": "bfloat16",
+            "device_name": name,
+            "projected": True,
+            "from": f"{model.name} on {settings.runtime.device}; {bandwidth:g} GB/s, {flops:g} TFLOP/s",
+            "profile": profile_of(costs, model.size).as_dict(),
+        }
+        yield name, document
+
+
+def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
+    """Median share of the floor of the costs that are bound by memory, and of those bound by arithmetic; where there
+    are none of one kind, that of all."""
+    counted = [p for p in phases if p.floor > 0]
+    by_memory = [p.read / machine.bandwidth >= p.flops / machine.flops for p in counted]
+    found = [
+        [min(1.0, p.share) for p, bound in zip(counted, by_memory, strict=True) if bound == kind]
+        for kind in (True, False)
+    ]
+    memory, arithmetic = (statistics.median(part or [*found[0], *found[1]]) for part in found)
+    return memory, arithmetic
+
+
+def projected(
+    phases: Sequence[Phase], reached: tuple[float, float], here: Machine, there: Machine, layers: int
+) -> list[Phase]:
+    """The phases, with the bytes and operations that they need there, on a device that is not at hand: its floors
+    divided by the shares that were reached here, and the least that so many layers' passes take. What has no floor, the
+    encoder, scales with bandwidth; drafts of the shipped policy stay as they are. A projection, not a measurement."""
     projections = []
-    for phase in phases:
-        floor = there.floor(phase.read, phase.flops)
-        share = min(1.0, phase.share)
-        scale = here.bandwidth / there.bandwidth  # a phase without a floor, e.g. encode, scales with bandwidth
-        seconds = max(overhead, floor / share if share > 0 else phase.seconds * scale)
-        projections.append(replace(phase, seconds=seconds, p95=seconds, least=seconds, floor=floor))
+    for p in phases:
+        passes = {"prefill": layers, "verify": layers, "feed": 1}.get(p.kind, p.rows - 1)
+        least = max(passes * _PER_LAYER, p.read / there.bandwidth / reached[0], p.flops / there.flops / reached[1])
+        if p.kind == "encode":
+            least = p.seconds * here.bandwidth / there.bandwidth
+        elif p.kind in SOURCES:
+            least = p.seconds
+        projections.append(replace(p, seconds=least, p95=least, least=least, floor=there.floor(p.read, p.flops)))
     return projections
+
+
+def _counts_prompt(phase: Phase, prompt: int) -> bool:
+    return phase.kind == "prefill" or (phase.kind == "feed" and phase.rows == prompt)
+
+
+def prompt_of(shape: TargetSettings) -> int:
+    """P of a shape with these settings: vision tokens, instruction, scene, proprioception."""
+    vision = shape.grid**2 if shape.observation == "vision" else 0
+    return vision + shape.instruction_tokens + shape.scene_tokens + 1

@@ -69,6 +69,7 @@ def plot_roofline(path: Path, title: str, machine: Machine, phases: Sequence[Pha
     import matplotlib as mpl
 
     from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
+    from kerv_cli.report.scatter import place_labels
 
     limited = [phase for phase in phases if phase.floor > 0]
     with mpl.rc_context(STYLE):
@@ -78,15 +79,17 @@ def plot_roofline(path: Path, title: str, machine: Machine, phases: Sequence[Pha
         knee = machine.flops / machine.bandwidth
         x = np.geomspace(min([*intensity, knee]) / 2, max([*intensity, knee]) * 2, 64)
         axes.plot(x, np.minimum(machine.flops, x * machine.bandwidth) / 1e9, color=INK)
+        labels, shades = [], []
         for number, kind in enumerate(dict.fromkeys(phase.kind for phase in limited)):
             group = [phase for phase in limited if phase.kind == kind]
             at = [phase.flops / phase.read for phase in group], [phase.flops / phase.seconds / 1e9 for phase in group]
             axes.plot(*at, "o", color=colour(number), label=kind)
-            for phase, a, b in zip(group, *at, strict=True):
-                axes.annotate(str(phase.rows), (a, b), textcoords="offset points", xytext=(4, -10), fontsize=8)
+            labels += [(a, b, str(phase.rows)) for phase, a, b in zip(group, *at, strict=True)]
+            shades += [colour(number)] * len(group)
         axes.set(xscale="log", yscale="log", xlabel="operations per byte", ylabel="GFLOP/s")
         axes.legend(title="phase, by rows")
         about = f"roof: {machine.bandwidth / 1e9:.1f} GB/s and {machine.flops / 1e9:.0f} GFLOP/s, measured"
         entitle(figure, title, about)
+        place_labels(figure, axes, labels, shades)
         with atomic_path(path) as temporary:
             figure.savefig(temporary, format="png", dpi=130)

@@ -9,14 +9,18 @@ from typing import Any
 
 import torch
 
+from kerv_cli.base.files import write_json
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.settings import BenchSettings
 from kerv_cli.bench.ceilings import MethodCeiling, ceilings
 from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
-from kerv_cli.bench.phases import Phase, Stage, costs, flipped, measure
-from kerv_cli.bench.profile import profile_of
+from kerv_cli.bench.phases import Phase, flipped, measure
+from kerv_cli.bench.profile import profile_of, projections
+from kerv_cli.bench.report import plot_roofline
+from kerv_cli.engine.cost import Profile
+from kerv_cli.engine.decoder import Decoder
 
 FLIP_CHUNKS = 8
 
@@ -33,6 +37,7 @@ class Bench:
     phases: list[Phase]
     ceilings: dict[int, list[MethodCeiling]]
     ties: tuple[int, int]
+    profile: Profile
 
     @property
     def dtype(self) -> str:
@@ -60,24 +65,23 @@ class Bench:
             "phases": [phase.as_dict() for phase in self.phases],
             "ceilings": {str(n): [asdict(c) for c in rows] for n, rows in self.ceilings.items()},
             "ties": {"flipped": self.ties[0], "compared": self.ties[1]},
-            "profile": profile_of(int(self.card["prompt"]), self.phases).as_dict(),
+            "profile": self.profile.as_dict(),
         }
 
 
 def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
     """Bytes, operations and floors of the model on this machine; needs no forward of the trunk."""
-    prompt, s = model.target.max_prompt, model.target.settings
-    size = 4 if model.target.device.type == "cpu" else model.dtype.itemsize
+    prompt, s, sizes = model.target.max_prompt, model.target.settings, model.sizes
     floors = {
-        "floor_token": costs(model, 1, prompt),
-        "floor_verify": costs(model, tokens, prompt),
-        "floor_prefill": costs(model, prompt, 0),
-        "floor_both": costs(model, prompt + tokens - 1, 0),
+        "floor_token": sizes.forward(1, prompt),
+        "floor_verify": sizes.forward(tokens, prompt),
+        "floor_prefill": sizes.forward(prompt, 0),
+        "floor_both": sizes.forward(prompt + tokens - 1, 0),
     }
     return {
-        "weights": model.trunk_weights,
-        "weight_bytes": model.trunk_weights * model.dtype.itemsize,
-        "cache_bytes": 2.0 * s.layers * s.width * (prompt + tokens) * size,
+        "weights": sizes.trunk_weights,
+        "weight_bytes": sizes.trunk_weights * sizes.weight,
+        "cache_bytes": 2.0 * s.layers * s.width * (prompt + tokens) * sizes.slot,
         "prompt": prompt,
         "tokens": tokens,
         "bandwidth": machine.bandwidth,
@@ -96,24 +100,34 @@ def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, fl
     return model, machine, card_of(model, machine, max(settings.tokens)), opened
 
 
-@torch.inference_mode()
 def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) -> Bench:
     """Measures the opened model."""
     began = time.perf_counter()
-    stage = Stage(model, max(settings.tokens) + 2)
-    stage.prefill()
-    stage.verify()
-    synchronise(model.target.device)
+    Decoder(model.target).decode(model.observation)
     cold = {"open_seconds": opened, "first_decode_seconds": time.perf_counter() - began}
-    machine, phases = measure(model, machine, settings.tokens, settings.drafter_depth, settings.repeats)
-    profile = profile_of(stage.length, phases)
+    machine, phases = measure(model, machine, settings)
+    profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
     card = card_of(model, machine, max(settings.tokens))
-    ties = flipped(model, FLIP_CHUNKS, max(settings.tokens))
-    return Bench(model, machine, card, cold, phases, by_tokens, ties)
+    return Bench(model, machine, card, cold, phases, by_tokens, flipped(model, FLIP_CHUNKS), profile)
+
+
+def write(settings: BenchSettings, bench: Bench) -> list[Path]:
+    """Writes the document, the roofline and the projections of `projected` -> their paths."""
+    path = place_of(settings.results, bench.model.name, bench.dtype, ".json")
+    write_json(path, bench.document())
+    plot_roofline(path.with_suffix(".png"), bench.title, bench.machine, bench.phases)
+    paths = [path, path.with_suffix(".png")]
+    for device, document in (
+        projections(settings, bench.model, bench.machine, bench.phases) if settings.projected else ()
+    ):
+        kind = f"-{device.lower().replace(' ', '-')}.json"
+        paths.append(place_of(settings.results, settings.projected, document["dtype"], kind))
+        write_json(paths[-1], document)
+    return paths
 
 
 def place_of(results: str, model: str, dtype: str, kind: str) -> Path:
-    """results/bench/<model>-<dtype>.<kind>: of the document, the plot, the table of a replay."""
+    """results/bench/<model>-<dtype><kind>."""
     name = model.rstrip("/").rsplit("/", 1)[-1]
     return results_dir(results) / "bench" / f"{name}-{dtype}{kind}"

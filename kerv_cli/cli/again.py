@@ -9,16 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.manifests import read
-from kerv_cli.base.settings import StudySettings, TrainDrafterSettings, TrainTargetSettings, settings_from
+from kerv_cli.base.settings import (
+    StudySettings,
+    TrainDrafterSettings,
+    TrainTargetSettings,
+    read_settings,
+    settings_from,
+)
 from kerv_cli.lab.catalogue import ROLLOUT, RunEntry, description_of, find_run, store_of
-from kerv_cli.lab.cells import CellRunner, reference_decode
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
 from kerv_cli.lab.policy import check, identity_of
-from kerv_cli.lab.reuse import new_name
-from kerv_cli.lab.run_file import note_invocation
-from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore
+from kerv_cli.lab.run import CellRunner, reference_decode
+from kerv_cli.lab.store import STUDIES, StudyStore, new_rollout
 from kerv_cli.report.viewing import save_recording
 
 if TYPE_CHECKING:
@@ -46,7 +50,7 @@ def plan_again(run: RunEntry, results: str) -> Again:
     cells = [_again(cell, results) for cell in plan.cells]
     study = StudySettings(plan.name, plan.title, plan.baseline, axis=plan.axis)
     if run.kind == ROLLOUT:
-        return Again(run, study, cells, StudyStore(results, new_name(results, cells), ROLLOUTS))
+        return Again(run, study, cells, new_rollout(results, cells))
     store = StudyStore(results, _free(Path(results).expanduser() / STUDIES, plan.name))
     return Again(run, dataclasses.replace(study, name=store.name), cells, store)
 
@@ -72,7 +76,7 @@ def run_again(again: Again, results: str) -> RunEntry:
         KervError: a cell failed.
     """
     again.store.write_plan(again.study, again.cells)
-    note_invocation(again.store.root, ["runs", "rerun", again.run.id])
+    again.store.note_command(["runs", "rerun", again.run.id])
     runner = CellRunner(again.store.rollouts, save_recording, keep=True)
     outcome = execute(again.cells, runner, again.store, gauge=reference_decode)
     if outcome.failed:
@@ -103,6 +107,6 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))
-    settings = read(TrainDrafterSettings, value, str(path))
-    weights: dict[str, Any] = {("drafter" if run.kind == "drafter" else "early"): name}
-    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, **weights)))
+    settings = read_settings(TrainDrafterSettings, value, tolerant=True)
+    others = settings.policy.others | {run.kind: name}
+    return drafter_run(dataclasses.replace(settings, policy=dataclasses.replace(settings.policy, others=others)))

@@ -1,32 +1,104 @@
-"""The `kerv` command. One thin module per command lies below `commands/`; nothing heavy is imported here."""
+"""The `kerv` command: every registered command under its name. Each of kerv's own is a file beside this one; nothing
+heavy is imported here."""
 
 from __future__ import annotations
 
 import os
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from kerv_cli.cli import (
-    bench,
-    build,
-    calibrate,
-    completion,
-    demos,
-    doctor,
-    report,
-    rollout,
-    runs,
-    serve,
-    sweep,
-    train,
-    view,
-)
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.registry import parts
+from kerv_cli.cli.command import CONTEXT, commands_below, summary_of, typer_command
+from kerv_cli.cli.common import one_line_errors
+
+# kerv's own commands register themselves, in the order of the help
+# isort: off
+from kerv_cli.cli import demos, train, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
+from kerv_cli.cli import bench, doctor, completion  # noqa: F401
+# isort: on
 
 # Set before numpy loads: by default its products use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+FAMILIES = {
+    "train": "Train the target, a drafter or a score.",
+    "build": "Build artifacts that need no training.",
+    "runs": "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made.",
+}
+"""First words that are no commands themselves."""
+
+
+class Commands(TyperGroup):
+    """The registered commands whose names begin with `prefix`, one word behind it: kerv itself, `kerv train`, …"""
+
+    prefix = ""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The words that can follow."""
+        names = (part.name.removeprefix(self.prefix) for part in commands_below(self.prefix))
+        return list(dict.fromkeys(name.split()[0] for name in names))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command, or the family of commands, of this word; None: neither."""
+        name = self.prefix + cmd_name
+        if name in parts("command"):
+            return typer_command(parts("command")[name])
+        if not any(commands_below(f"{name} ")):
+            return None
+        family = Commands(name=cmd_name, help=FAMILIES.get(name), no_args_is_help=True, rich_markup_mode=None)
+        family.context_settings, family.prefix = CONTEXT, f"{name} "
+        return family
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """`demos export` is a command beside `demos`.
+
+        Raises:
+            UsageError: the first word is no command; the line says which is meant.
+        """
+        if self.prefix + " ".join(args[:2]) in parts("command"):
+            return " ".join(args[:2]), typer_command(parts("command")[self.prefix + " ".join(args[:2])]), args[2:]
+        command = self.get_command(ctx, args[0])
+        if command is not None or ctx.resilient_parsing:
+            return args[0], command, args[1:]
+        names = self.list_commands(ctx)
+        if "=" not in args[0]:
+            raise UnknownName(f"{self.prefix}command", args[0], names)
+        at = next((at for at, word in enumerate(args) if word in names), 0)
+        line = [*args[at:], *args[:at]] if at else ["COMMAND", *args]
+        raise UsageError(f"settings follow the command: kerv {self.prefix}{' '.join(line)}")
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Lists the commands without importing what they run."""
+        rows = []
+        for word in self.list_commands(ctx):
+            name = self.prefix + word
+            rows.append(
+                (word, summary_of(parts("command")[name]) if name in parts("command") else FAMILIES.get(name, ""))
+            )
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+class Kerv(Commands):
+    """kerv itself, where every error becomes one line."""
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Reads kerv's own options, and prints the help."""
+        self.words = list(args)
+        with one_line_errors(self.words):
+            return super().make_context(info_name, args, parent, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs the command."""
+        with one_line_errors(self.words):
+            return super().invoke(ctx)
+
+
 app = typer.Typer(
+    cls=Kerv,
     name="kerv",
     help="Fast vision-language-action policies on Meta-World: train, sweep, report, look.",
     epilog="Settings follow the command as key=value, e.g. kerv rollout method=spec_vla task=drawer-open threshold.r=5",
@@ -34,21 +106,8 @@ app = typer.Typer(
     add_completion=False,  # `kerv completion` installs a script for bash that knows of '='
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT,
 )
-app.command("demos")(demos.demos)
-app.add_typer(train.app, name="train")
-app.add_typer(build.app, name="build")
-app.command("calibrate")(calibrate.calibrate)
-app.command("rollout")(rollout.rollout)
-app.command("sweep")(sweep.sweep)
-app.command("serve")(serve.serve)
-app.command("report")(report.report)
-app.add_typer(runs.app, name="runs")
-app.command("view")(view.view)
-app.command("bench")(bench.bench)
-app.command("doctor")(doctor.doctor)
-app.command("completion")(completion.completion)
 
 
 def _version(asked: bool) -> None:
@@ -71,9 +130,7 @@ def kerv(
 
 def main() -> None:
     """Entry point of the `kerv` script."""
-    if (
-        "_KERV_COMPLETE" in os.environ
-    ):  # a shell asks for completions; typer registers its shells with add_completion only
+    if "_KERV_COMPLETE" in os.environ:  # a shell asks; typer registers its shells with add_completion only
         from typer._completion_classes import completion_init
 
         completion_init()

@@ -1,55 +1,40 @@
-"""`kerv bench`: a target's speed against the device's limits; `kerv bench replay`: recorded decodes on another one."""
+"""`kerv bench`: what a target's decodes cost, against the device's limits."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from kerv_cli.cli.common import Overrides, ShowConfig, composed, console, edge, print_table
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_json
+from kerv_cli.base.settings import BenchSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import print_table
 
-if TYPE_CHECKING:
-    from kerv_cli.base.settings import BenchSettings
-
-REPLAY = "replay"
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
 Compare = Annotated[
     tuple[Path, Path] | None, typer.Option("--compare", help="Compare two results instead of measuring one.")
 ]
 
 
-@edge
-def bench(
-    overrides: Overrides = None, cfg: ShowConfig = False, as_json: AsJson = False, compare: Compare = None
-) -> None:
-    """Measure a target's forwards against the device's limits; target= is a policy or a shape: vla-150m, smolvla,
-    openvla-7b. 'kerv bench replay study=NAME target=…' executes a study's recorded decodes on that target."""
-    words = list(overrides or [])
-    if words[:1] == [REPLAY]:
-        _replay(words[1:], cfg, as_json)
-        return
-    from kerv_cli.base.settings import BenchSettings
-
-    settings = composed("bench", renamed(words), BenchSettings, cfg)
+@command(
+    "bench",
+    BenchSettings,
+    keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
+    examples=("kerv bench", "kerv bench target=vla-150m dtype=bfloat16 projected=openvla-7b"),
+    typed={"target": "model"},  # to Hydra target= would be a choice among the files of conf/target
+)
+def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = None) -> None:
+    """Measure what a target's decodes cost, against the device's limits; target= is a policy or a shape: vla-150m,
+    smolvla, openvla-7b. 'kerv report study=NAME on=PROFILE' prices a study's decodes with it."""
     if compare is not None:
         _compare(*compare)
         return
-    _measure(settings, as_json)
-
-
-def renamed(words: list[str]) -> list[str]:
-    """To Hydra target= and study= would be choices among the files of conf/; here they name a policy or shape, and a
-    study of the results folder."""
-    keys = {"target": "model", "study": "recorded"}
-    return [f"{keys.get(key, key)}{equals}{value}" for key, equals, value in (word.partition("=") for word in words)]
-
-
-def _measure(settings: BenchSettings, as_json: bool) -> None:
-    from kerv_cli.base.files import write_json
     from kerv_cli.bench import report
-    from kerv_cli.bench.run import open_and_card, place_of, run
+    from kerv_cli.bench.run import open_and_card, run, write
 
     model, machine, card, opened = open_and_card(settings)
     print_table(("card", ""), report.card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
@@ -62,17 +47,13 @@ def _measure(settings: BenchSettings, as_json: bool) -> None:
     print_table(("method", *columns), report.ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
     flipped, compared = done.ties
     typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
-    document, path = done.document(), place_of(settings.results, model.name, done.dtype, ".json")
-    write_json(path, document)
-    report.plot_roofline(path.with_suffix(".png"), done.title, done.machine, done.phases)
-    typer.echo(f"{path}\n{path.with_suffix('.png')}")
+    for path in write(settings, done):
+        typer.echo(str(path))
     if as_json:
-        typer.echo(json.dumps(document, allow_nan=False))
+        typer.echo(json.dumps(done.document(), allow_nan=False))
 
 
 def _compare(a: Path, b: Path) -> None:
-    from kerv_cli.base.errors import CheckpointError
-    from kerv_cli.base.files import read_json
     from kerv_cli.bench.report import comparison_rows
 
     documents: list[dict[str, Any]] = []
@@ -83,18 +64,3 @@ def _compare(a: Path, b: Path) -> None:
         documents.append(document)
     names = [f"{d['target']} {d['dtype']} ms" for d in documents]
     print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
-
-
-def _replay(words: list[str], cfg: bool, as_json: bool) -> None:
-    from kerv_cli.base.settings import BenchReplaySettings
-
-    settings = composed("bench_replay", renamed(words), BenchReplaySettings, cfg)
-    from kerv_cli.bench.replay_run import replay
-
-    result = replay(settings)
-    for table in result.tables():
-        console().print(table)
-    for path in result.write(settings.results):
-        typer.echo(str(path))
-    if as_json:
-        typer.echo(json.dumps(result.document(), allow_nan=False))

@@ -2,66 +2,64 @@
 
 from __future__ import annotations
 
-import typer
-
 from kerv_cli.base.errors import UsageError
-from kerv_cli.cli import common
-from kerv_cli.cli.common import Overrides, ShowConfig, ShowPlan, edge, progress_bar
-
-HELP = "Build artifacts that need no training."
-
-app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+from kerv_cli.base.registry import find, load, parts
+from kerv_cli.base.settings import BuildDatastoreSettings, BuildDrafterSettings, BuildTargetSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_plan, progress_bar
 
 
-@app.callback(help=HELP)
-def build() -> None:
-    """The group: with a callback, its single command keeps its name."""
-
-
-@app.command("target")
-@edge
-def target(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+@command(
+    "build target",
+    BuildTargetSettings,
+    keys="target checkpoint name statistics environment camera prompt crop int8 results",
+    examples=(
+        "kerv build target checkpoint=models/openvla-7b name=openvla",
+        "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",
+    ),
+    # to Hydra target= would be a choice among the files of conf/target
+    typed={"target": "family"},
+)
+def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     """Check a published checkpoint and make it a target; its files stay where they are."""
-    from kerv_cli.base.settings import BuildTargetSettings
-
-    # here target=NAME is a registered family; to Hydra it would be a choice among the files of conf/target
-    words = [f"family={o[7:]}" if o.startswith("target=") else o for o in overrides or []]
-    settings = common.composed("build_target", words, BuildTargetSettings, cfg)
-    from kerv_cli.base.registry import find, load, parts
-
     importers = {name: part for name, part in parts("target").items() if "importer" in part.traits}
     if find("target", settings.family, "target family").name not in importers:
         raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")
     folder, figures = load(importers[settings.family].traits["importer"])(settings)
-    common.print_figures("target", figures, folder)
+    print_figures("target", figures, folder, as_json)
 
 
-@app.command("drafter")
-@edge
-def drafter(overrides: Overrides = None, cfg: ShowConfig = False) -> None:
+@command(
+    "build drafter",
+    BuildDrafterSettings,
+    keys="checkpoint policy.target policy.drafter positions mask results",
+    examples=(
+        "kerv build drafter checkpoint=models/eagle policy.target=openvla",
+        "kerv build drafter checkpoint=models/eagle policy.target=openvla policy.drafter=public mask=prompt",
+    ),
+)
+def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Check a drafter in the public EAGLE or Spec-VLA layout and copy it beside its target."""
-    from kerv_cli.base.settings import BuildDrafterSettings
-
-    settings = common.composed("build_drafter", overrides, BuildDrafterSettings, cfg)
     from kerv_cli.training.public_drafter import import_drafter
 
     folder, figures = import_drafter(settings)
-    common.print_figures("drafter", figures, folder)
+    print_figures("drafter", figures, folder, as_json)
 
 
-@app.command("datastore")
-@edge
-def datastore(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+@command(
+    "build datastore",
+    BuildDatastoreSettings,
+    keys="policy.target demos task episodes starts name stride key components half",
+    examples=("kerv build datastore demos=mt10", "kerv build datastore policy.target=mine demos=mine half=true --plan"),
+)
+def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks under the target's own features, for retrieval."""
-    from kerv_cli.base.settings import BuildDatastoreSettings
-
-    settings = common.composed("build_datastore", overrides, BuildDatastoreSettings, cfg)
     from kerv_cli.training.datastore import DatastoreBuild, leave_one_out
 
     run = DatastoreBuild(settings)
     if plan:
-        common.print_plan(run.plan())
+        print_plan(run.plan(), as_json)
     with progress_bar("encoding demonstrations") as advance:
         store = run.build(advance)
     figures = {"entries": len(store.vectors), "tasks": len(store.shards), **leave_one_out(store)}
-    common.print_figures("datastore, nearest neighbour in another episode", figures, run.folder)
+    print_figures("datastore, nearest neighbour in another episode", figures, run.folder, as_json)

@@ -1,4 +1,5 @@
-"""`kerv calibrate`: fits predictors, reference levels, boundary ranges and skip levels on the demonstrations."""
+"""`kerv calibrate`: predictors, reference levels, boundary ranges and skip levels, from the demonstrations; `kerv
+calibrate risk`: what unverified drafts lose, from closed loop."""
 
 from __future__ import annotations
 
@@ -6,8 +7,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.cli import common
-from kerv_cli.cli.common import Overrides, ShowConfig, ShowPlan, edge, print_table, progress_bar
+from kerv_cli.base.errors import Interrupted
+from kerv_cli.base.settings import CalibrateRiskSettings, CalibrateSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import ShowPlan, console, print_plan, print_table, progress_bar
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -16,25 +19,22 @@ if TYPE_CHECKING:
 
     from kerv_cli.methods.calibration import Calibration
 
+PLOT = "coverage.png"
 
-RISK, PLOT = "risk", "coverage.png"
 
-
-@edge
-def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
-    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels. `kerv calibrate
-    risk …` records in closed loop what unverified drafts lose, for skip=risk."""
-    if overrides and overrides[0] == RISK:
-        _risk(overrides[1:], cfg, plan)
-        return
-    from kerv_cli.base.settings import CalibrateSettings
-
-    settings = common.composed("calibrate", overrides, CalibrateSettings, cfg)
+@command(
+    "calibrate",
+    CalibrateSettings,
+    keys="policy.target demos task name episodes decodes proposer window boundary_windows epsilon",
+    examples=("kerv calibrate demos=mt10", "kerv calibrate policy.target=mine demos=mine decodes=20 --plan"),
+)
+def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
+    """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels."""
     from kerv_cli.training.calibration import CalibrationRun
 
     run = CalibrationRun(settings)
     if plan:
-        common.print_plan(run.plan())
+        print_plan(run.plan())
     with progress_bar("reading demonstrations") as advance:
         run.load(advance)
     variability, skip = {}, None
@@ -46,7 +46,7 @@ def calibrate(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPl
     if run.stored:
         with progress_bar("skip levels") as advance:
             skip = run.skip(advance)
-    with common.console(stderr=True).status("fitting the predictors"):
+    with console(stderr=True).status("fitting the predictors"):
         calibration = run.finish(variability, boundary, skip)
     _tasks(calibration, run.path)
     _noise(calibration)
@@ -122,17 +122,20 @@ def _skip(calibration: Calibration) -> None:
     print_table(columns, rows, title)
 
 
-def _risk(overrides: list[str], cfg: bool, plan: bool) -> None:
-    from kerv_cli.base.errors import Interrupted
-    from kerv_cli.base.settings import CalibrateRiskSettings
-
-    settings = common.composed("calibrate_risk", overrides, CalibrateRiskSettings, cfg)
+@command(
+    "calibrate risk",
+    CalibrateRiskSettings,
+    keys="policy.target task name episodes seed sources scores unverified epsilon features",
+    examples=("kerv calibrate risk", "kerv calibrate risk policy.target=mine episodes=50 features=true --plan"),
+)
+def risk(settings: CalibrateRiskSettings, plan: ShowPlan = False) -> None:
+    """Record in closed loop what unverified drafts lose, for skip=risk."""
     from kerv_cli.report.risk import coverage_table, plot_coverage
     from kerv_cli.training.risk_recording import RiskRun
 
     run = RiskRun(settings)
     if plan:
-        common.print_plan(run.plan())
+        print_plan(run.plan())
     try:
         with progress_bar("episodes") as advance:
             run.record(advance)

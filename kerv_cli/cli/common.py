@@ -1,62 +1,24 @@
-"""What every command shares: turning errors into one line, override arguments and their completion, progress bars,
-tables."""
+"""What commands share: options, errors as one line, progress bars, tables."""
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import Annotated, Any
 
 import typer
 
 from kerv_cli.base.errors import KervError
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def complete_overrides(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Completions of an override. Imports nothing heavy."""
-    from kerv_cli.cli.completing import complete_overrides as complete
-
-    return complete(ctx, incomplete)
-
-
-Overrides = Annotated[
-    list[str] | None,
-    typer.Argument(help="Settings as key=value; see --cfg for all of them.", autocompletion=complete_overrides),
-]
-ShowConfig = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, nothing else.")]
-
-
-def composed(command: str, overrides: list[str] | None, schema: type[T], cfg: bool, writes: bool = True) -> T:
-    """The command's settings. With --cfg they are printed and the command ends. writes: the command stores results, so
-    that a folder that cannot be written is refused now.
-
-    Raises:
-        UsageError: as `config.compose`. StorageError: as `places.check_writable`.
-    """
-    from kerv_cli.base.config import compose, to_yaml
-    from kerv_cli.base.places import check_writable
-
-    settings: Any = compose(command, overrides or [], schema)
-    if cfg:
-        typer.echo(to_yaml(settings), nl=False)
-        raise typer.Exit(0)
-    if writes:
-        check_writable(settings.results)
-    checked: T = settings
-    return checked
 
 
 def print_json(value: Any) -> None:
@@ -93,30 +55,30 @@ def print_plan(text: str, as_json: bool = False) -> None:
     raise typer.Exit(0)
 
 
-def edge(command: Callable[P, None]) -> Callable[P, None]:
-    """Decorates a command: every exception is printed as one line and becomes an exit code (a KervError's own; 1 for
-    others; 130 for Ctrl-C). Commands named in the line run as they stand. KERV_TRACEBACK=1 raises it instead."""
-
-    @functools.wraps(command)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
-        words: Any = kwargs.get("overrides") or kwargs.get("arguments") or []
-        try:
-            command(*args, **kwargs)
-        except typer.Exit:
+@contextmanager
+def one_line_errors(words: Sequence[str]) -> Iterator[None]:
+    """Every exception within is printed as one line and becomes an exit code: a KervError's own, 2 for what typer
+    cannot parse, 130 for Ctrl-C, 1 for others. Commands named in the line run as they stand. KERV_TRACEBACK=1 raises
+    the exception instead. words: of the command line."""
+    try:
+        yield
+    except (typer.Exit, typer.Abort):
+        raise
+    except KervError as error:
+        _refuse(runnable(str(error), words), error.exit_code, error)
+    except typer.TyperException as error:
+        if "\n" in error.format_message():  # the help, where the command is left out
             raise
-        except KervError as error:
-            _refuse(runnable(str(error), words), error.exit_code, error)
-        except KeyboardInterrupt:
-            _refuse("interrupted", 130, None)
-        except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise typer.Exit(1) from None
-        except OSError as error:
-            _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
-        except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
-            _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
-
-    return wrapped
+        _refuse(error.format_message(), error.exit_code, error)
+    except KeyboardInterrupt:
+        _refuse("interrupted", 130, None)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(1) from None
+    except OSError as error:
+        _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
+    except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
+        _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
 
 
 _QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
@@ -128,7 +90,7 @@ _CARRIED = {
 """Settings of the present command that a command in its messages needs too -> the commands that take them."""
 
 
-def runnable(message: str, words: Iterable[str]) -> str:
+def runnable(message: str, words: Sequence[str]) -> str:
     """The message with every quoted command made complete: how kerv is called here, and those of the present command's
     settings without which it would work on another folder or another policy."""
 
@@ -232,8 +194,11 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
     console().print(table)
 
 
-def print_figures(what: str, figures: dict[str, float], folder: object) -> None:
+def print_figures(what: str, figures: Mapping[str, float], folder: object, as_json: bool = False) -> None:
     """Prints named numbers, four digits of each, and the folder of what they belong to."""
+    if as_json:
+        print_json({"folder": folder, **figures})
+        return
     rows = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in figures.items())
     print_table((what, ""), rows)
     typer.echo(str(folder))

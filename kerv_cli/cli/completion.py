@@ -6,19 +6,27 @@ from typing import Annotated
 
 import typer
 
-from kerv_cli.cli.common import edge
+from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.files import atomic_path
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.completing import SHELLS, script, script_path
+
+Install = Annotated[bool, typer.Option("--install", help="Put the script where the shell looks for it.")]
 
 
-@edge
-def completion(
-    shell: Annotated[str, typer.Argument(help="bash, zsh or fish.")],
-    install: Annotated[bool, typer.Option("--install", help="Put the script where the shell looks for it.")] = False,
-) -> None:
+@command(
+    "completion",
+    NoSettings,
+    examples=("kerv completion bash --install", "kerv completion zsh"),
+    names="NAME: bash, zsh or fish.",
+    completes=lambda: list(SHELLS),
+)
+def completion(names: list[str], install: Install = False) -> None:
     """Print a shell's completion script, or install it for this user."""
-    from kerv_cli.base.errors import UnknownName
-    from kerv_cli.base.files import atomic_path
-    from kerv_cli.cli.completing import SHELLS, script, script_path
-
+    if len(names) != 1:
+        raise UsageError(f"name one shell: {', '.join(SHELLS)}")
+    shell = names[0]
     if shell not in SHELLS:
         raise UnknownName("shell", shell, SHELLS)
     if not install:

@@ -1,38 +1,36 @@
-"""`kerv demos`: record the scripted experts."""
+"""`kerv demos`: record the scripted experts; `kerv demos export` and `import`: LeRobot datasets."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kerv_cli.cli.common import (
-    Overrides,
-    ShowConfig,
-    ShowPlan,
-    composed,
-    edge,
-    print_figures,
-    print_plan,
-    print_table,
-    progress_bar,
+from kerv_cli.base.errors import Interrupted, UsageError
+from kerv_cli.base.places import artifact, results_dir
+from kerv_cli.base.settings import (
+    EXPERT,
+    DemosExportSettings,
+    DemosImportSettings,
+    DemosSettings,
+    PolicySettings,
+    as_plain,
 )
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import ShowPlan, print_figures, print_plan, print_table, progress_bar
 
 if TYPE_CHECKING:
-    from kerv_cli.base.settings import DemosSettings
     from kerv_cli.training.dagger import TargetActs
 
 
-@edge
-def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+@command(
+    "demos",
+    DemosSettings,
+    keys="name task episodes seed perturbed policy frame_stride world.camera.name runtime.workers results",
+    examples=("kerv demos name=mine task=MT10 episodes=100", "kerv demos name=visited policy=vision task=reach --plan"),
+)
+def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a target
-    visits, labelled by the expert. `kerv demos export …` writes a LeRobot dataset, `kerv demos import …` reads one."""
-    if overrides and overrides[0] in OTHERS:
-        OTHERS[overrides[0]](overrides[1:], cfg)
-        return
-    from kerv_cli.base.errors import Interrupted
-    from kerv_cli.base.settings import DemosSettings, as_plain
-
-    settings = composed("demos", overrides, DemosSettings, cfg)
-    from kerv_cli.base.places import artifact
+    visits, labelled by the expert."""
     from kerv_cli.worlds import resolve_tasks, spec_of
 
     tasks = resolve_tasks(settings.task)
@@ -70,7 +68,6 @@ def demos(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan =
 
 def _actor(settings: DemosSettings, task: str) -> TargetActs | None:
     """The target that moves the robot instead of the expert; None: the expert. task: one of the recorded tasks."""
-    from kerv_cli.base.settings import EXPERT, PolicySettings
     from kerv_cli.worlds import spec_of
 
     target = settings.policy.target
@@ -79,23 +76,21 @@ def _actor(settings: DemosSettings, task: str) -> TargetActs | None:
 
         return TargetActs.of(settings.results, target, spec_of(task), settings.world)
     if target != PolicySettings().target:
-        from kerv_cli.base.errors import UsageError
-
         raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
     return None
 
 
-def _export(words: list[str], cfg: bool) -> None:
-    from kerv_cli.base.settings import DemosExportSettings
-
-    settings = composed("demos_export", words, DemosExportSettings, cfg)
-    from pathlib import Path
-
-    from kerv_cli.base.places import artifact, results_dir
+@command(
+    "demos export",
+    DemosExportSettings,
+    keys="demos to format results",
+    examples=("kerv demos export demos=mt10", "kerv demos export demos=mt10 to=lerobot/mt10"),
+)
+def export_demos(settings: DemosExportSettings) -> None:
+    """Write demonstrations as a LeRobot dataset."""
     from kerv_cli.worlds.demos.dataset import DemoDataset
     from kerv_cli.worlds.demos.lerobot.export import export
 
-    _check_format(settings.format)
     dataset = DemoDataset.open(artifact(settings.results, "demos", settings.demos))
     folder = (
         Path(settings.to).expanduser() if settings.to else results_dir(settings.results) / "lerobot" / settings.demos
@@ -106,19 +101,20 @@ def _export(words: list[str], cfg: bool) -> None:
     print_figures("LeRobot dataset", figures, folder)
 
 
-def _import(words: list[str], cfg: bool) -> None:
-    from kerv_cli.base.settings import DemosImportSettings
-
-    settings = composed("demos_import", words, DemosImportSettings, cfg)
-    from pathlib import Path
-
-    from kerv_cli.base.places import artifact
+@command(
+    "demos import",
+    DemosImportSettings,
+    keys="source name camera episodes dofs strict tail format results",
+    examples=(
+        "kerv demos import source=datasets/aloha name=aloha",
+        "kerv demos import source=datasets/libero dofs=openvla episodes=50",
+    ),
+)
+def import_demos(settings: DemosImportSettings) -> None:
+    """Read a LeRobot dataset as demonstrations."""
     from kerv_cli.worlds.demos.lerobot.reading import import_lerobot
 
-    _check_format(settings.format)
     if not settings.source:
-        from kerv_cli.base.errors import UsageError
-
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
     with progress_bar("import") as advance:
@@ -126,13 +122,3 @@ def _import(words: list[str], cfg: bool) -> None:
     rows = ((name, len(row["episodes"]), f"{row['mean_steps']:.0f}") for name, row in manifest["tasks"].items())
     title = f"demonstrations in {folder}, suite {manifest['environment'].upper()}"
     print_table(("task", "episodes", "mean steps"), rows, title)
-
-
-def _check_format(name: str) -> None:
-    from kerv_cli.base.errors import UnknownName
-
-    if name != "lerobot":
-        raise UnknownName("format", name, ("lerobot",))
-
-
-OTHERS = {"export": _export, "import": _import}

@@ -9,12 +9,13 @@ import typer
 
 from kerv_cli.base.errors import StorageError
 from kerv_cli.base.findings import Finding
-from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, edge, print_json, print_table
+from kerv_cli.base.settings import DoctorSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, print_json, print_table
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from kerv_cli.base.settings import DoctorSettings
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -24,17 +25,18 @@ Repair = Annotated[
 ]
 
 
-@edge
-def doctor(
-    overrides: Overrides = None, cfg: ShowConfig = False, repair: Repair = False, as_json: AsJson = False
-) -> None:
+@command(
+    "doctor",
+    DoctorSettings,
+    keys="target environment world.camera.size runtime.device runtime.threads results",
+    examples=("kerv doctor", "kerv doctor target=mt10-vision"),
+    # to Hydra target= would be a choice among the files of conf/target
+    typed={"target": "policy.target"},
+    writes=False,
+)
+def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = False) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say what to do about what is missing. With
     target=NAME or environment=NAME: whether that keeps its protocol."""
-    from kerv_cli.base.settings import DoctorSettings
-
-    # here target=NAME is a policy's folder; to Hydra it would be a choice among the files of conf/target
-    words = [f"policy.{o}" if o.startswith("target=") else o for o in overrides or []]
-    settings = composed("doctor", words, DoctorSettings, cfg, writes=False)
     if repair:
         _repair(settings)
         return

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, composed, console, edge, print_json
-
-if TYPE_CHECKING:
-    from kerv_cli.base.settings import ReportSettings
+from kerv_cli.base.settings import ReportSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, console, print_json, print_table
 
 Publish = Annotated[
     bool,
@@ -20,44 +20,60 @@ Publish = Annotated[
 
 
 Choose = Annotated[
-    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the boldest safe one.")
+    bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the fastest safe one.")
 ]
 
 
-@edge
+def studies_there() -> list[str]:
+    """Names of the studies in ./results."""
+    return sorted(path.parent.name for path in Path("results/studies").glob("*/plan.yaml"))
+
+
+@command(
+    "report",
+    ReportSettings,
+    keys="study results on against loss",
+    examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
+    # a folder of results; to Hydra study= would be a choice among the files of conf/study
+    typed={"study": "only"},
+    lists=("on",),
+    values={"study": studies_there},
+)
 def report(
-    overrides: Overrides = None,
-    cfg: ShowConfig = False,
+    settings: ReportSettings,
+    words: list[str],
     publish: Publish = False,
     choose: Choose = False,
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
-    from kerv_cli.base.settings import ReportSettings
     from kerv_cli.lab.resolve import study_name
 
-    # here study=NAME is a folder of results; to Hydra it would be a choice among the files of conf/study
-    words = [f"only={study_name(o[6:])}" if o.startswith("study=") else o for o in overrides or []]
-    settings = composed("report", words, ReportSettings, cfg)
+    settings.only = settings.only and study_name(settings.only)
     from kerv_cli.base.places import results_dir
     from kerv_cli.cli.sweep import tell_table
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.agreement import agreement_summary
     from kerv_cli.report.report import report as write_report
+    from kerv_cli.report.reprice import ASSUMES, repriced_summary
     from kerv_cli.report.tables import rows_of
 
     if choose:
         _choose(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.against)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.against, settings.on)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
-        print_json({"files": output.files, "studies": tables})
+        priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
+        print_json({"files": output.files, "studies": tables, **priced})
         return
     for name, table in output.tables.items():
         tell_table(table, StudyStore(results_dir(settings.results), name), words)
     if output.agreement is not None:
         console().print(agreement_summary(output.agreement))
+    if output.priced is not None:
+        summary = repriced_summary(output.priced)
+        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
     for path in output.files:
         typer.echo(str(path))
 
@@ -77,11 +93,11 @@ def _choose(settings: ReportSettings, as_json: bool) -> None:
     answers = {}
     for name in names:
         data = load_study(StudyStore(results, name))
-        groups = choices(study_table(data), per_task_table(data), data.plan.axis, settings.loss)
+        groups = choices(study_table(data), per_task_table(data), settings.loss)
         answers[name] = rows_of(choices_frame(groups))
         if not as_json:
             typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
-            typer.echo(f"  {sentence(groups[0], data.plan.axis, settings.loss, data.plan.baseline)}")
+            typer.echo(f"  {sentence(groups[0], settings.loss, data.plan.baseline)}")
             for choice in groups[1:]:
                 typer.echo(f"  {short(choice)}")
     if as_json:

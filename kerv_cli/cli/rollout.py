@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from kerv_cli.base.errors import KervError
+from kerv_cli.base.errors import Interrupted, KervError
+from kerv_cli.base.places import check_writable
+from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
-    Overrides,
-    ShowConfig,
     ShowPlan,
     at_work,
     called,
     console,
-    edge,
     in_same,
     print_json,
     print_notes,
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from kerv_cli.engine.record import EpisodeRecord
-    from kerv_cli.lab.cells import CellRunner
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
+    from kerv_cli.lab.run import CellRunner
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.tables import StudyData
 
@@ -40,24 +40,26 @@ B = TypeVar("B")
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
 
-@edge
+@command(
+    "rollout",
+    RolloutSettings,
+    keys="task method policy episodes seed proposer threshold record rollout.clock world.stress.kind",
+    examples=(
+        "kerv rollout method=spec_vla task=drawer-open threshold.r=5",
+        "kerv rollout -m method=ar,one_pass task=[reach,push] episodes=5",
+    ),
+)
 def rollout(
-    overrides: Overrides = None,
-    cfg: ShowConfig = False,
-    plan: ShowPlan = False,
-    multirun: Many = False,
-    as_json: AsJson = False,
+    words: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
     from dataclasses import asdict
 
     from kerv_cli.base.config import to_yaml
-    from kerv_cli.base.places import check_writable
-    from kerv_cli.lab.effects import without_effect
+    from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
     from kerv_cli.worlds import resolve_tasks
 
-    words = list(overrides or [])
     resolved = resolve_rollout(words, multirun)
     if cfg:
         typer.echo("---\n".join(to_yaml(settings) for settings in resolved.settings.values()), nl=False)
@@ -134,21 +136,18 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     Raises:
         Interrupted: Ctrl-C. KervError: an episode failed.
     """
-    from kerv_cli.base.errors import Interrupted
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab import events
-    from kerv_cli.lab.cells import CellRunner, reference_decode
     from kerv_cli.lab.execute import execute
     from kerv_cli.lab.reuse import begin
-    from kerv_cli.lab.run import close_worlds
-    from kerv_cli.lab.run_file import note_invocation
+    from kerv_cli.lab.run import CellRunner, close_worlds, reference_decode
     from kerv_cli.report.viewing import save_recording
 
     store, cells, done = begin(results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
     store.write_plan(resolved.study, cells)
-    note_invocation(store.root, arguments)
+    store.note_command(arguments)
     runtime = next(iter(resolved.settings.values())).runtime
     with ProgressDisplay(console(stderr=True)) as display:
 

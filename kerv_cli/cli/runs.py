@@ -8,66 +8,55 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kerv_cli.cli.common import AsJson, called, console, edge, in_same, print_json, print_table
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.settings import CommandSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
 
 if TYPE_CHECKING:
     from kerv_cli.lab.catalogue import RunEntry
     from kerv_cli.report.compare import Comparison, Difference
 
-HELP = "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made."
+RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
+FILTERS = "NAME: kind=, method=, task=, state=, since= and results=DIR narrow the list."
 
-app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
+To = Annotated[str, typer.Option("--to", help="csv, trackio, wandb (offline) or mlflow.")]
+Folder = Annotated[Path | None, typer.Option("--dir", help="Where it is written; default results/exports.")]
 
 
-def complete_run(incomplete: str) -> list[str]:
+def run_ids() -> list[str]:
     """Ids of the runs in ./results."""
     from kerv_cli.lab.catalogue import find_runs
 
-    return [run.id for run in find_runs("results") if run.id.startswith(incomplete)]
+    return [run.id for run in find_runs("results")]
 
 
-Words = Annotated[
-    list[str] | None,
-    typer.Argument(help="Runs (id, a unique part of it, or last) and results=DIR.", autocompletion=complete_run),
-]
-Filters = Annotated[
-    list[str] | None, typer.Argument(help="kind=, method=, task=, state=, since= and results=DIR narrow the list.")
-]
-
-
-Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-
-
-def _split(words: list[str] | None, least: int = 0, most: int = 1000, what: str = "a run") -> tuple[list[str], str]:
-    """(names, results folder) of the words. Raises UsageError: too few or too many names."""
-    from kerv_cli.base.errors import UsageError
+def _runs(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
+    """The names as those of runs. Raises UsageError: too few or too many."""
     from kerv_cli.lab.resolve import study_name
 
-    words = words or []
-    results = [word.split("=", 1)[1] for word in words if word.startswith("results=")]
-    names = [study_name(word.removeprefix("study=")) for word in words if not word.startswith("results=")]
     if not least <= len(names) <= most:
         raise UsageError(f"name {what}: 'kerv runs list' shows them")
-    return names, results[-1] if results else "results"
+    return [study_name(name.removeprefix("study=")) for name in names]
 
 
-@app.command("list")
-@edge
-def list_(overrides: Filters = None, as_json: AsJson = False) -> None:
+@command(
+    "runs list", names=FILTERS, keys="results", examples=("kerv runs list", "kerv runs list kind=rollout method=ar")
+)
+def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first."""
-    from kerv_cli.base.errors import UsageError
     from kerv_cli.lab.catalogue import find_runs, matching
 
-    words, results = _split(overrides)
-    for word in words:
+    for word in names:
         if "=" not in word:
             raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
-    runs = matching(find_runs(results), dict(word.split("=", 1) for word in words))
+    runs = matching(find_runs(settings.results), dict(word.split("=", 1) for word in names))
     if as_json:
         print_json([_plain(run) for run in runs])
         return
     if not runs:
-        typer.echo(f"no runs in {results}" + (" that agree" if words else ""))
+        typer.echo(f"no runs in {settings.results}" + (" that agree" if names else ""))
         return
     rows = [
         (run.id, run.kind, run.started.replace("T", " ")[:16], run.state, _few(run.methods), _few(run.tasks),
@@ -95,17 +84,22 @@ def _plain(run: RunEntry) -> dict[str, Any]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
-@app.command("show")
-@edge
-def show(overrides: Words = None, as_json: AsJson = False) -> None:
+@command(
+    "runs show",
+    names=RUNS,
+    completes=run_ids,
+    keys="results",
+    examples=("kerv runs show last", "kerv runs show main --json"),
+)
+def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
     from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
     from kerv_cli.report.summary import summary_table
     from kerv_cli.report.tables import load_study, rows_of, study_table
 
-    names, results = _split(overrides, 1, 1)
-    chosen = sides(results, names[0])
+    results, (name,) = settings.results, _runs(names)
+    chosen = sides(results, name)
     run = chosen[0].run
     table = study_table(load_study(store_of(run))) if run.has_episodes and run.episodes else None
     if table is not None:
@@ -126,14 +120,19 @@ def show(overrides: Words = None, as_json: AsJson = False) -> None:
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
-@app.command("compare")
-@edge
-def compare(overrides: Words = None, as_json: AsJson = False) -> None:
+@command(
+    "runs compare",
+    names=RUNS,
+    completes=run_ids,
+    keys="results",
+    examples=("kerv runs compare main:ar main:kerv", "kerv runs compare main last"),
+)
+def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: what differs in settings beside what differs in results, with intervals."""
     from kerv_cli.report import compare as comparing
 
-    names, results = _split(overrides, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(results, *names)]
+    runs = _runs(names, 2, 2, "two runs, ID or ID:SETTING")
+    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
     if as_json:
         print_json([comparing.as_plain(comparison) for comparison in comparisons])
         return
@@ -143,16 +142,20 @@ def compare(overrides: Words = None, as_json: AsJson = False) -> None:
         _print_results(comparison)
 
 
-@app.command("diff")
-@edge
-def diff(overrides: Words = None, as_json: AsJson = False) -> None:
+@command(
+    "runs diff",
+    names=RUNS,
+    completes=run_ids,
+    keys="results",
+    examples=("kerv runs diff main:ar main:kerv", "kerv runs diff main last"),
+)
+def diff(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show what differs between two runs in settings, weights, machine and versions."""
     from dataclasses import asdict
 
     from kerv_cli.report import compare as comparing
 
-    names, results = _split(overrides, 2, 2, "two runs, ID or ID:SETTING")
-    pairs = comparing.pairs_to_compare(results, *names)
+    pairs = comparing.pairs_to_compare(settings.results, *_runs(names, 2, 2, "two runs, ID or ID:SETTING"))
     by_pair = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
     if as_json:
         print_json({name: [asdict(difference) for difference in rows] for name, rows in by_pair.items()})
@@ -179,19 +182,21 @@ def _print_results(comparison: Comparison) -> None:
     print_table(("measure", "first", "second", "change", "95 % interval", ""), rows)
 
 
-@app.command("rerun")
-@edge
-def rerun(overrides: Words = None, plan: Annotated[bool, typer.Option("--plan", help="Say what would run.")] = False,
-          as_json: AsJson = False) -> None:  # fmt: skip
+@command(
+    "runs rerun",
+    names=RUNS,
+    completes=run_ids,
+    keys="results",
+    examples=("kerv runs rerun last", "kerv runs rerun main --plan"),
+)
+def rerun(
+    settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
+) -> None:
     """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
-    from kerv_cli.base.errors import UsageError
-    from kerv_cli.base.places import check_writable
     from kerv_cli.lab.catalogue import TRAINED, find_run
 
-    names, results = _split(overrides, 1, 1)
-    run = find_run(results, names[0])
-    check_writable(results)
-    where = in_same(overrides or [])
+    results, (name,) = settings.results, _runs(names)
+    run = find_run(results, name)
     if run.kind in TRAINED:
         _train_again(run, results, plan, as_json)
         return
@@ -211,7 +216,7 @@ def rerun(overrides: Words = None, plan: Annotated[bool, typer.Option("--plan", 
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
         return
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
-    typer.echo(f"both side by side: {called()} runs compare {run.id} {entry.id}{where}")
+    typer.echo(f"both side by side: {called()} runs compare {run.id} {entry.id}{in_same(words)}")
 
 
 def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None:
@@ -221,15 +226,14 @@ def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None
     run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
 
 
-@app.command("rm")
-@edge
-def rm(overrides: Words = None, yes: Yes = False) -> None:
+@command(
+    "runs rm", names=RUNS, completes=run_ids, keys="results", examples=("kerv runs rm last", "kerv runs rm main --yes")
+)
+def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
-    from kerv_cli.lab.catalogue import disk_bytes, find_run
-    from kerv_cli.lab.removal import check_removable, remove
+    from kerv_cli.lab.catalogue import check_removable, disk_bytes, find_run, remove
 
-    names, results = _split(overrides, 1)
-    runs = [find_run(results, name, exact=yes) for name in names]
+    runs = [find_run(settings.results, name, exact=yes) for name in _runs(names, 1, 1000)]
     for run in runs:
         check_removable(run)
     total = sum(disk_bytes(run.folder) for run in runs)
@@ -241,22 +245,24 @@ def rm(overrides: Words = None, yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@app.command("export")
-@edge
+@command(
+    "runs export",
+    names=RUNS,
+    completes=run_ids,
+    keys="results",
+    examples=("kerv runs export last", "kerv runs export main --to mlflow"),
+)
 def export(
-    overrides: Words = None,
-    to: Annotated[str, typer.Option("--to", help="csv, trackio, wandb (offline) or mlflow.")] = "csv",
-    folder: Annotated[Path | None, typer.Option("--dir", help="Where it is written; default results/exports.")] = None,
-    as_json: AsJson = False,
+    settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
     """Hand a run to a tracker, or write its episodes or its curves as CSV."""
     from kerv_cli.base.places import results_dir
     from kerv_cli.lab.catalogue import find_run
     from kerv_cli.report.export import export as hand_over
 
-    names, results = _split(overrides, 1, 1)
-    folder = folder or results_dir(results) / "exports" / to
-    run_names = hand_over(find_run(results, names[0]), to, folder)
+    (name,) = _runs(names)
+    folder = folder or results_dir(settings.results) / "exports" / to
+    run_names = hand_over(find_run(settings.results, name), to, folder)
     if as_json:
         print_json({"folder": folder, "written": run_names})
         return

@@ -8,24 +8,29 @@ import time
 
 import typer
 
-from kerv_cli.cli import common
-from kerv_cli.cli.common import Overrides, ShowConfig, ShowPlan, edge
+from kerv_cli.base.settings import ServeSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import ShowPlan, print_plan
 
 
-@edge
-def serve(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+@command(
+    "serve",
+    ServeSettings,
+    keys="policy method task host port gripper chunk log_every max_mb runtime.device",
+    examples=(
+        "kerv serve policy=vision method=one_pass",
+        "kerv serve policy.target=openvla port=0 runtime.device=auto",
+    ),
+    typed={"task": "task_name"},  # one task's name; elsewhere it is a list
+)
+def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
     """Answer observations with actions over websockets (openpi's protocol), with any method, until Ctrl-C."""
-    from kerv_cli.base.settings import ServeSettings
-
-    # here task=NAME is one task's name; elsewhere it is a list
-    words = [f"task_name={o[5:]}" if o.startswith("task=") else o for o in overrides or []]
-    settings = common.composed("serve", words, ServeSettings, cfg)
     from kerv_cli.serve.policy import served
     from kerv_cli.serve.server import PolicyServer
 
     interface, decoder = served(settings)
     if plan:
-        common.print_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
+        print_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
     server = PolicyServer(interface, decoder, _log, settings.max_mb, settings.log_every)
     with server.listening(settings.host, settings.port) as listening:
         port = listening.socket.getsockname()[1]

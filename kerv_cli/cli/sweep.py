@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from kerv_cli.base.errors import Interrupted
+from kerv_cli.base.places import check_writable
+from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
-    Overrides,
-    ShowConfig,
     ShowPlan,
     called,
     console,
-    edge,
     in_same,
     print_json,
     print_notes,
@@ -36,18 +37,24 @@ if TYPE_CHECKING:
 SECONDS_PER_EPISODE = 1.0  # before anything was measured; MT10 on one core takes 0.5 to 1.5
 
 
-@edge
-def sweep(
-    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
-) -> None:
-    """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused."""
+@command(
+    "sweep",
+    SweepSettings,
+    keys="study task episodes policy until rerun loss runtime.workers results",
+    examples=("kerv sweep study=demo", "kerv sweep study=threshold task=[reach,push] episodes=5 --plan"),
+    each="rollout",
+)
+def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+    """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused. Without study=
+    list the studies."""
+    if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in words):
+        _list_studies(as_json)
+        return
     from kerv_cli.base.config import to_yaml
-    from kerv_cli.base.places import check_writable
     from kerv_cli.cli.rollout import planned_cells
     from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import idle_overrides, resolve
 
-    words = list(overrides or [])
     resolved = resolve(words)
     first = next(iter(resolved.settings.values()))
     if cfg:
@@ -60,12 +67,11 @@ def sweep(
     check_writable(first.results)
     cells = planned_cells(resolved)
     from kerv_cli.lab.reuse import Stock, cover, disagreements
-    from kerv_cli.lab.run_file import interrupted_since
     from kerv_cli.lab.store import StudyStore
 
     store = StudyStore(first.results, resolved.study.name)
     stock = Stock(store)
-    covered = cover(cells, stock, resolved.rerun, interrupted_since(store.root, ["sweep", *words]))
+    covered = cover(cells, stock, resolved.rerun, store.interrupted_since(["sweep", *words]))
     _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
     if plan:
         _print_plan(covered, store, first.runtime.workers, as_json)
@@ -78,14 +84,36 @@ def sweep(
         raise typer.Exit(1)
 
 
+def _list_studies(as_json: bool) -> None:
+    """Prints the studies of conf/ and how large each is."""
+    from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
+    from kerv_cli.base.files import read_yaml
+    from kerv_cli.base.manifests import read
+    from kerv_cli.worlds import resolve_tasks
+
+    rows, composer = [], Composer("rollout", RolloutSettings)
+    for name in groups()["study"]:
+        path = conf_dir() / "study" / f"{name}.yaml"
+        study = read(StudySettings, {"name": name, **read_yaml(path.read_text(encoding="utf-8"))}, str(path))
+        common = composer.compose(split_words(study.common))
+        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(resolve_tasks(common.task))
+        rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
+    columns = ("study", "settings", "tasks", "episodes", "in all", "")
+    if as_json:
+        print_json([dict(zip((*columns[:5], "title"), row, strict=True)) for row in rows])
+        return
+    print_table(columns, rows, "episodes: per task; in all: settings x tasks x episodes")
+    typer.echo(f"run one, e.g.: {called()} sweep study=demo; what it would do: --plan")
+
+
 def _warn(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(f"kerv: warning: {line}", err=True)
 
 
 def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
-    from kerv_cli.lab.estimate import estimate
     from kerv_cli.lab.plan import seeds_text
+    from kerv_cli.lab.reuse import estimate
 
     by_label: dict[str, list[Cell]] = {}
     for cell in covered.cells:
@@ -110,12 +138,10 @@ def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool
 
 def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
     """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
-    from kerv_cli.base.errors import Interrupted
     from kerv_cli.cli.progress import ProgressDisplay
-    from kerv_cli.lab.cells import CellRunner, reference_decode
     from kerv_cli.lab.execute import execute
     from kerv_cli.lab.reuse import take_over
-    from kerv_cli.lab.run_file import note_finished, note_invocation
+    from kerv_cli.lab.run import CellRunner, reference_decode
     from kerv_cli.report.viewing import save_recording
 
     runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
@@ -123,7 +149,7 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
     take_over(store, covered)
     if resolved.until == "done":
         store.write_plan(resolved.study, cells)
-    note_invocation(store.root, ["sweep", *words])
+    store.note_command(["sweep", *words])
     here = runtime.executor == "local" and runtime.workers == 1
     with ProgressDisplay(console(stderr=True)) as display:
         runner = CellRunner(store.rollouts, save_recording, on_step=display.on_step if here else None)
@@ -139,7 +165,7 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
                 f"interrupted: {count} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
             ) from None
     if not outcome.failed:
-        note_finished(store.root)
+        store.note_finished()
     return outcome
 
 
@@ -176,10 +202,9 @@ def _until_decided(
     return total
 
 
-def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> None:
+def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
     """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
     command, for the one that is named."""
-    from kerv_cli.lab.run_file import sweep_command
     from kerv_cli.report.summary import not_in_turn, summary_table
     from kerv_cli.report.tables import values_of
 
@@ -190,7 +215,7 @@ def tell_table(table: DataFrame, store: StudyStore, words: Iterable[str]) -> Non
         typer.echo(f"its cells are of {len(codes)} states of the code, commits {names}")
     apart = not_in_turn(table)
     if apart:
-        command = runnable(f"'{sweep_command(store.root, store.name, 'rerun=timed')}'", words)
+        command = runnable(f"'{store.sweep_command('rerun=timed')}'", words)
         typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; {command} does that")
     note = store.read_plan().note
     if note:

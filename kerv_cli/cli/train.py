@@ -1,4 +1,4 @@
-"""`kerv train target` and `kerv train drafter`."""
+"""`kerv train target`, `kerv train drafter` and `kerv train score`."""
 
 from __future__ import annotations
 
@@ -6,65 +6,67 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.cli import common
-from kerv_cli.cli.common import AsJson, Overrides, ShowConfig, ShowPlan, edge, progress_bar
+from kerv_cli.base.settings import TrainDrafterSettings, TrainScoreSettings, TrainTargetSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_json, print_plan, progress_bar
 
 if TYPE_CHECKING:
     from kerv_cli.training.runs import DrafterRun, TargetRun
 
-app = typer.Typer(
-    help="Train the target or a drafter.", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+
+@command(
+    "train target",
+    TrainTargetSettings,
+    keys="name demos task target target.observation train.steps train.init train.lr world.camera.name runtime.device",
+    examples=(
+        "kerv train target name=mine demos=mt10",
+        "kerv train target name=quick target=nano train.steps=500 --plan",
+    ),
 )
-
-
-@app.command("target")
-@edge
-def target(
-    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
-) -> None:
+def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Behaviour-clone the target on demonstrations."""
-    from kerv_cli.base.settings import TrainTargetSettings
-
-    settings = common.composed("train_target", overrides, TrainTargetSettings, cfg)
     from kerv_cli.training.runs import TargetRun
 
     run_training(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
 
 
-@app.command("drafter")
-@edge
-def drafter(
-    overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False, as_json: AsJson = False
-) -> None:
+@command(
+    "train drafter",
+    TrainDrafterSettings,
+    keys="policy.target drafter demos task starts policy.drafter policy.early train.steps train.lr runtime.device",
+    examples=(
+        "kerv train drafter policy.target=mine demos=mt10",
+        "kerv train drafter drafter=early policy.target=mine",
+    ),
+)
+def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter, or with drafter=early the early one, on the target's own greedy decodes."""
-    from kerv_cli.base.settings import TrainDrafterSettings
-
-    settings = common.composed("train_drafter", overrides, TrainDrafterSettings, cfg)
     from kerv_cli.training.runs import drafter_run
 
     run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
 
 
-@app.command("score")
-@edge
-def score(overrides: Overrides = None, cfg: ShowConfig = False, plan: ShowPlan = False) -> None:
+@command(
+    "train score",
+    TrainScoreSettings,
+    keys="policy.target policy.risk policy.score inputs steps lr weight_decay held_out seed results",
+    examples=("kerv train score", "kerv train score inputs=[odds,entropy] steps=600"),
+)
+def score(settings: TrainScoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a score that expects a draft's loss, on what 'kerv calibrate risk features=true' recorded."""
-    from kerv_cli.base.settings import TrainScoreSettings
-
-    settings = common.composed("train_score", overrides, TrainScoreSettings, cfg)
     from kerv_cli.training.score_training import ScoreRun
 
     run = ScoreRun(settings)
     if plan:
-        common.print_plan(run.plan())
+        print_plan(run.plan(), as_json)
     with progress_bar("training the score") as advance:
         metrics = run.train(advance)
-    common.print_figures("held-out episodes", metrics, run.folder)
+    print_figures("held-out episodes", metrics, run.folder, as_json)
 
 
 def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     if plan:
-        common.print_plan(run.plan(), as_json)
+        print_plan(run.plan(), as_json)
     with progress_bar(loading) as advance:
         run.load(advance)
     begun = False
@@ -84,9 +86,9 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
 
     plot = save_curves(run.folder)
     if as_json:
-        common.print_json({"folder": run.folder, "best": metrics, "curves": plot})
+        print_json({"folder": run.folder, "best": metrics, "curves": plot})
         return
-    common.print_figures("best checkpoint", metrics, run.folder)
+    print_figures("best checkpoint", metrics, run.folder)
     typer.echo(f"curves in {run.folder / 'log.csv'} and {plot}")
 
 

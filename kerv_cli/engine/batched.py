@@ -54,7 +54,7 @@ class BatchDecoder:
     """
 
     def __init__(self, decoder: Decoder, deviation_every: int = 0) -> None:
-        """decoder: of a method that `check_batch` accepts. deviation_every: as in RolloutSettings."""
+        """decoder: of a method that `Method.check` accepts for a batch. deviation_every: as in RolloutSettings."""
         self.decoder, self.target, self.every = decoder, decoder.target, deviation_every
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
         self.skip = decoder.parts.skip

@@ -1,10 +1,9 @@
-"""The cost model of a decode: its forwards, and their seconds by a latency profile (docs/measuring.md)."""
+"""The cost model of a decode: its rounds, and their seconds by a latency profile (docs/measuring.md)."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,30 +13,48 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
-KINDS = ("encode", "prefill", "verify", "draft", "feed")
-"""Kinds of a profile's phases: docs/measuring.md."""
+KINDS = ("encode", "prefill", "verify", "feed", "draft", "tree", "early", "retrieval")
+"""Kinds of a profile's costs: docs/measuring.md."""
+
+FORMAT = 2
+"""Of a profile whose costs were measured inside whole decodes; older ones, without a format, forward by forward."""
 
 DRAFTER = "drafter"
-_HOST = ("seconds.accept", "seconds.rectify", "seconds.other")
-DECODE_TIMES = ("seconds.propose", *_HOST)
+_SOURCES = {"early": "early", "merged": "early", "retrieval": "retrieval"}
+"""Proposer -> the cost of its draft. Merged drafts are early ones, and what is retrieved shows otherwise."""
+_WIDE = 32  # nodes from which on a draft of unknown settings is a tree of few levels
+_LEVELS = 5
+_HOST = ("accept", "rectify", "other")
+HOST_PHASES = ("propose", *_HOST)
 """Phases of a recorded decode whose seconds do not depend on the target's size, where the drafter does not draft."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Seconds of every forward by its rows. prompt: P. phases: kind -> (rows, seconds), rows increasing. Between
-    measured rows times are interpolated, behind the last ones continued in a straight line."""
+    """Seconds of every forward by its rows, and of drafts. Between measured rows times are interpolated, behind the
+    last ones continued in a straight line.
+
+    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks; 0: not said. about: target,
+    machine, versions.
+    """
 
     prompt: int
     phases: Mapping[str, tuple[tuple[int, ...], tuple[float, ...]]]
+    tokens: int = 0
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     def seconds(self, kind: str, rows: int) -> float:
         """Of one phase of so many rows."""
+        return float(self.times(kind, np.array([rows]))[0])
+
+    def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
+        """`seconds` of every number of rows (n,)."""
         measured, times = self.phases[kind]
-        if len(measured) > 1 and rows > measured[-1]:
+        seconds: np.ndarray = np.interp(rows, measured, times)
+        if len(measured) > 1:
             slope = (times[-1] - times[-2]) / (measured[-1] - measured[-2])
-            return times[-1] + slope * (rows - measured[-1])
-        return float(np.interp(rows, measured, times))
+            seconds = seconds + slope * np.maximum(rows - measured[-1], 0)
+        return seconds
 
     def decode(self, tokens: int) -> float:
         """Of an autoregressive decode of N tokens."""
@@ -49,108 +66,163 @@ class Profile:
         return self.seconds("verify", 1)
 
     def drafting(self, depth: int) -> float:
-        """A chain of `depth` tokens from the drafter: its first token needs no forward."""
-        rows, times = self.phases["draft"]
-        step = times[-1] / max(1, rows[-1] - 1)
-        return step * max(0, depth - 1)
+        """A chain of `depth` tokens from the drafter."""
+        return self.seconds("draft", depth) if depth else 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "prompt": self.prompt,
-            "phases": {
-                kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()
-            },
-        }
+        phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
+        return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "phases": phases}
 
 
-def read_profile(path: Path) -> Profile:
-    """The profile in the document of a bench.
+def read_profile(path: Path, least: int = 1) -> Profile:
+    """The profile in the document of a bench. least: its format.
 
     Raises:
-        CheckpointError: no such document.
+        CheckpointError: no such document, or one of another format.
     """
     document = read_json(path)
     try:
         stored = document["profile"]
+        form = int(stored.get("format", 1))
         phases = {k: (tuple(v["rows"]), tuple(v["seconds"])) for k, v in stored["phases"].items()}
-        return Profile(int(stored["prompt"]), phases)
+        about = {key: value for key, value in document.items() if isinstance(value, str | bool | int | float)}
+        profile = Profile(int(stored["prompt"]), phases, int(stored.get("tokens", 0)), about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"{path} holds no latency profile: make one with 'kerv bench'") from error
+    if not least <= form <= FORMAT:
+        age = "an older" if form < least else "a newer"
+        raise CheckpointError(
+            f"{path} is of {age} kerv (format {form}, here {FORMAT}): measure it again with "
+            f"'kerv bench target={about.get('target', 'TARGET')}'"
+        )
+    return profile
 
 
 @dataclass(frozen=True)
-class Forward:
-    """One forward of the target. kind: prefill | verify. start: tokens committed before it. drafted: nodes it verifies.
-    accepted: draft tokens committed. proposer: who drafted, empty without a draft."""
+class Work:
+    """What some decodes did, flat: n rounds with a forward of the target, of `len(host)` decodes.
 
-    kind: str
-    start: int
-    drafted: int
-    accepted: int
-    proposer: str = ""
+    decode: (n,) which decode. prefill: (n,) bool. nodes, accepted: (n,) of the draft. levels: (n,) of the drafter's
+    draft, 0 where it did not draft; tree: (n,) bool, more than a chain. feeds: (n,) bool, the drafter is fed behind it.
+    host: (decodes,) seconds, as recorded, of acceptance and all else that does not depend on the target's size, but for
+    proposing. propose: the same of proposing, 0 where the drafter, which follows the target's shape, drafted. sources:
+    kind -> (decodes,) bool, whether there was such a draft besides.
+    """
 
-
-@dataclass(frozen=True)
-class DecodeSequence:
-    """One decode. forwards: empty where the draft was executed unverified. host: seconds, as recorded, of all that does
-    not depend on the target's size: acceptance, rectification, and proposers other than the drafter."""
-
-    forwards: tuple[Forward, ...]
-    host: float
+    decode: np.ndarray
+    prefill: np.ndarray
+    nodes: np.ndarray
+    accepted: np.ndarray
+    levels: np.ndarray
+    tree: np.ndarray
+    feeds: np.ndarray
+    host: np.ndarray
+    propose: np.ndarray
+    sources: Mapping[str, np.ndarray]
 
     @property
-    def drafts(self) -> bool:
-        """Whether the drafter, whose shape follows the target's, drafted in it."""
-        return any(f.proposer == DRAFTER for f in self.forwards)
+    def needs(self) -> list[str]:
+        """The kinds of costs that price it."""
+        used = {
+            "encode": True,
+            "prefill": self.prefill.any(),
+            "verify": (~self.prefill).any(),
+            "feed": self.feeds.any(),
+            "draft": (self.levels[~self.tree] > 1).any(),
+            "tree": self.tree.any(),
+            **{kind: count.any() for kind, count in self.sources.items()},
+        }
+        return [kind for kind in KINDS if used.get(kind)]
 
 
-def sequence_of(row: Mapping[str, Any], size: int, tokens: int) -> DecodeSequence:
-    """A row of decodes.parquet, cut to its first `tokens` of `size` tokens. A draft that reached beyond the cut shrinks
-    with the depth that is left; a round behind the cut is left out."""
-    forwards = []
-    for played in row["rounds"]:
-        start, nodes = int(played["start"]), int(played["tree_size"])
-        if played["mode"] == "skip" or start >= tokens:
-            continue
-        if played["mode"] == PARALLEL:
-            forwards.append(Forward("prefill", 0, tokens, 0))
-            continue
-        depth, most = tokens - start - 1, size - start - 1  # tokens that a draft may have here, and had in the record
-        if depth < 1:
-            nodes = 0
-        elif nodes >= most:
-            nodes = math.ceil(nodes * depth / most)
-        kind = "prefill" if start == 0 else "verify"
-        accepted = min(int(played["accepted"]), depth) if nodes else 0
-        forwards.append(Forward(kind, start, nodes, accepted, str(played["proposer"]) if nodes else ""))
-    drafted = any(f.proposer == DRAFTER for f in forwards)
-    host = sum(float(row[name]) for name in (_HOST if drafted else DECODE_TIMES))
-    return DecodeSequence(tuple(forwards), host)
+def work_of(
+    rounds: Mapping[str, np.ndarray],
+    counts: np.ndarray,
+    phases: Mapping[str, np.ndarray],
+    looked_up: np.ndarray,
+    size: int,
+    drafter: tuple[int, int] | None = None,
+) -> Work:
+    """The work of some decodes.
+
+    Args:
+        rounds: of all decodes, one behind the other: mode, proposer, start, tree_size, accepted, (n,) each.
+        counts: (decodes,) rounds of each.
+        phases: (decodes,) seconds of each of `HOST_PHASES`.
+        looked_up: (decodes,) bool: something was retrieved.
+        size: N.
+        drafter: the proposer's `depth` and `top_k`; None: not known, a draft of many nodes is a tree.
+    """
+    decodes, every = len(counts), np.repeat(np.arange(len(counts)), counts)
+    mode, proposer = rounds["mode"], rounds["proposer"]
+    drafts, parallel = (rounds["tree_size"] > 0) & (proposer == DRAFTER), mode == PARALLEL
+    has_drafter = np.bincount(every, drafts, decodes) > 0
+    nodes = np.where(parallel, size, rounds["tree_size"])
+    depth, top_k = drafter or (_LEVELS, 0)
+    tree = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
+    levels = np.where(tree, np.minimum(depth, size - rounds["start"] - 1), nodes) * drafts
+    host, propose = sum(phases[name] for name in _HOST), np.where(has_drafter, 0.0, phases["propose"])
+    kinds = {kind: [name for name, of in _SOURCES.items() if of == kind] for kind in set(_SOURCES.values())}
+    others = {kind: np.bincount(every, np.isin(proposer, names), decodes) > 0 for kind, names in kinds.items()}
+    others["retrieval"] |= looked_up
+    last = np.diff(every, append=decodes) > 0
+    forward = mode != "skip"
+    accepted = np.where(parallel, 0, rounds["accepted"])
+    return Work(
+        decode=every[forward],
+        prefill=(rounds["start"] == 0)[forward],
+        nodes=nodes[forward],
+        accepted=accepted[forward],
+        levels=levels[forward],
+        tree=tree[forward],
+        feeds=(has_drafter[every] & ~last)[forward],
+        host=np.asarray(host),
+        propose=propose,
+        sources=others,
+    )
 
 
-def sequence_of_record(decode: DecodeRecord) -> DecodeSequence:
-    """The forwards and host seconds of a decode that was just recorded, whole."""
-    times = {name: decode.phases.get(name.removeprefix("seconds."), 0.0) for name in DECODE_TIMES}
-    size = decode.size or len(decode.tokens)
-    return sequence_of({"rounds": [vars(played) for played in decode.rounds], **times}, size, size)
+def sequence_of_record(decode: DecodeRecord) -> Work:
+    """The work of a decode that was just recorded."""
+    names = ("mode", "proposer", "start", "tree_size", "accepted")
+    return work_of(
+        {name: np.array([getattr(played, name) for played in decode.rounds]) for name in names},
+        np.array([len(decode.rounds)]),
+        {name: np.array([decode.phases.get(name, 0.0)]) for name in HOST_PHASES},
+        np.array([decode.similarity is not None]),
+        decode.size or len(decode.tokens),
+    )
 
 
-def predicted(decode: DecodeSequence, profile: Profile) -> float:
-    """Seconds of the decode by the cost model: the profile's times of its forwards, the drafter's passes
-    and the states it is fed, and the recorded host seconds."""
-    seconds = profile.seconds("encode", 1) + decode.host
-    for i, forward in enumerate(decode.forwards):
-        rows = forward.drafted + (profile.prompt if forward.kind == "prefill" else 1)
-        seconds += profile.seconds(forward.kind, rows)
-        if forward.proposer == DRAFTER:
-            seconds += profile.drafting(min(forward.drafted, profile_depth(forward)))
-        if decode.drafts and i + 1 < len(decode.forwards):
-            first = forward.kind == "prefill"
-            seconds += profile.seconds("feed", profile.prompt if first else forward.accepted + 1)
-    return seconds
+def predicted(work: Work, profile: Profile) -> float:
+    """`prices` of all decodes, summed."""
+    return float(prices(work, profile).sum())
 
 
-def profile_depth(forward: Forward) -> int:
-    """Levels of a draft: a chain's length; a tree has more nodes than a chunk has tokens, and few levels."""
-    return forward.drafted if forward.drafted < 32 else 5
+def prices(work: Work, profile: Profile) -> np.ndarray:
+    """(decodes,) seconds by the cost model: the profile's costs of the forwards, of the drafter's passes and of the
+    states it is fed, of early and retrieved drafts, and the recorded host seconds. Where the profile lacks the costs of
+    those drafts, they take what was recorded."""
+    rows = work.nodes + np.where(work.prefill, profile.prompt, 1)
+    seconds = np.zeros(len(rows))
+    for kind, chosen in (("prefill", work.prefill), ("verify", ~work.prefill)):
+        seconds[chosen] = profile.times(kind, rows[chosen]) if chosen.any() else 0.0
+    trees = "tree" if profile.phases.get("tree", ((), ()))[0] else "draft"
+    for kind, chosen in (("draft", (work.levels > 0) & ~work.tree), (trees, work.tree)):
+        if chosen.any():
+            seconds[chosen] += profile.times(kind, work.levels[chosen])
+    if work.feeds.any():
+        fed = work.accepted + np.where(work.prefill, profile.prompt, 1)
+        seconds += np.where(work.feeds, profile.times("feed", fed), 0.0)
+    total = profile.seconds("encode", 1) + work.host + np.bincount(work.decode, seconds, len(work.host))
+    used = {kind: drafts for kind, drafts in work.sources.items() if drafts.any()}
+    if missing(list(used), profile):
+        return np.asarray(total + work.propose)
+    drafting = sum((drafts * profile.seconds(kind, 1) for kind, drafts in used.items()), np.zeros(len(total)))
+    return np.asarray(total + np.where(drafting > 0, drafting, work.propose))
+
+
+def missing(needs: Sequence[str], profile: Profile) -> list[str]:
+    """The kinds of costs that a profile lacks."""
+    return [kind for kind in needs if not profile.phases.get(kind, ((), ()))[0]]

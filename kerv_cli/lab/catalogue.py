@@ -6,6 +6,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import fnmatch
+import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -13,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_json, sha256_of, visible
-from kerv_cli.base.leftovers import clean
+from kerv_cli.base.files import read_json, sha256_of, storage_errors, sync, visible
+from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
+from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, unique_cells
-from kerv_cli.lab.run_file import invocations
 from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, stores
 
 SWEEP, ROLLOUT = "sweep", "rollout"
@@ -133,7 +135,7 @@ def store_of(run: RunEntry) -> StudyStore:
 
 def _study(store: StudyStore) -> RunEntry:
     kind = SWEEP if store.family == STUDIES else ROLLOUT
-    typed = invocations(store.root)
+    typed = store.commands()
     name = store.name
     try:
         cells = unique_cells(store.read_plan().cells)
@@ -225,13 +227,18 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
     """By which others name the artifact: that of its weights or data, else of its description."""
     if value.get("kind") == "datastore":
         return content_of(value["key"], value["chunk"], value["target"], value["files"])
+    if value.get("kind") == "risk":
+        from kerv_cli.methods.risk import hash_of_recording
+
+        return hash_of_recording(path)
     return str(value.get("sha256") or (sha256_of(path) if value else ""))
 
 
 def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
     if not (folder / "log.csv").is_file():
         return "complete"  # copied or imported: it has no log
-    rows = _log(folder)
+    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
     steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
     return "complete" if step >= steps else f"step {step:.0f} of {steps}"
 
@@ -261,11 +268,6 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     return {kind: names.get(value, value[:12]) for kind, value in run.made_from.items()}
 
 
-def _log(folder: Path) -> list[dict[str, str]]:
-    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 def _changed(path: Path) -> str:
     try:
         return datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")[:19]
@@ -275,8 +277,29 @@ def _changed(path: Path) -> str:
 
 def disk_bytes(folder: Path) -> int:
     """Size of everything below a folder."""
-    return sum(path.stat().st_size for path in _files(folder))
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    return (path for path in folder.rglob("*") if path.is_file())
+def check_removable(run: RunEntry) -> None:
+    """Raises UsageError: the folder is a link, or a process computes cells of the run at the moment."""
+    if run.folder.is_symlink():
+        raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
+    if not run.has_episodes or run.state == "damaged":
+        return
+    store = store_of(run)
+    if any(is_claimed(store.claims, cell) for cell in store.read_plan().cells):
+        raise UsageError(f"{run.id} is running: stop it first")
+
+
+def remove(run: RunEntry) -> None:
+    """Removes the run's folder: first it gets a temporary's name, which no command reads and which the next one that
+    looks there cleans away if this process is killed before it is done.
+
+    Raises:
+        StorageError: the disk refused; the run is as it was.
+    """
+    gone = temporary_beside(run.folder)
+    with storage_errors(run.folder):
+        run.folder.rename(gone)
+        sync(run.folder.parent)
+    shutil.rmtree(gone, ignore_errors=True)

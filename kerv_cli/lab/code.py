@@ -45,7 +45,8 @@ def _package() -> Iterator[tuple[str, Path]]:
 
 
 def _outside() -> Iterator[tuple[str, Path]]:
-    modules = {part.build.partition(":")[0] for kind in kinds() for part in parts(kind).values() if kind != "executor"}
+    computing = [kind for kind in kinds() if kind not in ("executor", "command")]
+    modules = {part.build.partition(":")[0] for kind in computing for part in parts(kind).values()}
     for name in sorted(module for module in modules if module and not module.startswith("kerv_cli.")):
         spec = importlib.util.find_spec(name)
         if spec is not None and spec.origin is not None:

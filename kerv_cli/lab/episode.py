@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,9 @@ from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.lab.clock import RealClock
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import World
+
+OnStep = Callable[[int], object]
+"""Told the number of executed control steps after each of them, outside the timing."""
 
 
 class Follower(Protocol):
@@ -74,8 +77,8 @@ class _Execution:
     """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
     the first one the robot stands still."""
 
-    def __init__(self, world: World, follower: Follower, trace: _Trace) -> None:
-        self.world, self.follower, self.trace = world, follower, trace
+    def __init__(self, world: World, follower: Follower, trace: _Trace, on_step: OnStep | None) -> None:
+        self.world, self.follower, self.trace, self.on_step = world, follower, trace, on_step
         self.in_hand: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
 
@@ -85,6 +88,8 @@ class _Execution:
             self.last = self.in_hand.popleft()
         self.trace.add(self.last)
         self.follower.observe(self.trace.actions[-1], self.trace.path[-1])
+        if self.on_step is not None:
+            self.on_step(len(self.trace.actions))
 
     def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
         """A new chunk replaces the one in hand."""
@@ -108,15 +113,21 @@ class _Execution:
 
 
 def run_episode(
-    world: World, decoder: ActionDecoder, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
+    world: World,
+    decoder: ActionDecoder,
+    seed: int,
+    camera: CameraConfig | None = None,
+    clock: RealClock | None = None,
+    on_step: OnStep | None = None,
 ) -> EpisodeRecord:
     """One closed-loop episode until success or the horizon: decodes a chunk and executes it whole, or, with a clock,
     as docs/methods.md §8 says.
 
     Simulation and rendering happen outside the decoder and so outside inference time. camera: the view whose frames the
     record keeps, one per control step; None: none. clock: of a world that goes on during decodes; None: it waits.
+    on_step: shows progress.
     """
-    steps = episode(world, decoder, seed, camera, clock)
+    steps = episode(world, decoder, seed, camera, clock, on_step)
     decode: Any = None
     while True:
         try:
@@ -128,15 +139,20 @@ def run_episode(
 
 
 def episode(
-    world: World, follower: Follower, seed: int, camera: CameraConfig | None = None, clock: RealClock | None = None
+    world: World,
+    follower: Follower,
+    seed: int,
+    camera: CameraConfig | None = None,
+    clock: RealClock | None = None,
+    on_step: OnStep | None = None,
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-    """As `run_episode`, decoded by whoever runs it: yields each observation, is sent its decode and returns the
+    """The episode of `run_episode`, decoded by the caller: yields each observation, is sent its decode and returns the
     record."""
     began = time.perf_counter()
     world.reset(seed)
     follower.reset(world.task, seed, world.end_effector)
     trace = _Trace(world, camera)
-    execution = _Execution(world, follower, trace)
+    execution = _Execution(world, follower, trace, on_step)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     if clock is not None:

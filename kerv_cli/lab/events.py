@@ -18,7 +18,7 @@ class CellFailed:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a sweep. Every asked-for cell is in exactly one of the three lists."""
+    """The result of a sweep. Every cell of the plan is in exactly one of the three lists."""
 
     done: list[Cell] = field(default_factory=list)  # run now
     reused: list[Cell] = field(default_factory=list)  # complete before

@@ -1,33 +1,82 @@
 """Runs a study's blocks through an executor: resumes, isolates failures, shares work with other sweeps, emits events.
 
-The process that runs a block also writes its cells, so a crash loses at most the running cells.
+The process that runs a block also writes its cells, so a crash loses at most the running cells. The settings of a block
+take turns in it, episode by episode, and a cell is written after its last episode.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
+import os
 import secrets
 import time
+import traceback
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from datetime import UTC, datetime
-from typing import Any
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any, ParamSpec, Protocol, runtime_checkable
 
-from kerv_cli.base.errors import CheckpointError, StorageError
+from kerv_cli.base.errors import CheckpointError, KervError, StorageError
 from kerv_cli.base.leftovers import clean
-from kerv_cli.base.provenance import git_commit
+from kerv_cli.base.provenance import git_commit, stamp
 from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab import events
-from kerv_cli.lab.block import BlockRun, CellResult, Gauge, Prepare, failed
-from kerv_cli.lab.claims import clean_void, is_claimed, release, running_cell
+from kerv_cli.lab.claims import claim, clean_void, is_claimed, note_running, release, running_cell
 from kerv_cli.lab.code import code_hash
 from kerv_cli.lab.executors import Executor, WorkerLost, check_executor, open_executor
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Block, Cell, blocks_of
+from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.store import StudyStore
 
+P = ParamSpec("P")
+
 _POLL_SECONDS = 1.0  # between two looks at blocks that another sweep computes
+
+RunEpisode = Callable[[int], EpisodeRecord]
+"""Runs the episode of a seed."""
+
+Prepare = Callable[[Cell], RunEpisode]
+"""Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls. One
+that can run the cells of a batch is a `Together` too."""
+
+Gauge = Callable[[str], float]
+"""Seconds of a fixed workload on a device. Picklable."""
+
+
+@runtime_checkable
+class Together(Protocol):
+    """Runs the episodes of several cells at once."""
+
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+        """Cells of one setting -> each episode as it ends: its cell, its seed, and its record or its error."""
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """The end of a cell, complete or failed; plain values, because an exception may not survive pickling."""
+
+    episodes: int = 0
+    successes: int = 0
+    seconds: float = 0.0
+    reason: str = ""  # empty: complete
+    reused: bool = False  # another sweep completed it meanwhile
+    trace: str = ""
+    storage: bool = False  # the disk refused the cell: no other cell could be written either
+
+
+Results = dict[str, CellResult]
+"""Ends of a block's cells by id."""
+
+
+def failed(error: BaseException) -> CellResult:
+    """The result of a cell that raised `error`, inside an except clause."""
+    return CellResult(reason=one_line(error), trace=traceback.format_exc(), storage=isinstance(error, StorageError))
 
 
 def execute(
@@ -92,7 +141,7 @@ class _Sweep:
         }
         self.waiting: deque[Block] = deque()
         self.elsewhere: list[Block] = []  # another sweep computes them
-        self.running: dict[Future[Any], BlockRun] = {}
+        self.running: dict[Future[Results | None], BlockRun] = {}
 
     def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
         """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
@@ -114,7 +163,11 @@ class _Sweep:
         try:
             while self.waiting or self.running or self.elsewhere:
                 while self.waiting and len(self.running) < executor.slots:
-                    self._start(self.waiting.popleft(), executor)
+                    block = self.waiting.popleft()
+                    name = f"{self.run_id}-{secrets.token_hex(4)}"
+                    attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
+                    self.on_event(events.BlockStarted(block))
+                    self.running[executor.submit(attempt)] = attempt
                 for future in wait(self.running, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done:
                     self._settle(self.running.pop(future), future)
                 self._look_elsewhere()
@@ -124,13 +177,7 @@ class _Sweep:
             for attempt in self.running.values():
                 release(self.store.claims, attempt.block.cells, attempt.name)
 
-    def _start(self, block: Block, executor: Executor) -> None:
-        name = f"{self.run_id}-{secrets.token_hex(4)}"
-        attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
-        self.on_event(events.BlockStarted(block))
-        self.running[executor.submit(attempt)] = attempt
-
-    def _settle(self, attempt: BlockRun, future: Future[dict[str, CellResult] | None]) -> None:
+    def _settle(self, attempt: BlockRun, future: Future[Results | None]) -> None:
         block = attempt.block
         try:
             results = future.result()
@@ -146,7 +193,7 @@ class _Sweep:
         else:
             self._note_all(block, results)
 
-    def _note_all(self, block: Block, results: Mapping[str, CellResult]) -> None:
+    def _note_all(self, block: Block, results: Results) -> None:
         for cell in block.cells:
             if cell.id in results:
                 self.note(cell, results[cell.id])
@@ -161,9 +208,9 @@ class _Sweep:
             if last_cell is None:  # it ended before any cell ran: so would another attempt
                 results[cell.id] = result
             elif self.store.has_cell(cell.id):
-                stored = self.store.read_cell(cell.id)
-                sums = stored.status["episodes"], stored.status["successes"], stored.status["seconds"]
-                results[cell.id] = CellResult(*sums, reused=stored.status["run"] != self.run_id)
+                status = self.store.status_of(cell.id)
+                sums = status["episodes"], status["successes"], status["seconds"]
+                results[cell.id] = CellResult(*sums, reused=status["run"] != self.run_id)
         self._note_all(attempt.block, results)
         rest = attempt.block.without(results)
         if rest is not None:
@@ -173,12 +220,12 @@ class _Sweep:
         """When nothing else is left to do, queues the blocks that no other sweep computes any more."""
         if self.waiting or self.running or not self.elsewhere:
             return
-        claimed = [any(is_claimed(self.store.claims, cell) for cell in block.cells) for block in self.elsewhere]
-        if all(claimed):
+        blocks, self.elsewhere = self.elsewhere, []
+        for block in blocks:
+            theirs = any(is_claimed(self.store.claims, cell) for cell in block.cells)
+            (self.elsewhere if theirs else self.waiting).append(block)
+        if not self.waiting:
             time.sleep(_POLL_SECONDS)
-            return
-        self.waiting.extend(block for block, theirs in zip(self.elsewhere, claimed, strict=True) if not theirs)
-        self.elsewhere = [block for block, theirs in zip(self.elsewhere, claimed, strict=True) if theirs]
 
     def note(self, cell: Cell, result: CellResult) -> None:
         """Adds a cell's result to the outcome and emits its event."""
@@ -195,3 +242,146 @@ class _Sweep:
             self.store.clear_failure(cell.id)
             self.outcome.done.append(cell)
             self.on_event(events.CellDone(cell, result.episodes, result.successes, result.seconds))
+
+
+@dataclass(frozen=True)
+class BlockRun:
+    """One attempt to run a block, the function that an executor calls. Picklable.
+
+    name: unique among all attempts. run: id of the sweep. status: the sweep's entries in every cell's status.json.
+    """
+
+    block: Block
+    name: str
+    run: str
+    prepare: Prepare
+    store: StudyStore
+    gauge: Gauge | None = None
+    status: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self) -> Results | None:
+        """Results by cell id; None where another sweep computes one of the cells: nothing was run then."""
+        try:
+            if not claim(self.store.claims, self.block.cells, self.run, self.name):
+                return None
+        except StorageError as error:
+            return {self.block.cells[0].id: failed(error)}
+        try:
+            return self._take_turns() if self.block.batch == 1 else self._together()
+        finally:
+            release(self.store.claims, self.block.cells, self.name)
+
+    def _take_turns(self) -> Results:
+        turns = [_Turn(cell, self) for cell in self.block.cells]
+        results = {turn.cell.id: result for turn in turns if (result := turn.prepare()) is not None}
+        order = 0
+        for seed in self.block.seeds:
+            for turn in (turns[index] for index in self.block.order(seed)):
+                if turn.cell.id in results:
+                    continue
+                result = turn.take(seed, order)
+                order += 1
+                if result is not None:
+                    results[turn.cell.id] = result
+                    if result.storage:
+                        return results
+        return results
+
+    def _together(self) -> Results:
+        """Runs the cells of a batch; a cell is written as soon as its last episode has ended."""
+        turns = {cell.id: _Turn(cell, self) for cell in self.block.cells if not self.store.has_cell(cell.id)}
+        results = {cell.id: CellResult(reused=True) for cell in self.block.cells if cell.id not in turns}
+        cells = [turn.cell for turn in turns.values()]
+        try:
+            if not isinstance(self.prepare, Together):
+                raise TypeError(f"{type(self.prepare).__name__} runs one episode at a time, not {self.block.batch}")
+            note_running(self.store.claims, self.block.cells[0], self.name)
+            for order, (cell, _, end) in enumerate(self.prepare.together(cells) if cells else ()):
+                if cell.id in results:
+                    continue  # another of its episodes failed
+                result = turns[cell.id].add(end, order)
+                if result is not None:
+                    results[cell.id] = result
+                    if result.storage:
+                        return results
+        except Exception as error:  # noqa: BLE001 - what the decodes have in common failed
+            results = dict.fromkeys(turns, failed(error)) | results
+        return results
+
+
+def _guarded(step: Callable[P, CellResult | None]) -> Callable[P, CellResult | None]:
+    """The step with an error as the cell's result."""
+
+    @functools.wraps(step)
+    def attempt(*args: P.args, **kwargs: P.kwargs) -> CellResult | None:
+        try:
+            return step(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
+            return failed(error)
+
+    return attempt
+
+
+class _Turn:
+    """One cell's part in a block. Its methods return the cell's result as soon as it has failed or is complete."""
+
+    def __init__(self, cell: Cell, work: BlockRun) -> None:
+        self.cell, self.work = cell, work
+        self.device = str(cell.settings["runtime"]["device"])
+        self.episodes: list[tuple[EpisodeRecord, Circumstances]] = []
+        self.seconds = 0.0
+
+    @_guarded
+    def prepare(self) -> CellResult | None:
+        """Builds the setting, unless the cell is complete."""
+        clock = time.perf_counter()
+        if self.work.store.has_cell(self.cell.id):
+            return CellResult(reused=True)
+        note_running(self.work.store.claims, self.cell, self.work.name)
+        self.run_episode = self.work.prepare(self.cell)
+        self.seconds += time.perf_counter() - clock
+        return None
+
+    @_guarded
+    def take(self, seed: int, order: int) -> CellResult | None:
+        """Runs one episode; writes the cell after its last one."""
+        note_running(self.work.store.claims, self.cell, self.work.name)
+        started = datetime.now(UTC)
+        load = self.work.gauge(self.device) if self.work.gauge is not None else math.nan
+        clock = time.perf_counter()
+        record = self.run_episode(seed)
+        return self._keep(record, order, started, load, time.perf_counter() - clock)
+
+    @_guarded
+    def add(self, end: EpisodeRecord | Exception, order: int) -> CellResult | None:
+        """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
+        note_running(self.work.store.claims, self.cell, self.work.name)
+        if isinstance(end, Exception):
+            raise end
+        started = datetime.now(UTC) - timedelta(seconds=end.wall_seconds)
+        return self._keep(end, order, started, math.nan, end.wall_seconds)
+
+    def _keep(
+        self, record: EpisodeRecord, order: int, started: datetime, load: float, seconds: float
+    ) -> CellResult | None:
+        at = Circumstances(self.work.name, order, started.isoformat(timespec="milliseconds"), load)
+        self.episodes.append((record, at))
+        self.seconds += seconds
+        if len(self.episodes) < len(self.cell.seeds):
+            return None
+        status = {**stamp(self.device), **self.work.status, "run": self.work.run, "pid": os.getpid()}
+        status |= {"seconds": self.seconds}
+        records, circumstances = zip(*sorted(self.episodes, key=lambda episode: episode[0].seed), strict=True)
+        if not self.work.store.write_cell(self.cell, records, status, circumstances):
+            return CellResult(reused=True)
+        return CellResult(len(records), sum(record.success for record in records), self.seconds)
+
+
+def one_line(error: BaseException) -> str:
+    """An error in one line: the message of a KervError; type, message and line of the source of any other."""
+    text = " ".join(str(error).split())
+    if isinstance(error, KervError):
+        return text
+    frames = traceback.extract_tb(error.__traceback__)
+    line = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {text[:200]}{line}"

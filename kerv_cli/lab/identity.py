@@ -9,16 +9,29 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.settings import EXPERT, MODEL, as_plain, settings_from
-from kerv_cli.lab.effects import idle_keys
+from kerv_cli.base.registry import METHOD_KINDS, part_of
+from kerv_cli.base.settings import (
+    CONSTANT,
+    EXPERT,
+    MODEL,
+    PROFILE,
+    WAITS,
+    RolloutSettings,
+    TimingSettings,
+    as_plain,
+    settings_from,
+)
 
 ENGINE = 1
 """Which tokens the code gives. Raised by hand in a change that alters tokens or actions, and in no other:
 tests/test_golden.py holds both."""
+
+Plain = Mapping[str, Any]
+"""RolloutSettings as nested plain values: those of a cell, as they are stored."""
 
 Identity = Mapping[str, str]
 """Hashes of the weights and data behind a setting, e.g. {"target": sha256, "drafter": sha256}."""
@@ -32,8 +45,12 @@ OBSERVATION = "observation"
 NOT_DETERMINING = frozenset({"task", "episodes", "seed", "policy", "method", "results", "record", "record_size"})
 NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
+_JUDGED = ("acceptance", "threshold", "rectifier")
+"""The parts that judge drafts."""
+_ARTIFACTS = ("drafter", "early", "datastore", "calibration")
 
-def hash_of(value: Any) -> str:
+
+def hash_of(value: object) -> str:
     """First 16 hex digits of the SHA-256 of canonical JSON.
 
     Raises:
@@ -43,13 +60,13 @@ def hash_of(value: Any) -> str:
     return hashlib.sha256(_canonical(value).encode("ascii")).hexdigest()[:16]
 
 
-def _canonical(value: Any) -> str:
+def _canonical(value: object) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
-def work_of(settings: Mapping[str, Any], identity: Identity, engine: int = ENGINE) -> str:
-    """Hash of what determines the results of a setting, apart from task, seeds and repeat. settings: plain
-    RolloutSettings, of this kerv or an older one. engine: version that computes them."""
+def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
+    """Hash of what determines the results of a setting, of this kerv or an older one, apart from task, seeds and
+    repeat. engine: version that computes them."""
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
     policy = settings.get("policy", {}).get("kind", MODEL)
     return _work(_canonical(determining), _canonical(dict(identity)), policy, engine)
@@ -62,7 +79,7 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
     return hash_of({"settings": effective(plain), "policy": {"kind": policy, **hashes}, "engine": engine})
 
 
-def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
+def effective(settings: Plain) -> dict[str, Any]:
     """The settings that determine a result: complete, without those that have no effect."""
     determining = without(settings, NOT_DETERMINING)
     try:
@@ -78,7 +95,7 @@ def effective(settings: Mapping[str, Any]) -> dict[str, Any]:
     return determining
 
 
-def _filled(stored: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
+def _filled(stored: Plain, complete: Plain) -> dict[str, Any]:
     """Stored values and, where an older file has none, the defaults of today; keys that are unknown today stay."""
     values = {**complete, **stored}
     for key, value in values.items():
@@ -93,33 +110,33 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
     settings.pop(path[-1], None)
 
 
-def complete_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Stored plain RolloutSettings with today's defaults where an older kerv had no such setting."""
+def complete_settings(settings: Plain) -> dict[str, Any]:
+    """Stored settings with today's defaults where an older kerv had no such setting."""
     try:
         return _filled(settings, as_plain(settings_from(settings, tolerant=True)))
     except KervError:
         return dict(settings)
 
 
-def depends_on_order(settings: Mapping[str, Any]) -> bool:
+def depends_on_order(settings: Plain) -> bool:
     """Whether an episode's result depends on the episodes before it in its cell: a skip level that feedback moves."""
     skip = settings.get("skip", {})
     return bool(skip.get("up") or skip.get("down"))
 
 
-def stress_of(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Kind and level of the stress in plain RolloutSettings; `none` where nothing is shifted."""
+def stress_of(settings: Plain) -> dict[str, Any]:
+    """Kind and level of a setting's stress; `none` where nothing is shifted."""
     stress = settings["world"].get("stress", {})
     level = int(stress.get("level", 0))
     return {"kind": stress["kind"] if level else "none", "level": level}
 
 
-def batch_of(settings: Mapping[str, Any]) -> int:
-    """Episodes that run at the same time in plain RolloutSettings; with more than one they have no times."""
+def batch_of(settings: Plain) -> int:
+    """Episodes that a setting runs at the same time; with more than one they have no times."""
     return int(settings.get("rollout", {}).get("batch", 1))
 
 
-def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
     """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}."""
     pairs: dict[str, Any] = {}
     for key, value in settings.items():
@@ -127,6 +144,65 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return pairs
 
 
-def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
     """The settings without those keys."""
     return {key: value for key, value in settings.items() if key not in names}
+
+
+def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: bool = False) -> dict[str, str]:
+    """Those of the overrides `key=value` that have no effect on the rollout -> why. sweep: it is one of a sweep's.
+
+    An expert's are left out: it refuses the settings of a method.
+    """
+    if settings.policy.kind == EXPERT:
+        return {}
+    idle = idle_keys(settings)
+    if not sweep:
+        idle |= {f"runtime.{name}": "a rollout runs in one process" for name in sorted(NOT_DETERMINING_RUNTIME)}
+    reasons = {}
+    for word in overrides:
+        key = word.partition("=")[0].lstrip("+")
+        reason = next((why for name, why in idle.items() if key == name or key.startswith(f"{name}.")), None)
+        if reason is not None:
+            reasons[word] = reason
+    return reasons
+
+
+def _idle_timing(timing: TimingSettings) -> dict[str, str]:
+    if timing.clock == WAITS:
+        names = ("latency", "latency_ms", "profile", "ar_ms", "delay_compensation")
+        return {f"rollout.{name}": "rollout.clock=waits: the world waits for every decode" for name in names}
+    idle = {}
+    if timing.latency != CONSTANT:
+        idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
+    if timing.latency != PROFILE:
+        idle["rollout.profile"] = f"rollout.latency={timing.latency} reads no profile"
+    if timing.latency == CONSTANT:
+        idle["rollout.ar_ms"] = "rollout.latency=constant scales nothing"
+    return idle
+
+
+def idle_keys(settings: RolloutSettings) -> dict[str, str]:
+    """Key of a setting that has no effect -> why."""
+    method = settings.parts()
+    names = {kind: method[kind].kind for kind in METHOD_KINDS}
+    idle: dict[str, str] = {}
+    if names["proposer"] == names["prefill_draft"] == "none":
+        idle |= dict.fromkeys(_JUDGED, f"method {settings.method} drafts nothing")
+    elif names["skip"] == "always":
+        idle["rectifier"] = "skip=always verifies nothing, so nothing is rejected"
+    elif names["acceptance"] in ("strict", "sequence"):
+        idle["threshold"] = f"acceptance={names['acceptance']} has no threshold"
+    needed = {need for kind in METHOD_KINDS for need in part_of(kind, names[kind]).needs(method[kind])}
+    for kind in _ARTIFACTS:
+        if kind not in needed:
+            idle[f"policy.{kind}"] = f"method {settings.method} reads no {kind}"
+    if "datastore" not in needed:
+        idle["datastore"] = f"method {settings.method} reads no datastore"
+    idle |= _idle_timing(settings.rollout)
+    batch = settings.rollout.batch
+    if batch > 1:
+        idle |= dict.fromkeys(("record", "record_size"), f"rollout.batch={batch}: episodes of a batch are not recorded")
+    if not settings.record:
+        idle["record_size"] = "record=0 saves no recording"
+    return idle

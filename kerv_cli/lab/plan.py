@@ -1,4 +1,5 @@
-"""Cells and blocks of a study: what is to run, in which order. What a cell means is decided in identity.py."""
+"""A study's plan: cells and blocks, what is to run in which order, and plan.yaml. What a cell means is decided in
+identity.py."""
 
 from __future__ import annotations
 
@@ -13,8 +14,11 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import read_yaml, to_yaml
+from kerv_cli.base.manifests import read
+from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings
-from kerv_cli.lab.identity import Identity, batch_of, hash_of, without, work_of
+from kerv_cli.lab.identity import Identity, Plain, batch_of, complete_settings, hash_of, without, work_of
 
 MOST_CELLS = 100_000
 """Cells of a study; more are refused before they are planned."""
@@ -47,7 +51,7 @@ class Cell:
 
     def part(self, seeds: Sequence[int], name: str = "") -> Cell:
         """A cell of this work on these seeds. name: of its folder on disk; empty: the cell is to run."""
-        return replace(self, seeds=tuple(seeds), id=name or _name(self.work, seeds))
+        return replace(self, seeds=tuple(seeds), id=name or hash_of([*self.work, list(seeds)]))
 
     def again(self, names: Collection[str]) -> Cell:
         """This cell with the first id that is not among the names: `<id>-2`, `<id>-3`, …"""
@@ -112,7 +116,7 @@ class Block:
 def make_cell(
     label: str,
     overrides: str,
-    settings: Mapping[str, Any],
+    settings: Plain,
     identity: Identity,
     task: str,
     seeds: Sequence[int],
@@ -127,10 +131,6 @@ def make_cell(
         raise ValueError(f"setting '{label}': resolve runtime.device before planning")
     cell = Cell("", label, overrides, task, tuple(seeds), {**settings, "task": [task]}, dict(identity), repeat)
     return cell.part(seeds)
-
-
-def _name(work: tuple[str, str, int], seeds: Sequence[int]) -> str:
-    return hash_of([*work, list(seeds)])
 
 
 def plan(
@@ -186,9 +186,9 @@ def blocks_of(cells: Iterable[Cell], workers: int = 1) -> list[Block]:
     """The cells grouped by task, seeds, repeat and threads (a process has one number of them), in the order of their
     first cells; each id once. Those of a batch are grouped by setting, into as many blocks as there are workers or
     more."""
-    groups: dict[tuple[Any, ...], list[Cell]] = {}
+    groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in unique_cells(cells):
-        key: tuple[Any, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
+        key: tuple[object, ...] = cell.task, cell.seeds, cell.repeat, cell.settings["runtime"]["threads"]
         if batch_of(cell.settings) > 1:
             key = (json.dumps([without(cell.settings, {"task"}), cell.identity], sort_keys=True), cell.repeat)
         groups.setdefault(key, []).append(cell)
@@ -248,3 +248,130 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise ValueError(f"'{part}' is no range of seeds")
         seeds.extend(span)
     return tuple(seeds)
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """A study and its cells, in the order in which they run."""
+
+    name: str
+    title: str
+    baseline: str  # label that the others are compared with
+    axis: str  # config key of the plots' x axis; empty where there is none
+    cells: tuple[Cell, ...]
+    note: str = ""  # what to see
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels in the order of the plan."""
+        return list(dict.fromkeys(cell.label for cell in self.cells))
+
+
+@dataclass(frozen=True)
+class _Label:
+    overrides: str
+    identity: dict[str, str]
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A cell in the file. seeds: as `seeds_text`."""
+
+    id: str
+    label: str
+    task: str
+    seeds: str
+    repeat: int
+
+
+@dataclass(frozen=True)
+class _File:
+    """plan.yaml: every label's settings once, then one line per cell."""
+
+    study: str
+    title: str
+    baseline: str
+    axis: str
+    labels: dict[str, _Label]
+    cells: tuple[_Line, ...]
+    note: str = ""
+
+
+def plan_text(plan: StudyPlan) -> str:
+    """The plan as YAML: every label's settings once, then one line per cell."""
+    labels: dict[str, dict[str, Any]] = {}
+    for cell in plan.cells:
+        if cell.label not in labels:
+            settings = {key: value for key, value in cell.settings.items() if key != "task"}
+            labels[cell.label] = {"overrides": cell.overrides, "identity": cell.identity, "settings": settings}
+    head: dict[str, Any] = {
+        "study": plan.name,
+        "title": plan.title,
+        "baseline": plan.baseline,
+        "axis": plan.axis,
+        "note": plan.note,
+        "labels": labels,
+    }
+    cells = [
+        {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}
+        for c in plan.cells
+    ]
+    return to_yaml(head) + to_yaml({"cells": cells}, default_flow_style=None, width=1000)
+
+
+def plan_from_text(text: str) -> StudyPlan:
+    """The inverse of `plan_text`.
+
+    Raises:
+        CheckpointError, ValueError: not a plan, or one that contradicts itself.
+    """
+    file = read(_File, read_yaml(text), "the plan", tolerant=True)
+    for label in file.labels.values():
+        read(RolloutSettings, label.settings, "the plan", tolerant=True)
+        wrong = [kind for kind in METHOD_KINDS if not isinstance(label.settings.get(kind, {}), dict)]
+        if wrong or not label.settings.keys() & set(METHOD_KINDS):
+            raise ValueError(f"a label has no settings of {' or '.join(wrong or METHOD_KINDS)}")
+    unknown = {line.label for line in file.cells} - set(file.labels)
+    if unknown or file.baseline not in file.labels:
+        raise ValueError(f"it has no label {', '.join(sorted(unknown)) or file.baseline}")
+    return StudyPlan(file.study, file.title, file.baseline, file.axis, tuple(_cells_of(file)), file.note)
+
+
+def _cells_of(file: _File) -> Iterator[Cell]:
+    complete: dict[str, dict[str, Any]] = {}
+    shared: dict[tuple[str, str], dict[str, Any]] = {}  # of thousands of cells: memory
+    for line in file.cells:
+        label, key = file.labels[line.label], (line.label, line.task)
+        if line.label not in complete:
+            complete[line.label] = complete_settings(label.settings)
+        if key not in shared:
+            shared[key] = {**complete[line.label], "task": [line.task]}
+        yield Cell(
+            id=line.id,
+            label=line.label,
+            overrides=label.overrides,
+            task=line.task,
+            seeds=parse_seeds(line.seeds),
+            settings=shared[key],
+            identity=label.identity,
+            repeat=line.repeat,
+        )
+
+
+def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:
+    """`new`, preceded by the cells of `old` with its settings and seeds on tasks that `new` does not name."""
+    if (old.name, old.baseline) != (new.name, new.baseline):
+        return new
+    tasks = {cell.task for cell in new.cells}
+    settings = {(cell.label, cell.repeat): cell.work[0] for cell in new.cells}
+    seeds: dict[tuple[str, int], set[int]] = {}
+    for cell in new.cells:
+        seeds.setdefault((cell.label, cell.repeat), set()).update(cell.seeds)
+    cells = []
+    for cell in old.cells:
+        key = cell.label, cell.repeat
+        shared = [seed for seed in cell.seeds if seed in seeds.get(key, ())]
+        if shared and cell.task not in tasks and cell.work[0] == settings[key]:
+            cells.append(cell.part(shared, cell.id))
+    return replace(new, cells=(*cells, *new.cells))

@@ -16,14 +16,13 @@ from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, deviation
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab import timing
+from kerv_cli.lab import clock
 from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import check as check_method
-from kerv_cli.methods.compose import check_batch, compose, needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
@@ -53,19 +52,14 @@ def identity_of(settings: RolloutSettings) -> dict[str, str]:
     if is_expert(settings):
         tasks = resolve_tasks(settings.task)
         experts = spec_of(tasks[0]).experts
-        ours = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
-        return {"target": "", **({"expert": ours} if ours else {}), OBSERVATION: "state (privileged)"}
-    profile = timing.identity_of(settings)
+        hashes = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
+        return {"target": "", **({"expert": hashes} if hashes else {}), OBSERVATION: "state (privileged)"}
+    profile = clock.profile_identity(settings)
     artifacts = artifacts_of(settings)
-    shown = shown_to(artifacts.description.settings)
-    return {**artifacts.check(needs(settings.parts())), **profile, OBSERVATION: shown}
-
-
-def shown_to(target: Mapping[str, object]) -> str:
-    """The observation of a target with these settings, `vision` or `state (privileged)`; every row has it, so that a
-    privileged policy is recognised."""
-    kind = str(target.get(OBSERVATION, "vision"))
-    return "state (privileged)" if kind == "state" else kind
+    # every row of a table has it, so that a privileged policy is recognised
+    observation = str(artifacts.description.settings.get(OBSERVATION, "vision"))
+    observation = "state (privileged)" if observation == "state" else observation
+    return {**artifacts.check(Method.of(settings).needs), **profile, OBSERVATION: observation}
 
 
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
@@ -92,25 +86,19 @@ def check(settings: RolloutSettings) -> None:
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     check_stress(settings.world.stress, spec)
-    timing.check_numbers(settings, spec)
     if is_expert(settings):
         _check_expert(settings, spec)
         return
     artifacts = artifacts_of(settings)
     target = artifacts.description
     target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
-    method = settings.parts()
+    method = Method.of(settings)
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
-    check_method(method, settings.chunk, target.chunk, target.parallel)
-    check_batch(method, settings.method, settings.rollout.batch)
-    timing.check_method(settings, spec, target)
-    kinds = needs(method)
-    artifacts.check(kinds)
-    if "calibration" in kinds and method["threshold"].kind in ("kinematic", "change"):
-        calibration = artifacts.load("calibration")
-        for task in tasks if method["threshold"].k_s is None else ():
-            calibration.k_s(task)
+    method.check(target, settings.rollout.batch)
+    clock.check(settings, spec, target)
+    artifacts.check(method.needs)
+    method.check_levels(tasks, artifacts.load)
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
@@ -123,7 +111,7 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 
 
 def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
-    timing.check_expert(settings, spec)
+    clock.check(settings, spec, None)
     if settings.rollout.batch > 1:
         raise UsageError(f"policy=expert with rollout.batch={settings.rollout.batch}: it decodes nothing, leave it out")
     if settings.deviation_every > 0:
@@ -182,7 +170,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         decoder: ActionDecoder = ExpertDecoder()
     else:
         artifacts = artifacts_of(settings)
-        decoder = compose(settings.parts(), artifacts.target, artifacts.load, task, settings.chunk)
+        decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
         if settings.deviation_every > 0:
             reference = Decoder(artifacts.target, chunk=settings.chunk)
             decoder = Sampled(decoder, reference, settings.deviation_every)
@@ -197,7 +185,7 @@ def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
         UsageError, CheckpointError: as `check`.
     """
     artifacts = artifacts_of(settings)
-    decoder = compose(settings.parts(), artifacts.target, artifacts.load, chunk=settings.chunk)
+    decoder = Method.of(settings).decoder(artifacts.target, artifacts.load)
     return BatchDecoder(decoder, settings.deviation_every)
 
 
@@ -211,13 +199,13 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
         return None
     target = None if is_expert(settings) else artifacts_of(settings).description
     measured = 0.0
-    if timing.calibrates(settings):
+    if clock.calibrates(settings):
         runtime = settings.runtime
         measured = _ar_seconds(
             *(settings.results, settings.policy.target, settings.chunk, task, settings.world.camera.size),
             *(runtime.device, runtime.dtype, runtime.threads),
         )
-    latency = timing.latency_of(settings, target, measured)
+    latency = clock.latency_of(settings, target, measured)
     return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
 
 

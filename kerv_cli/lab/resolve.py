@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.config import MOST_POINTS, Composer, compose, expand, split_words, swept_keys
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.config import MOST_POINTS, Composer, check_once, compose, expand, split_words, swept_keys
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
-from kerv_cli.lab.effects import without_effect
+from kerv_cli.lab.identity import without_effect
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 EPISODES_PER_CELL = 1
@@ -43,11 +43,11 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
     """
     overrides, by_path = _study_of_path(overrides)
-    mine = [o for o in overrides if o.split("=", 1)[0].split(".", 1)[0] in _OF_THE_SWEEP]
+    mine = [o for o in overrides if _key(o).split(".", 1)[0] in _OF_THE_SWEEP]
     theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
     sweep = compose("sweep", mine, SweepSettings)
     if by_path is not None:
-        names = {o.split("=", 1)[0].removeprefix("study.") for o in mine if o.startswith("study.")}
+        names = {_key(o).removeprefix("study.") for o in mine if o.startswith("study.")}
         changes = {name: getattr(sweep.study, name) for name in names & set(StudySettings.__dataclass_fields__)}
         sweep.study = dataclasses.replace(by_path, **changes)
     keys = {_key(o) for o in theirs}
@@ -57,8 +57,13 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         varied = keys & {_key(word) for word in words}
         if varied:
             raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
+    if not points:
+        raise UsageError(f"study '{sweep.study.name}' has no settings: see conf/study/demo.yaml for some")
     if sweep.study.baseline not in points:
-        raise UsageError(f"baseline '{sweep.study.baseline}' is none of the study's settings: {', '.join(points)}")
+        raise UsageError(
+            f"study '{sweep.study.name}' has no setting '{sweep.study.baseline}', the baseline that its others are "
+            f"compared with: add it, or name one of these by baseline=: {', '.join(points)}"
+        )
     composer = Composer("rollout", RolloutSettings)
     settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
     for setting in settings.values():
@@ -85,17 +90,13 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     for point in expand(words) if multirun else [words]:
         composed = compose("rollout", [*shared, *point], RolloutSettings)
         composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
-        values = [f"{key.rsplit('.', 1)[-1]}={_value(point, key)}" for key in varied]
+        values = _varied_values(point, varied)
         parts = [word for word in point if _key(word) in METHOD_KINDS and _key(word) not in varied]
         label = " ".join([composed.method, *parts, *values])
         settings[label], texts[label] = composed, " ".join(point)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
     study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
     return ResolvedStudy(study, settings, texts)
-
-
-def _value(point: Sequence[str], key: str) -> str:
-    return next(word.split("=", 1)[1] for word in point if word.split("=", 1)[0] == key)
 
 
 def _is_ar(settings: RolloutSettings) -> bool:
@@ -120,13 +121,15 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
     Raises:
         UsageError: no such file, or it is no study.
     """
+    check_once(overrides, ["study"])
     paths = [o.split("=", 1)[1] for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))]
     if not paths:
         return list(overrides), None
-    if len(paths) > 1:
-        raise UsageError(f"study= is given twice, {paths[0]} and {paths[-1]}: leave one out")
-    path = Path(paths[-1]).expanduser()
+    path = Path(paths[0]).expanduser()
     value = _read_study(path)
+    for key in value:
+        if key not in StudySettings.__dataclass_fields__:
+            raise UnknownName(f"key in study={path}:", key, StudySettings.__dataclass_fields__)
     try:
         study = read(StudySettings, {"name": path.stem, **value}, str(path))
     except CheckpointError as error:
@@ -162,14 +165,18 @@ def _key(override: str) -> str:
     return override.split("=", 1)[0]
 
 
+def _varied_values(words: Sequence[str], varied: Collection[str]) -> list[str]:
+    """The words of a grid's keys, for a label: `threshold.r=3` -> `r=3`."""
+    return [word[_key(word).rfind(".") + 1 :] for word in words if _key(word) in varied]
+
+
 def _points(study: StudySettings) -> dict[str, list[str]]:
     """Label -> override words; a grid's labels carry its values: `spec_vla r=3`."""
     points: dict[str, list[str]] = {}
     for label, text in study.settings.items():
         varied = swept_keys(text)
         for words in expand(text):
-            values = [f"{_key(w).rsplit('.', 1)[-1]}={w.split('=', 1)[1]}" for w in words if _key(w) in varied]
-            points[" ".join([label, *values])] = words
+            points[" ".join([label, *_varied_values(words, varied)])] = words
         if len(points) > MOST_POINTS:
             raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
     return points

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import re
-import secrets
+import functools
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
 from kerv_cli.lab.code import code_hash
-from kerv_cli.lab.identity import ENGINE, OBSERVATION, depends_on_order, effective, flat, work_of
-from kerv_cli.lab.plan import Cell, unique_cells
-from kerv_cli.lab.store import ROLLOUTS, StudyStore, stores, studies_of
-
-_MOST_NAME = 32  # letters of the methods in a rollout's name
+from kerv_cli.lab.identity import ENGINE, OBSERVATION, Identity, Plain, depends_on_order, effective, flat, work_of
+from kerv_cli.lab.plan import Cell, blocks_of, unique_cells
+from kerv_cli.lab.store import ROLLOUTS, StudyStore, new_rollout, stores, studies_of
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """What `rerun=` runs again: nothing; settings whose times were not taken in turn; cells of other code; everything."""
@@ -38,8 +33,8 @@ class StockEntry:
     task: str
     repeat: int
     seeds: tuple[int, ...]
-    settings: Mapping[str, Any]
-    identity: Mapping[str, str]
+    settings: Plain
+    identity: Identity
     started: str
     run: str
     engine: int
@@ -245,17 +240,12 @@ def _differences(entry: StockEntry, cell: Cell) -> str:
         for kind in dict.fromkeys([*cell.identity, *entry.identity])
         if kind != OBSERVATION and cell.identity.get(kind) != entry.identity.get(kind)
     ]
-    changes += [f"{_weights(kind, cell)} changed" for kind in weights]
+    names = {"target": f"weights of {cell.settings['policy']['target']}"}
+    changes += [f"{names.get(kind, kind)} changed" for kind in weights]
     old, new = flat(effective(entry.settings)), flat(effective(cell.settings))
     keys = [key for key in dict.fromkeys([*new, *old]) if old.get(key) != new.get(key)]
     changes += [f"{key} {old.get(key)} → {new.get(key)}" for key in keys]
     return ", ".join(changes[:3]) or "new setting"
-
-
-def _weights(kind: str, cell: Cell) -> str:
-    if kind == "target":
-        return f"weights of {cell.settings['policy']['target']}"
-    return kind
 
 
 def take_over(store: StudyStore, covered: Covered) -> None:
@@ -267,13 +257,8 @@ def take_over(store: StudyStore, covered: Covered) -> None:
     for name, source in covered.sources.items():
         with contextlib.suppress(CheckpointError):
             source.status_of(name)
-            _copy(source, store, name)
-
-
-def _copy(source: StudyStore, store: StudyStore, name: str) -> None:
-    write_folder(
-        store.cells / name, lambda temporary: shutil.copytree(source.cells / name, temporary, dirs_exist_ok=True)
-    )
+            copy = functools.partial(shutil.copytree, source.cells / name, dirs_exist_ok=True)
+            write_folder(store.cells / name, copy)
 
 
 def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
@@ -288,15 +273,7 @@ def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], 
             covered = cover(cells, Stock(store, others=False))
             if covered.reasons:
                 return store, covered.cells, len(covered.cells) - len(covered.reasons)
-    return StudyStore(results, new_name(results, cells), ROLLOUTS), list(cells), 0
-
-
-def new_name(results: str | Path, cells: Sequence[Cell]) -> str:
-    """A free name: date, time and methods, e.g. `20260301-142530-ar-spec_vla`."""
-    methods = "-".join(dict.fromkeys(str(cell.settings["method"]) for cell in unique_cells(cells)))
-    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
-    exists = (Path(results).expanduser() / ROLLOUTS / name).exists()
-    return f"{name}-{secrets.token_hex(2)}" if exists else name
+    return new_rollout(results, cells), list(cells), 0
 
 
 def disagreements(cells: Iterable[Cell], stock: Stock) -> list[str]:
@@ -322,3 +299,40 @@ def _differ(store: StudyStore, cell: Cell, other: StockEntry) -> list[int]:
     shared = [seed for seed in cell.seeds if seed in first.index and seed in second.index]
     columns = ["success", "steps", "forwards", "tokens"]
     return [s for s in shared if list(first.loc[s, columns]) != list(second.loc[s, columns])]
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """Time for the cells of a plan that are not complete."""
+
+    seconds: float  # wall time
+    to_run: int  # cells
+    reused: int
+    source: str  # of the figure, in words
+
+
+def estimate(covered: Covered, store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:
+    """Time for the cells that are to run, from the mean wall seconds per episode of the plan's other cells.
+
+    A label with complete cells uses its own mean, others the mean over all; `prior_seconds` per episode is the guess
+    where nothing is complete. Workers are taken to scale perfectly, up to one per block.
+
+    Raises:
+        CheckpointError: a complete cell cannot be read.
+    """
+    seconds: Counter[str] = Counter()
+    episodes: Counter[str] = Counter()
+    cells = unique_cells(covered.cells)
+    to_run = [cell for cell in cells if cell.id in covered.reasons]
+    for cell in cells:
+        if cell.id not in covered.reasons:
+            _, status = covered.sources.get(cell.id, store).described(cell.id)
+            seconds[cell.label] += status["wall_seconds"]
+            episodes[cell.label] += status["episodes"]
+    stored = episodes.total()
+    prior = seconds.total() / stored if stored else prior_seconds
+    means = {label: seconds[label] / count for label, count in episodes.items()}
+    total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in to_run)
+    source = f"measured on {stored} stored episodes" if stored else f"a guess of {prior_seconds:g} s per episode"
+    at_once = max(1, min(workers, len(blocks_of(to_run, workers))))
+    return TimeEstimate(total / at_once, len(to_run), len(cells) - len(to_run), source)

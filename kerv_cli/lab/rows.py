@@ -1,4 +1,4 @@
-"""Records of episodes and decodes as rows of parquet tables."""
+"""A cell's parquet tables: records of episodes and decodes as rows, and the rows as data frames."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
 
 _PHASE_FIELDS = [(f"seconds.{phase}", pa.float64()) for phase in PHASES]
@@ -52,6 +55,9 @@ EPISODE_SCHEMA = pa.schema(
         ("carried_steps", pa.int64()),  # control steps during decodes that executed the chunk before
         ("held_steps", pa.int64()),  # … that held the last action
         ("dropped_steps", pa.int64()),  # actions of new chunks that were left out as stale
+        ("path_length", pa.float64()),  # of the end effector, metres
+        ("jerk", pa.float64()),  # of the end effector, root mean square, m/s³
+        ("gripper_switches", pa.int64()),
         ("wall_seconds", pa.float64()),
         ("initial_state", pa.list_(pa.float64())),
         ("repeat", pa.int64()),
@@ -79,7 +85,8 @@ _ROUND = pa.struct(
 )
 _OF_DELAY = ("observed", "carried", "held", "dropped", "predicted")  # fields of Delay
 _MEASURES = ("variability", "similarity", "metric", "deviation")
-_OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds")  # fields of EpisodeRecord
+_MOTION = ("path_length", "jerk", "gripper_switches")
+_OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds", *_MOTION)  # of EpisodeRecord
 _OF_DECODE = ("mode", "forwards", "seconds", "compensated", "skipped", *_MEASURES)  # fields of DecodeRecord
 
 DECODE_SCHEMA = pa.schema(
@@ -109,6 +116,7 @@ DECODE_SCHEMA = pa.schema(
     ]
 )
 _TRUST = ("score", "level", "reason", "loss", "alarm")
+_DECODE_TIMES = pa.schema([DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
 @dataclass(frozen=True)
@@ -227,3 +235,76 @@ def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer, compression="zstd")
     return buffer.getvalue()
+
+
+def tables_of(records: Sequence[EpisodeRecord], at: Sequence[Circumstances], repeat: int) -> dict[str, bytes]:
+    """A cell's tables: name of the file -> its bytes. at: circumstances of each record."""
+    episodes = [episode_row(record, one, repeat) for record, one in zip(records, at, strict=True)]
+    decodes = [row for record in records for row in decode_rows(record)]
+    return {
+        "episodes.parquet": parquet_bytes(episodes, EPISODE_SCHEMA),
+        "decodes.parquet": parquet_bytes(decodes, DECODE_SCHEMA),
+    }
+
+
+class CellTables(NamedTuple):
+    """What a report needs of a cell's tables. seconds: seed -> (decodes,) seconds."""
+
+    folder: Path
+    episodes: pa.Table
+    seconds: dict[int, np.ndarray]
+
+
+def read_tables(folder: Path) -> CellTables:
+    """The tables in a cell's folder.
+
+    Raises:
+        OSError, ValueError, ArrowException: they are not what a kerv wrote.
+    """
+    episodes = _with_columns(_parquet(folder / "episodes.parquet"), EPISODE_SCHEMA)
+    decodes = _with_columns(_parquet(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
+    return CellTables(folder, episodes, _split_by_seed(decodes))
+
+
+def frames_of(cells: Sequence[CellTables]) -> list[pd.DataFrame]:
+    """The episodes of each cell, one row each, with the column decode_seconds; converted all at once.
+
+    Raises:
+        CheckpointError: an episode has no decodes.
+    """
+    whole = pa.concat_tables([cell.episodes for cell in cells], promote_options="default").to_pandas()
+    try:
+        whole["decode_seconds"] = [cell.seconds[s] for cell in cells for s in cell.episodes["seed"].to_pylist()]
+    except KeyError as error:
+        raise CheckpointError(f"a cell in {cells[0].folder.parent} has no decodes of seed {error}") from error
+    stops = np.cumsum([cell.episodes.num_rows for cell in cells]).tolist()
+    return [whole.iloc[stop - cell.episodes.num_rows : stop] for cell, stop in zip(cells, stops, strict=True)]
+
+
+def _parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Those columns of a parquet file, or all of them."""
+    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
+    return pq.ParquetFile(path).read(columns=columns, use_threads=False)
+
+
+def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The columns of `schema` first, then those that only the table has. A column that an older table lacks is empty.
+
+    Raises:
+        ValueError: a column of another type.
+    """
+    if table.schema.equals(schema):
+        return table
+    present, names = set(table.column_names), list(schema.names)
+    for field in (field for field in schema if field.name not in present):
+        table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    further = [name for name in table.column_names if name not in set(names)]
+    table = table.select([*names, *further])
+    return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
+
+
+def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
+    """Seed -> seconds of its decodes, in order; the decodes of an episode stand together."""
+    seeds, seconds = (decodes[name].to_numpy() for name in ("seed", "seconds"))
+    starts = np.flatnonzero(np.diff(seeds, prepend=-1))
+    return dict(zip(seeds[starts].tolist(), np.split(seconds, starts[1:]), strict=True))

@@ -1,19 +1,32 @@
-"""Episodes of one setting on one task, in the worlds of this process."""
+"""Runs episodes in the worlds of this process: of one setting on one task, of a study's cell, or several at once; and
+gauges the machine's load.
+
+Weights, datastores and worlds are shared by all settings of a process. Frames and decoders are not: a setting that got
+its frames from another would decode with warm caches, and a skip's level may follow the episodes of its own block.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
+import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings
+from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings, settings_from
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.episode import ActionDecoder, run_episode
-from kerv_cli.lab.policy import batch_decoder_for, clock_for, decoder_for
+from kerv_cli.lab.episode import OnStep, run_episode
+from kerv_cli.lab.plan import Cell
+from kerv_cli.lab.policy import artifacts_of, batch_decoder_for, clock_for, decoder_for
 from kerv_cli.lab.together import EpisodeEnd, Request, run_together
 from kerv_cli.methods.compose import own_decoder
 from kerv_cli.worlds import spec_of
@@ -23,7 +36,7 @@ from kerv_cli.worlds.stress import NO_STRESS, Stress
 from kerv_cli.worlds.stress import build as build_stress
 from kerv_cli.worlds.world import EpisodeWorld
 
-K = TypeVar("K", bound=Hashable)
+K = TypeVar("K")
 
 
 def camera_config(settings: CameraSettings) -> CameraConfig:
@@ -82,41 +95,11 @@ class Runner:
         self.clock = clock_for(settings, task)
         camera = camera_config(settings.world.camera)
         self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
-        self.on_step: Callable[[int], None] | None = None  # told the number of executed control steps, for progress
 
-    def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
-        """Runs the episode of a seed; its record has frames where it is recorded."""
+    def episode(self, seed: int, recorded: bool = False, on_step: OnStep | None = None) -> EpisodeRecord:
+        """Runs the episode of a seed; its record has frames where it is recorded. on_step: see `run_episode`."""
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
-        decoder = self.decoder if self.on_step is None else Watched(self.decoder, self.on_step)
-        return run_episode(world, decoder, seed, self._recording if recorded else None, self.clock)
-
-
-class Watched:
-    """A decoder whose executed control steps are counted, outside the timing. on_step: told the number so far."""
-
-    def __init__(self, decoder: ActionDecoder, on_step: Callable[[int], None]) -> None:
-        self.decoder, self.on_step, self.steps = decoder, on_step, 0
-        self.decode = decoder.decode
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Those of the decoder."""
-        return self.decoder.cameras
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode."""
-        self.steps = 0
-        self.decoder.reset(task, seed, end_effector)
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Tells the decoder, then counts."""
-        self.decoder.observe(action, end_effector)
-        self.steps += 1
-        self.on_step(self.steps)
-
-    def finish(self, success: bool) -> None:
-        """Tells the decoder."""
-        self.decoder.finish(success)
+        return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock, on_step)
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
@@ -158,3 +141,102 @@ def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings
             raise end.result
         outcomes.append(end.result.success)
     return float(np.mean(outcomes))
+
+
+OnCellStep = Callable[[Cell, int, int], None]
+"""Told the cell, the seed and the number of control steps executed, after each of them."""
+
+Save = Callable[[EpisodeRecord, Path, str, Mapping[str, float]], None]
+"""Writes a recording: the record of the episode, the .rrd file, the label of the setting, and the limits that its
+signals are compared with."""
+
+
+@dataclass(frozen=True)
+class CellRunner:
+    """Prepares cells for their episodes; picklable without `on_step`.
+
+    rollouts: folder of the .rrd files, one per recorded episode, written by `save`. keep: cells of one setting and task
+    share a decoder, so that what it learns and its warm-up carry over from cell to cell. on_step: shows progress within
+    an episode.
+    """
+
+    rollouts: Path
+    save: Save
+    keep: bool = False
+    on_step: OnCellStep | None = None
+
+    def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
+        """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
+        settings = settings_from(cell.settings)
+        key = json.dumps(cell.settings, sort_keys=True), cell.task
+        runner = _runner(*key) if self.keep else Runner(settings, cell.task)
+
+        def episode(seed: int) -> EpisodeRecord:
+            on_step = functools.partial(self.on_step, cell, seed) if self.on_step is not None else None
+            record = runner.episode(seed, cell.repeat == 0 and is_recorded(settings, seed), on_step)
+            if record.frames:
+                name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
+                self.save(record, self.rollouts / name, cell.label, limits_of(settings, cell.task))
+            return dataclasses.replace(record, frames={}, places={})
+
+        return episode
+
+    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+        """Runs the episodes of cells whose settings differ in the task alone, `rollout.batch` at a time; yields each as
+        it ends: its cell, its seed, and its record or the error that its world raised."""
+        settings = settings_from(cells[0].settings)
+        requests = [Request(cell, cell.task, seed) for cell in cells for seed in cell.seeds]
+        for end in run_batch(settings, requests):
+            cell, seed = end.request.key, end.request.seed
+            if self.on_step is not None:
+                self.on_step(cell, seed, settings.world.horizon)
+            yield cell, seed, end.result
+
+
+def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:
+    """Signal of a recording -> the limit that a decision compares it with: F* of the boundary, s_min of verify-skip."""
+    limits = {}
+    if hasattr(settings.boundary, "f_star"):
+        limits["metric"] = float(settings.boundary.f_star)
+    if hasattr(settings.skip, "s_min"):
+        s_min = settings.skip.s_min
+        if s_min is None:
+            levels = artifacts_of(settings).load("calibration").skip
+            s_min = levels.tasks[task].s_min if levels is not None and task in levels.tasks else None
+        if s_min is not None:
+            limits["similarity"] = float(s_min)
+    return limits
+
+
+@functools.lru_cache(maxsize=64)
+def _runner(settings: str, task: str) -> Runner:
+    """The process's runner of these settings (JSON) on a task."""
+    return Runner(settings_from(json.loads(settings)), task)
+
+
+_TOKENS, _WIDTH, _LAYERS = 8, 512, 160  # of the reference decode: about 5 ms on one core, weights of one megabyte
+
+
+def reference_decode(device: str) -> float:
+    """Seconds of a fixed workload like a decode, a chain of products of few tokens with one matrix. It never changes,
+    so that a change of its time is one of the machine's load or clock."""
+    x, weights = _reference(device)
+    begin = time.perf_counter()
+    _chain(x, weights)
+    return time.perf_counter() - begin
+
+
+def _chain(x: Tensor, weights: Tensor) -> float:
+    for _ in range(_LAYERS):
+        x = torch.tanh(x @ weights)
+    return float(x[0, 0])  # waits for the device
+
+
+@functools.cache
+def _reference(device: str) -> tuple[Tensor, Tensor]:
+    """Operands (tokens, width) and (width, width), after a first run that allocates and chooses kernels."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(_TOKENS, _WIDTH, generator=generator).to(device)
+    weights = (torch.randn(_WIDTH, _WIDTH, generator=generator) / _WIDTH**0.5).to(device)
+    _chain(x, weights)
+    return x, weights

@@ -1,8 +1,8 @@
 """The results folder of a study. A cell is either complete or absent.
 
 results/studies/<name>/, results/rollouts/<run>/
-    run.json                      the commands that ran it; see run_file.py
-    plan.yaml                     what was asked for
+    run.json                      the commands that ran it, as they were typed
+    plan.yaml                     settings and cells, in the order in which they run
     cells/<id>/                   config.yaml, episodes.parquet, decodes.parquet, status.json
     failures/<id>.txt             traceback of the last attempt, until one succeeds
     claims/                       the cells that sweeps compute now; see claims.py
@@ -17,16 +17,17 @@ import hashlib
 import json
 import os
 import re
+import secrets
+import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import (
@@ -39,23 +40,24 @@ from kerv_cli.base.files import (
     to_yaml,
     visible,
     write_folder,
+    write_json,
 )
 from kerv_cli.base.leftovers import clean
 from kerv_cli.base.limits import check_name
+from kerv_cli.base.manifests import read
+from kerv_cli.base.provenance import git_commit
 from kerv_cli.base.settings import StudySettings
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab import rows
 from kerv_cli.lab.claims import write_lock
 from kerv_cli.lab.identity import work_of
-from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.plan_file import StudyPlan, merge_plans, plan_from_text, plan_text
+from kerv_cli.lab.plan import Cell, StudyPlan, merge_plans, plan_from_text, plan_text, unique_cells
 from kerv_cli.lab.rows import Circumstances
-from kerv_cli.lab.run_file import sweep_command
 
 _CELL_FILES = ("config.yaml", "episodes.parquet", "decodes.parquet")
 _STATUS = "status.json"
+_MOST_NAME = 32  # letters of the methods in a rollout's name
 _READ_TOGETHER = 100  # cells whose columns are converted at once: many tables of a few rows take much memory
-_DECODE_TIMES = pa.schema([rows.DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
 class DamagedCell(CheckpointError):
@@ -84,6 +86,25 @@ class StoredCell:
         return self.episodes[self.episodes["seed"].isin(cell.seeds)]
 
 
+@dataclass(frozen=True)
+class Invocation:
+    """One command that ran cells of a run. arguments: behind `kerv`. started, finished: ISO 8601, UTC; the second is
+    empty where it was interrupted or failed. git_commit: of kerv."""
+
+    arguments: tuple[str, ...]
+    started: str
+    git_commit: str
+    finished: str = ""
+
+
+@dataclass(frozen=True)
+class _RunFile:
+    """Contents of run.json, the oldest command first."""
+
+    commands: tuple[Invocation, ...]
+    format: int = 1
+
+
 FORMAT = 1
 """Of a cell's files. A cell of a higher one is of a newer kerv and is left alone."""
 
@@ -104,6 +125,7 @@ class StudyStore:
         self.cells = self.root / "cells"
         self.rollouts = self.root / "rollouts"
         self.plan_path = self.root / "plan.yaml"
+        self.run_path = self.root / "run.json"
         self.failures = self.root / "failures"
         self.damaged = self.root / "damaged"  # cells that were set aside
         self.claims = self.root / "claims"
@@ -145,8 +167,44 @@ class StudyStore:
     def how_to_run(self) -> str:
         """The command that runs this study, for messages."""
         if self.family == STUDIES:
-            return f"run `{sweep_command(self.root, self.name)}`"
+            return f"run `{self.sweep_command()}`"
         return f"run `kerv runs rerun {self.name}`"
+
+    def commands(self) -> tuple[Invocation, ...]:
+        """The commands in run.json, the oldest first; none where it is missing or damaged."""
+        with contextlib.suppress(CheckpointError):
+            return read(_RunFile, read_json(self.run_path), str(self.run_path), tolerant=True).commands
+        return ()
+
+    def note_command(self, arguments: Sequence[str]) -> None:
+        """Appends a command that begins now to run.json. Raises StorageError: the disk refused."""
+        self._write_commands(*self.commands(), Invocation(tuple(arguments), _now(), git_commit()))
+
+    def note_finished(self) -> None:
+        """Notes that the last command came to its end. Raises StorageError: the disk refused."""
+        *before, last = self.commands()
+        self._write_commands(*before, replace(last, finished=_now()))
+
+    def _write_commands(self, *commands: Invocation) -> None:
+        write_json(self.run_path, asdict(_RunFile(commands)))
+
+    def interrupted_since(self, arguments: Sequence[str]) -> str:
+        """When the command was begun that this one goes on with: the same arguments, never finished. Empty where there
+        is none."""
+        since = ""
+        for command in reversed(self.commands()):
+            if command.arguments != tuple(arguments) or command.finished:
+                break
+            since = command.started
+        return since
+
+    def sweep_command(self, *further: str) -> str:
+        """The command that runs the study, as it was typed last; without a record, by its name. further: overrides to
+        add."""
+        sweeps = (command.arguments for command in reversed(self.commands()) if command.arguments[:1] == ("sweep",))
+        words: Iterable[str] = next(sweeps, ("sweep", f"study={self.name}"))
+        words = (word for word in words if not word.startswith(("results=", "rerun=", "-")))
+        return shlex.join(["kerv", *words, *further])
 
     def has_cell(self, name: str) -> bool:
         """Whether the cell is complete; its files are compared with their hashes.
@@ -253,31 +311,9 @@ class StudyStore:
         """
         if [(r.task, r.seed) for r in records] != [(cell.task, seed) for seed in cell.seeds]:
             raise ValueError(f"records of other episodes than cell {cell.id} asks for ({cell.task}, {cell.seeds})")
-        files = self._cell_files(cell, records, status, circumstances or [Circumstances()] * len(records))
-
-        def fill(temporary: Path) -> None:
-            for file, content in files.items():
-                (temporary / file).write_bytes(content)
-
-        return write_folder(self.cells / cell.id, fill)
-
-    def _cell_files(
-        self,
-        cell: Cell,
-        records: Sequence[EpisodeRecord],
-        status: Mapping[str, Any],
-        circumstances: Sequence[Circumstances],
-    ) -> dict[str, bytes]:
+        at = circumstances or [Circumstances()] * len(records)
         config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
-        episodes = [
-            rows.episode_row(record, at, cell.repeat) for record, at in zip(records, circumstances, strict=True)
-        ]
-        decodes = [row for record in records for row in rows.decode_rows(record)]
-        files = {
-            "config.yaml": to_yaml(config).encode(),
-            "episodes.parquet": rows.parquet_bytes(episodes, rows.EPISODE_SCHEMA),
-            "decodes.parquet": rows.parquet_bytes(decodes, rows.DECODE_SCHEMA),
-        }
+        files = {"config.yaml": to_yaml(config).encode(), **rows.tables_of(records, at, cell.repeat)}
         full = {
             "format": FORMAT,
             "state": "complete",
@@ -285,13 +321,18 @@ class StudyStore:
             "successes": sum(r.success for r in records),
             "wall_seconds": sum(r.wall_seconds for r in records),
             "timed": all(r.timed for r in records),
-            "started": circumstances[0].started,
+            "started": at[0].started,
             **status,
             "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
         }
         full["sha256"] = _seal(full)
         files[_STATUS] = (json.dumps(full, indent=2, allow_nan=False) + "\n").encode()
-        return files
+
+        def fill(temporary: Path) -> None:
+            for file, content in files.items():
+                (temporary / file).write_bytes(content)
+
+        return write_folder(self.cells / cell.id, fill)
 
     def read_cell(self, name: str) -> StoredCell:
         """A complete cell.
@@ -299,21 +340,23 @@ class StudyStore:
         Raises:
             CheckpointError: it is absent or damaged, or of a newer kerv.
         """
-        return _with_frames([self._read(name)])[0]
+        return self._read([name])[0]
 
-    def _read(self, name: str) -> _ReadCell:
-        """A complete cell as it lies in its files; raises as `read_cell`."""
-        folder = self.cells / name
-        if not folder.exists():
-            raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
-        status = self.status_of(name)
-        try:
-            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
-            episodes = with_columns(_parquet(folder / "episodes.parquet"), rows.EPISODE_SCHEMA)
-            decodes = with_columns(_parquet(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
-            return _ReadCell(name, folder, config, _interned(status), episodes, _split_by_seed(decodes))
-        except (OSError, ValueError, pa.ArrowException) as error:
-            raise self._damaged(folder, error) from error
+    def _read(self, names: Sequence[str]) -> list[StoredCell]:
+        """Complete cells, whose columns are converted at once; raises as `read_cell`."""
+        described, tables = [], []
+        for folder in (self.cells / name for name in names):
+            if not folder.exists():
+                raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
+            status = self.status_of(folder.name)
+            try:
+                config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+                tables.append(rows.read_tables(folder))
+            except (OSError, ValueError, pa.ArrowException) as error:
+                raise self._damaged(folder, error) from error
+            described.append((folder, config, _interned(status)))
+        frames = rows.frames_of(tables)
+        return [StoredCell(one[0].name, *one, frame) for one, frame in zip(described, frames, strict=True)]
 
     def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
         """The complete ones of these cells by id, and those that are absent.
@@ -322,31 +365,22 @@ class StudyStore:
             CheckpointError: a cell is damaged, or is not of these settings.
             UsageError: not one is complete; the message names what to run.
         """
-        unique = list({cell.id: cell for cell in cells}.values())
+        unique = unique_cells(cells)
         on_disk = [cell for cell in unique if (self.cells / cell.id).exists()]
         if not on_disk:
             raise UsageError(f"study '{self.name}' has no complete cell: {self.how_to_run()}")
         results: dict[str, StoredCell] = {}
         for first in range(0, len(on_disk), _READ_TOGETHER):
-            part = [self._read_as(cell) for cell in on_disk[first : first + _READ_TOGETHER]]
-            results |= {result.id: result for result in _with_frames(part)}
-            del part
+            part = on_disk[first : first + _READ_TOGETHER]
+            for cell, result in zip(part, self._read([cell.id for cell in part]), strict=True):
+                if not is_result_of(result.config, cell):
+                    raise CheckpointError(
+                        f"{self.plan_path} is damaged (it says something else of cell {cell.id} than the cell): "
+                        f"{self.how_to_run()} again"
+                    )
+                results[cell.id] = result
             pa.default_memory_pool().release_unused()
         return results, [cell for cell in unique if cell.id not in results]
-
-    def _read_as(self, cell: Cell) -> _ReadCell:
-        """A complete cell that is the result of `cell`.
-
-        Raises:
-            CheckpointError: as `read_cells`.
-        """
-        read = self._read(cell.id)
-        if not is_result_of(read.config, cell):
-            raise CheckpointError(
-                f"{self.plan_path} is damaged (it says something else of cell {cell.id} than the cell): "
-                f"{self.how_to_run()} again"
-            )
-        return read
 
     def write_failure(self, name: str, text: str) -> None:
         """Stores the traceback of a cell that failed."""
@@ -357,18 +391,6 @@ class StudyStore:
         """Removes the traceback of an earlier attempt that failed."""
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
-
-
-@dataclass(frozen=True)
-class _ReadCell:
-    """A cell whose episodes are not converted yet. seconds: seed -> (decodes,) seconds."""
-
-    id: str
-    folder: Path
-    config: dict[str, Any]
-    status: dict[str, Any]
-    episodes: pa.Table
-    seconds: dict[int, np.ndarray]
 
 
 def _read_config(text: str) -> dict[str, Any]:
@@ -399,47 +421,8 @@ def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
         return False
 
 
-def _parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Those columns of a parquet file, or all of them."""
-    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
-    return pq.ParquetFile(path).read(columns=columns, use_threads=False)
-
-
-def with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """The columns of `schema` first, then those that only the table has. A column that an older table lacks is empty.
-
-    Raises:
-        ValueError: a column of another type.
-    """
-    if table.schema.equals(schema):
-        return table
-    present, names = set(table.column_names), list(schema.names)
-    for field in (field for field in schema if field.name not in present):
-        table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    further = [name for name in table.column_names if name not in set(names)]
-    table = table.select([*names, *further])
-    return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
-
-
-def _split_by_seed(decodes: pa.Table) -> dict[int, np.ndarray]:
-    """Seed -> seconds of its decodes, in order; the decodes of an episode stand together."""
-    seeds, seconds = (decodes[name].to_numpy() for name in ("seed", "seconds"))
-    starts = np.flatnonzero(np.diff(seeds, prepend=-1))
-    return dict(zip(seeds[starts].tolist(), np.split(seconds, starts[1:]), strict=True))
-
-
-def _with_frames(cells: Sequence[_ReadCell]) -> list[StoredCell]:
-    """The cells with their episodes as data frames, converted all at once."""
-    whole = pa.concat_tables([cell.episodes for cell in cells], promote_options="default").to_pandas()
-    try:
-        whole["decode_seconds"] = [cell.seconds[s] for cell in cells for s in cell.episodes["seed"].to_pylist()]
-    except KeyError as error:
-        raise CheckpointError(f"a cell in {cells[0].folder.parent} has no decodes of seed {error}") from error
-    stops = np.cumsum([cell.episodes.num_rows for cell in cells]).tolist()
-    return [
-        StoredCell(cell.id, cell.folder, cell.config, cell.status, whole.iloc[stop - cell.episodes.num_rows : stop])
-        for cell, stop in zip(cells, stops, strict=True)
-    ]
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _seal(status: Mapping[str, Any]) -> str:
@@ -472,3 +455,11 @@ def begun_studies(results: Path | str) -> list[str]:
             if any((store.cells / cell.id).exists() for cell in store.read_plan().cells):
                 names.append(store.name)
     return names
+
+
+def new_rollout(results: str | Path, cells: Sequence[Cell]) -> StudyStore:
+    """The folder of a new rollout, not yet created, by date, time and methods: `20260301-142530-ar-spec_vla`."""
+    methods = "-".join(dict.fromkeys(str(cell.settings["method"]) for cell in cells))
+    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:_MOST_NAME]}"
+    store = StudyStore(results, name, ROLLOUTS)
+    return StudyStore(results, f"{name}-{secrets.token_hex(2)}", ROLLOUTS) if store.root.exists() else store

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Generator, Hashable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -18,7 +18,7 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.lab.episode import episode
 from kerv_cli.worlds.spec import World
 
-K = TypeVar("K", bound=Hashable)
+K = TypeVar("K")
 OpenWorld = Callable[[str], World]
 """Task -> a new world."""
 
@@ -97,42 +97,20 @@ class _Slot(Generic[K]):
         self.task, self.seconds = "", 0.0
         self.world: World | None = None
         self.request: Request[K] | None = None
-        self.steps: Generator[Observation, DecodeRecord, EpisodeRecord] | None = None
 
     def begin(self, request: Request[K]) -> Iterator[EpisodeEnd[K]]:
         """Begins an episode; yields it where it ends at once."""
         self.request, self.seconds = request, 0.0
-        yield from self._timed(self._first)
+        yield from self.go_on(None)
 
-    def go_on(self, decode: DecodeRecord) -> Iterator[EpisodeEnd[K]]:
-        """Executes a decode; yields the episode where it has ended."""
-        yield from self._timed(lambda: self._steps().send(decode))
-
-    def close(self) -> None:
-        """Closes the world."""
-        if self.world is not None:
-            self.world.close()
-        self.world, self.task = None, ""
-
-    def _first(self) -> Observation:
-        assert self.request is not None
-        if self.task != self.request.task:
-            self.close()
-            self.world, self.task = self.open_world(self.request.task), self.request.task
-        assert self.world is not None
-        self.steps = episode(self.world, self.lane, self.request.seed)
-        return next(self.steps)
-
-    def _steps(self) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-        assert self.steps is not None
-        return self.steps
-
-    def _timed(self, step: Callable[[], Observation]) -> Iterator[EpisodeEnd[K]]:
-        """Runs the episode on to its next observation, or yields its end."""
+    def go_on(self, decode: DecodeRecord | None) -> Iterator[EpisodeEnd[K]]:
+        """Executes a decode, None at the beginning, up to the next observation; yields the episode where it ends."""
         began, request = time.perf_counter(), self.request
         assert request is not None
         try:
-            self.observation = step()
+            if decode is None:
+                self.steps = self._episode(request)
+            self.observation = next(self.steps) if decode is None else self.steps.send(decode)
             self.seconds += time.perf_counter() - began
             return
         except StopIteration as end:
@@ -141,5 +119,17 @@ class _Slot(Generic[K]):
         except Exception as error:  # noqa: BLE001 - one world's failure of any kind must not end the others
             result = error
             self.close()
-        self.request = self.steps = None
+        self.request = None
         yield EpisodeEnd(request, result)
+
+    def _episode(self, request: Request[K]) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
+        if self.world is None or self.task != request.task:
+            self.close()
+            self.world, self.task = self.open_world(request.task), request.task
+        return episode(self.world, self.lane, request.seed)
+
+    def close(self) -> None:
+        """Closes the world."""
+        if self.world is not None:
+            self.world.close()
+        self.world, self.task = None, ""

@@ -4,90 +4,40 @@ however many settings of a study share them."""
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Generic, TypeVar
+
+from torch import nn
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import sha256_of
+from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.places import artifact, beside, find_target
-from kerv_cli.base.registry import find, load
+from kerv_cli.base.registry import find
+from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.settings import PolicySettings
 from kerv_cli.base.spaces import ActionSpace
+from kerv_cli.engine.protocol import Target
+from kerv_cli.targets import checkpoint
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.compact.packed import load_packed
 
-if TYPE_CHECKING:
-    from kerv_cli.engine.protocol import Target
-    from kerv_cli.targets.checkpoint import TargetDescription
+TARGET = "target"
+
+
+T = TypeVar("T")
+W = TypeVar("W", bound="WeightsDescription")
 
 
 @dataclass(frozen=True)
 class Request:
-    """The target to check or load an artifact for. search: settings of a datastore's search."""
+    """The target to load an artifact for. search: settings of a datastore's search."""
 
     description: TargetDescription
+    target: Any = None  # a ReadableTarget, as kinds with weights of their own read it
     search: Any = None
-    target: Target | None = None  # loaded, where the artifact is to be loaded for it
-
-
-NOUNS = {"early": "early drafter", "score": "learned score"}
-"""Kind of artifact -> its name in messages, where that is another."""
-
-
-@dataclass(frozen=True)
-class MadeFrom:
-    """What an artifact was made from: kind -> hash of the target or artifact that it names as a source.
-
-    what: the artifact in messages. made: e.g. trained. again: the remedy.
-    """
-
-    what: str
-    made: str
-    again: str
-    hashes: Mapping[str, str]
-
-    def check_same(self, used: Mapping[str, str]) -> None:
-        """Refuses the artifact where its sources are not the policy's. used: kind -> hash of the policy's target and
-        artifacts; a source of a kind that the policy does not use does not matter.
-
-        Raises:
-            CheckpointError: the policy uses another artifact of the same kind as one of its sources.
-        """
-        for kind, digest in self.hashes.items():
-            if used.get(kind, digest) != digest:
-                raise CheckpointError(
-                    f"{self.what} was {self.made} for {NOUNS.get(kind, kind)} {digest[:12]}, not for "
-                    f"{used[kind][:12]}: {self.again}"
-                )
-
-
-def no_sources(path: Path) -> MadeFrom:
-    """`Artifact.sources` of a kind that is made from target and demonstrations alone: none."""
-    return MadeFrom("", "", "", {})
-
-
-@dataclass(frozen=True)
-class Artifact:
-    """One kind of artifact.
-
-    place: (results, name or None, the target's folder) -> its path; None names the one beside the target. check: (path,
-    request) -> its hash, or CheckpointError where it is missing, damaged or another target's. load: (path, request) ->
-    the loaded artifact. sources: path of a checked one -> the other artifacts that it was made from.
-    """
-
-    kind: str
-    place: Callable[[str, str | None, Path], Path]
-    check: Callable[[Path, Request], str]
-    load: Callable[[Path, Request], Any]
-    sources: Callable[[Path], MadeFrom] = no_sources
-
-
-def artifact_folder(kind: str) -> Callable[[str, str | None, Path], Path]:
-    """`Artifact.place` of a kind that is a folder: the named one, else the one beside the target."""
-
-    def place(results: str, name: str | None, target: Path) -> Path:
-        return artifact(results, kind, name) if name else beside(target, kind)
-
-    return place
 
 
 @dataclass(frozen=True)
@@ -98,6 +48,11 @@ class MadeFor:
     actions: ActionSpace
     chunk: int = 0
 
+    @classmethod
+    def of(cls, target: TargetDescription) -> MadeFor:
+        """The target described."""
+        return cls(target.sha256, target.actions, target.chunk)
+
     def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
         """Refuses another target. what: the artifact in messages. made: e.g. trained. again: the remedy.
 
@@ -105,9 +60,151 @@ class MadeFor:
             CheckpointError: another action space, normalisation, chunk length or other weights.
         """
         self.actions.check_same(target.actions, what, "the target", statistics=True)
-        if self.chunk != target.chunk:
+        if self.chunk and self.chunk != target.chunk:
             raise CheckpointError(f"{what} was {made} for chunks of {self.chunk} steps, not of {target.chunk}: {again}")
-        MadeFrom(what, made, again, {"target": self.sha256}).check_same({"target": target.sha256})
+        check_sources({TARGET: self.sha256}, {TARGET: target.sha256}, f"{what} was {made}", again)
+
+
+def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
+    """Refuses an artifact that was made from others than the policy's. sources, used: kind -> hash of what it was made
+    from, and of the policy's target and artifacts; a source of a kind that the policy does not use does not matter.
+    what: the beginning of the message, e.g. `the risk in FOLDER was recorded`. again: the remedy.
+
+    Raises:
+        CheckpointError: the policy uses another artifact of the same kind as one of the sources.
+    """
+    for kind, digest in sources.items():
+        if used.get(kind, digest) != digest:
+            noun = kind if kind == TARGET else kind_of(kind).noun
+            raise CheckpointError(f"{what} for {noun} {digest[:12]}, not for {used[kind][:12]}: {again}")
+
+
+class Artifact(Generic[T]):
+    """A kind of artifact: one JSON of the dataclass `schema`, with other files beside it or none, made for one target.
+    A kind says what is its own; `Weights` is the base of those that are a network.
+
+    kind: as `needs` name it. noun: its name in messages. made: e.g. trained. again: the remedy.
+    """
+
+    kind: str
+    noun: str
+    made = "trained"
+    again: str
+    schema: type[T]
+
+    def place(self, results: str, name: str | None, target: Path) -> Path:
+        """Its path; name None: the one beside the target in the folder `target`."""
+        return artifact(results, self.kind, name) if name else beside(target, self.kind)
+
+    def json(self, place: Path) -> Path:
+        """The file of its description."""
+        return place / f"{self.kind}.json"
+
+    def load(self, place: Path, request: Request) -> Any:
+        """The artifact, loaded for the target. Raises CheckpointError as `checked`, or for files that do not fit."""
+        raise NotImplementedError
+
+    def made_for(self, description: T) -> MadeFor:
+        """The target that it was made for."""
+        made_for: MadeFor = description.target  # type: ignore[attr-defined]
+        return made_for
+
+    def sources(self, description: T) -> Mapping[str, str]:
+        """Kind -> hash of the other artifacts that it was made from; none, where target and demonstrations suffice."""
+        return {}
+
+    def digest(self, place: Path, description: T) -> str:
+        """The hash that is part of the identity of results."""
+        return sha256_of(self.json(place))
+
+    def read(self, place: Path) -> T:
+        """Its description, of any target.
+
+        Raises:
+            CheckpointError: missing, damaged, of another format, or its files are not those that it names.
+        """
+        path = self.json(place)
+        if not path.is_file():
+            raise CheckpointError(f"no {self.noun} in {place}: {self.again}, or name a folder that holds one")
+        return self.described(path)
+
+    def described(self, path: Path) -> T:
+        """The description in `path`, which is there; errors as `read`."""
+        try:
+            description = read_file(self.schema, path, f"a {self.noun} of this version of kerv")
+        except CheckpointError as error:
+            raise CheckpointError(f"{error}; {self.again}") from error
+        check_files(path.parent, getattr(description, "files", {}), self.again)
+        return description
+
+    def checked(self, place: Path, target: TargetDescription) -> T:
+        """Its description, of an artifact that was made for this target.
+
+        Raises:
+            CheckpointError: as `read`, or another target, action space or chunk length.
+        """
+        description = self.read(place)
+        made_for, what = self.made_for(description), f"the {self.noun} in {place}"
+        made_for.check_same(MadeFor.of(target), what, self.made, self.again)
+        return description
+
+    def check_made_from(self, place: Path, description: T, used: Mapping[str, str]) -> None:
+        """Refuses other sources than the policy's; `used` and errors as in `check_sources`."""
+        check_sources(self.sources(description), used, f"the {self.noun} in {place} was {self.made}", self.again)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsDescription(checkpoint.Description):
+    """The JSON of an artifact with weights; a kind adds fields of its own. target: SHA-256 of the target's weights,
+    actions: its action space, chunk: its H, 0 where that does not matter."""
+
+    target: str
+    actions: ActionSpace
+    chunk: int = 0
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+class Weights(Artifact[W]):
+    """Base of kinds that are a network: safetensors and a JSON, `<kind>.json`."""
+
+    any_chunk = False  # whether the target's H does not matter
+
+    def module(self, description: W, target: Any) -> nn.Module:
+        """A fresh network of this description, for a ReadableTarget."""
+        raise NotImplementedError
+
+    def load(self, place: Path, request: Request) -> Any:
+        """The network with its weights, frozen, on the target's device in its number format."""
+        target = request.target
+        module = self.module(self.checked(place, request.description), target)
+        return load_packed(module, place, self.kind, target.device, target.dtype)
+
+    def made_for(self, description: W) -> MadeFor:
+        """The target that it was trained for."""
+        return MadeFor(description.target, description.actions, description.chunk)
+
+    def digest(self, place: Path, description: W) -> str:
+        """SHA-256 of the weights."""
+        return description.sha256
+
+    def described(self, path: Path) -> W:
+        """See `Artifact.described`; the weights beside it are checked."""
+        return checkpoint.read_description(path.parent, self.kind, self.schema)
+
+    def save(
+        self,
+        place: Path,
+        module: nn.Module,
+        made_for: MadeFor,
+        provenance: Mapping[str, Any],
+        stored: str = checkpoint.FLOAT32,
+        **own: Any,
+    ) -> str:
+        """Writes weights and description -> SHA-256 of the weights. stored: how, as in `TrainSettings`. own: the fields
+        of this kind's description."""
+        shared = {"target": made_for.sha256, "actions": made_for.actions.as_dict(), "provenance": dict(provenance)}
+        chunk = {} if self.any_chunk else {"chunk": made_for.chunk}
+        return checkpoint.save_module(place, self.kind, module, {**own, **shared, **chunk}, stored)
 
 
 class Artifacts:
@@ -125,9 +222,7 @@ class Artifacts:
     @functools.cached_property
     def description(self) -> TargetDescription:
         """The target's description; its weights are not loaded."""
-        from kerv_cli.targets.checkpoint import read_target
-
-        return read_target(self.folder)
+        return checkpoint.read_target(self.folder)
 
     @property
     def target(self) -> Target:
@@ -136,7 +231,7 @@ class Artifacts:
 
     def place(self, kind: str) -> Path:
         """Path of the artifact of this kind."""
-        return _kind(kind).place(self.results, self.policy.named(kind), self.folder)
+        return kind_of(kind).place(self.results, self.policy.named(kind), self.folder)
 
     def check(self, kinds: Iterable[str]) -> dict[str, str]:
         """Kind -> hash, of the target and of `kinds`.
@@ -145,11 +240,12 @@ class Artifacts:
             CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
                 one among `kinds`.
         """
-        request, kinds = Request(self.description, self.search), tuple(kinds)
-        hashes = {"target": self.description.sha256}
-        hashes |= {kind: _kind(kind).check(self.place(kind), request) for kind in kinds}
-        for kind in kinds:
-            _kind(kind).sources(self.place(kind)).check_same(hashes)
+        there = {kind: (kind_of(kind), self.place(kind)) for kind in kinds}
+        described = {kind: own.checked(place, self.description) for kind, (own, place) in there.items()}
+        hashes = {TARGET: self.description.sha256}
+        hashes |= {kind: own.digest(place, described[kind]) for kind, (own, place) in there.items()}
+        for kind, (own, place) in there.items():
+            own.check_made_from(place, described[kind], hashes)
         return hashes
 
     def load(self, kind: str) -> Any:
@@ -175,23 +271,20 @@ class _Owner:
         return hash((self.folder, self.device, self.dtype, repr(self.search)))
 
 
-def _kind(name: str) -> Artifact:
-    artifact_kind: Artifact = load(find("artifact", name).build)
-    return artifact_kind
+def kind_of(name: str) -> Artifact[Any]:
+    """The kind of artifact of this name. Raises UnknownName: there is none."""
+    kind: Artifact[Any] = find("artifact", name).built()
+    return kind
 
 
 @functools.lru_cache(maxsize=16)
 def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
-    from kerv_cli.base.runtime import DTYPES
-    from kerv_cli.targets.checkpoint import load_target
-
-    return load_target(folder, device, DTYPES[dtype])[0]
+    target: Target = checkpoint.load_target(folder, device, DTYPES[dtype])[0]
+    return target
 
 
 @functools.lru_cache(maxsize=64)
 def _artifact(kind: str, path: Path, digest: str, owner: _Owner) -> Any:
-    from kerv_cli.targets.checkpoint import read_target
-
-    description = read_target(owner.folder)
+    description = checkpoint.read_target(owner.folder)
     target = _target(owner.folder, description.sha256, owner.device, owner.dtype)
-    return _kind(kind).load(path, Request(description, owner.search, target))
+    return kind_of(kind).load(path, Request(description, target, owner.search))

@@ -10,15 +10,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import sha256_of, write_json
-from kerv_cli.base.manifests import read_file
-from kerv_cli.base.places import artifact, beside
-from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request
+from kerv_cli.base.files import write_json
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, check_sources
 from kerv_cli.methods.heisd.boundary import LEAST, BoundaryRanges
 from kerv_cli.methods.kinematics.prediction import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
-from kerv_cli.targets.checkpoint import TargetDescription
 
-FORMAT = 2
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
 AGAIN = "run 'kerv calibrate' again"
@@ -154,8 +150,8 @@ class Calibration:
         """
         if self.skip is None:
             raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
-        section = MadeFrom("the calibration's skip section", "fitted", AGAIN, {"datastore": self.skip.datastore})
-        section.check_same({"datastore": datastore})
+        what = "the calibration's skip section was fitted"
+        check_sources({"datastore": self.skip.datastore}, {"datastore": datastore}, what, AGAIN)
         if task not in self.skip.tasks:
             raise CheckpointError(
                 f"the calibration has no skip level for {task}, only for {', '.join(self.skip.tasks)}: {AGAIN}"
@@ -172,52 +168,31 @@ class Calibration:
         return build_predictor(kind, self.target.actions.is_strict, self.noise, minimum, self.window, horizon)
 
 
-def calibration_place(results: str, name: str | None, target: Path) -> Path:
-    """Path of the named calibration, else of the target's: pretrained/<name>/calibration.json where it is shipped,
-    artifacts/calibration/<name>/calibration.json where it was made here."""
-    if name is not None:
-        return artifact(results, "calibration", name) / FILE
-    if target.name == "target":
-        return target.parent / FILE
-    return (beside(target, "calibration") if target.parent.name == "target" else target) / FILE
+class CalibrationArtifact(Artifact[Calibration]):
+    """The calibration's file, which is its place."""
+
+    kind = noun = "calibration"
+    made, again = "made", "run 'kerv calibrate'"
+    schema = Calibration
+
+    def place(self, results: str, name: str | None, target: Path) -> Path:
+        """Path of the named calibration, else of the target's: pretrained/<name>/calibration.json where it is shipped,
+        artifacts/calibration/<name>/calibration.json where it was made here."""
+        if name is None and target.name == "target":
+            return target.parent / FILE
+        if name is None and target.parent.name != "target":
+            return target / FILE
+        return super().place(results, name, target) / FILE
+
+    def json(self, place: Path) -> Path:
+        """`place` itself."""
+        return place
+
+    def load(self, place: Path, request: Request) -> Calibration:
+        """The calibration."""
+        return self.checked(place, request.description)
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
     """Writes `calibration` atomically."""
     write_json(path, asdict(calibration))
-
-
-def read_calibration(path: Path) -> Calibration:
-    """The calibration at `path`, of any target.
-
-    Raises:
-        CheckpointError: missing, damaged or of another format.
-    """
-    if not path.is_file():
-        raise CheckpointError(f"no calibration at {path}: run 'kerv calibrate'")
-    try:
-        return read_file(Calibration, path, f"a calibration of format {FORMAT}")
-    except CheckpointError as error:
-        raise CheckpointError(f"{error}; {AGAIN}") from error
-
-
-def load_calibration(path: Path, description: TargetDescription) -> Calibration:
-    """The calibration at `path`, which must have been made for this target.
-
-    Raises:
-        CheckpointError: missing, damaged, of another format, target, action space or chunk length.
-    """
-    loaded = read_calibration(path)
-    present = MadeFor(description.sha256, description.actions, description.chunk)
-    loaded.target.check_same(present, str(path), "made", "run 'kerv calibrate'")
-    return loaded
-
-
-def _check(path: Path, request: Request) -> str:
-    load_calibration(path, request.description)
-    return sha256_of(path)
-
-
-ARTIFACT = Artifact(
-    "calibration", calibration_place, _check, lambda path, request: load_calibration(path, request.description)
-)

@@ -17,7 +17,8 @@ from kerv_cli.report.tables import is_number, rows_of, values_of
 CLOSE = 0.03
 """Two runs agree on a ratio where it differs by at most this share."""
 
-_MEASURES = ("successes", "pairs", "speedup", "speedup_low", "speedup_high", "time_per_step_ms", "gauge_ms")
+_MEASURES = ("successes", "pairs", "episode_speedup", "episode_speedup_low", "episode_speedup_high",
+             "speedup", "speedup_low", "speedup_high", "time_per_step_ms", "gauge_ms")  # fmt: skip
 _ORIGIN = ("device_name", "run", "git_commit")
 
 

@@ -140,6 +140,7 @@ def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str
     a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO, apart=True)
     rows = [
         _row("success", a["success"], b["success"], b, "difference", "difference"),
+        _row("speed per episode", 1.0, b["episode_speedup"], b, "episode_speedup", "ratio of times per episode"),
         _row("speedup", 1.0, b["speedup"], b, "speedup", "ratio of times per step"),
     ]
     rows += [

@@ -57,7 +57,7 @@ def verdict_of(label: str, counts: stats.PairedCounts, margin: float, look: int,
     """Judges a setting. margin: the bound on the loss, a share of episodes."""
     difference = stats.paired_difference(counts, confidence_of_a_look(looks))
     answer = SMALLER if difference.low > -margin else LARGER if difference.high < -margin else OPEN
-    return Verdict(label, answer, sum(counts), look, difference.value, difference.low, difference.high)
+    return Verdict(label, answer, int(sum(counts)), look, difference.value, difference.low, difference.high)
 
 
 def verdicts(data: StudyData, labels: Sequence[str], margin: float, look: int, looks: int) -> list[Verdict]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -57,6 +58,15 @@ def entitle(figure: Figure, title: str, about: str) -> None:
         engine.set(rect=(0.0, 0.0, 1.0, 1.0 - 0.72 / height), w_pad=0.12, h_pad=0.06)
     figure.text(0.012, 1.0 - 0.24 * inch, title, fontsize=13, fontweight="bold", va="center")
     figure.text(0.012, 1.0 - 0.54 * inch, about, fontsize=9, color=MUTED, va="center")
+
+
+def shared_legend(figure: Figure, panels: Iterable[Axes], columns: int) -> None:
+    """One legend below the panels, each label once."""
+    entries = [pair for panel in panels for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in entries}
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=max(1, min(columns, len(handles)))
+    )
 
 
 def colour(number: int) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from kerv_cli.base.registry import Part, parts
 from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
@@ -30,7 +31,6 @@ _RATIOS = {
     "compensation_rate": ("compensated_decodes", "decodes"),
     "retrieval_share": ("retrieval_decodes", "decodes"),
     "deviation": ("deviation_sum", "deviation_count"),
-    "realised_risk": ("audit_loss", "audits"),
     "audits_to_alarm": ("alarm_audits", "alarmed"),
     "felt_latency": ("delay_seconds", "delay_decodes"),
     "felt_latency_steps": ("delay_steps", "delay_decodes"),
@@ -43,13 +43,14 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
 
     success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
-    (methods also change the length of episodes); both have bootstrap intervals and are NaN without pairs, where no
-    target decodes and where an episode of either side was not timed. They count only the pairs that were measured in
-    turn in one block; with apart=True all pairs. mcnemar_p is NaN without pairs. same_run: all pairs were measured in
-    one run. same_block: share of the pairs that were measured in one block.
+    (methods also change the length of episodes); they are NaN without pairs, where no target decodes and where an
+    episode of either side was not timed. They count only the pairs that were measured in turn in one block; with
+    apart=True all pairs. mcnemar_p is NaN without pairs. same_run: all pairs were measured in one run. same_block:
+    share of the pairs that were measured in one block.
 
-    MACRO takes each measure within every difficulty group and then the unweighted mean of the groups; the speedup is
-    the ratio of the two macro means. Paired counts and p are those of all pairs in either case.
+    MACRO takes each measure within every difficulty group and then the unweighted mean of the groups, intervals
+    included; the speedup is the ratio of the two macro means. Paired counts, p and pairs_to_settle are those of all
+    pairs in either case.
 
     Args:
         episodes: the setting's, columns of rows.EPISODE_SCHEMA, decode_seconds, difficulty, run and those of `_SAME`.
@@ -58,20 +59,21 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     pairs = paired(episodes, baseline)
     macro = averaging == MACRO
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
-    counts = stats.paired_counts(worlds["success_baseline"].to_numpy(), worlds["success_method"].to_numpy())
     once = episodes[episodes["repeat"] == 0]
     timed = pairs if apart else pairs[pairs["in_turn"]]
     has_times = _decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
-        **_columns("success", _success(once, macro)),
+        **_columns("success", _averaged(once, macro, _success)),
         **_columns("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
         **_columns("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
-        **dict(zip(("AL_low", "AL_high"), _acceptance_interval(episodes, macro), strict=True)),
-        **dict(zip(("realised_risk_low", "realised_risk_high"), _risk_interval(episodes), strict=True)),
-        **paired_columns(counts),
-        "pairs_to_settle": stats.pairs_to_settle(counts, MARGIN),
+        **_columns("AL", _averaged(episodes, macro, _acceptance_length)),
+        **_columns("realised_risk", _averaged(episodes, macro, _realised_risk)),
+        **paired_columns(
+            _counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(_counts(part)))
+        ),
+        "pairs_to_settle": stats.pairs_to_settle(_counts(worlds), MARGIN),
         "same_run": bool(len(pairs) and pairs["same_run"].all()),
         "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
         "steps": int(episodes["steps"].sum()),
@@ -80,32 +82,49 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     }
 
 
-def _acceptance_interval(episodes: pd.DataFrame, macro: bool) -> stats.Interval:
-    """95 % interval of AL; for the macro average from the errors of the groups, which are independent."""
-    groups = [group for _, group in episodes.groupby("difficulty", sort=True)] if macro else [episodes]
-    groups = [group for group in groups if group["verifications"].sum()]
-    if not groups:
-        return stats.Interval(math.nan, math.nan)
-    lengths = [stats.ratio(group["committed"].to_numpy(), group["verifications"].to_numpy()) for group in groups]
-    mean = sum(length.value for length in lengths) / len(lengths)
-    reach = math.sqrt(sum((length.high - length.value) ** 2 for length in lengths)) / len(lengths)
-    return stats.Interval(mean - reach, mean + reach)
+def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame], Estimate]) -> Estimate:
+    """An estimate of the whole frame, or the mean of the difficulty groups that have one, with its interval."""
+    if not macro:
+        return estimate(frame)
+    estimates = [estimate(group) for _, group in frame.groupby("difficulty", sort=True)]
+    return stats.mean_of([one for one in estimates if not math.isnan(one.value)])
 
 
-def _risk_interval(episodes: pd.DataFrame) -> stats.Interval:
-    """95 % interval of the realised risk, pooled over all audits; 0 to 1 where a single episode holds them all."""
-    if not episodes["audits"].sum():
-        return stats.Interval(math.nan, math.nan)
-    risk = stats.ratio(episodes["audit_loss"].to_numpy(), episodes["audits"].to_numpy())
-    if math.isnan(risk.low):
-        return stats.Interval(0.0, 1.0)
-    return stats.Interval(max(0.0, risk.low), min(1.0, risk.high))
+def _success(episodes: pd.DataFrame) -> Estimate:
+    successes, count = int(episodes["success"].sum()), len(episodes)
+    return Estimate(successes / count, *stats.wilson(successes, count))
 
 
-def paired_columns(counts: stats.PairedCounts) -> dict[str, Any]:
+def _acceptance_length(episodes: pd.DataFrame) -> Estimate:
+    return _per_world(episodes, stats.ratio, episodes["committed"], episodes["verifications"])
+
+
+def _realised_risk(episodes: pd.DataFrame) -> Estimate:
+    """Mean over episodes of the mean loss of their trusted decodes: what a certificate promises. An episode's audits
+    are a fair sample of its trusted decodes, and more where these are more: each counts 1 ÷ that number, so that
+    episodes count alike. The decode-weighted mean, audit_loss ÷ audits, favours long episodes."""
+    trusted = (episodes["skipped_decodes"] + episodes["audits"]).clip(lower=1)
+    return _per_world(episodes, stats.share, episodes["audit_loss"] / trusted, episodes["audits"] / trusted)
+
+
+def _per_world(
+    episodes: pd.DataFrame, estimate: Callable[..., Estimate], above: pd.Series, below: pd.Series
+) -> Estimate:
+    """A quotient of sums over episodes, whose interval goes by task and seed; NaN where the sum below is 0."""
+    if not below.sum():
+        return stats.NO_ESTIMATE
+    return estimate(above.to_numpy(), below.to_numpy(), list(episodes["task"]), list(episodes["seed"]))
+
+
+def _counts(pairs: pd.DataFrame) -> stats.PairedCounts:
+    return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
+
+
+def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = None) -> dict[str, Any]:
     """Columns on the success of paired episodes: their number and counts, McNemar's p (NaN without pairs), the
-    difference with its interval, and whether the interval lies above minus the margin."""
-    difference = stats.paired_difference(counts)
+    difference with its interval, by default that of the counts, and whether the interval lies above minus the
+    margin."""
+    difference = difference or stats.paired_difference(counts)
     return {
         "pairs": sum(counts),
         **counts._asdict(),
@@ -155,6 +174,7 @@ def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
 
 def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
     blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
+    blocks = blocks.groupby([pairs["task"], pairs["seed"]]).transform("first")  # repeats of a world belong together
     return stats.speedup(
         pairs[f"{time}_baseline"].to_numpy(),
         pairs[f"{time}_method"].to_numpy(),
@@ -177,7 +197,12 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
     sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
     values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
-    return values
+    return values | {name: float(part.built(episodes)) for name, part in own_columns().items()}
+
+
+def own_columns() -> Mapping[str, Part]:
+    """Columns that are not kerv's, by name: registered functions of a setting's episodes."""
+    return parts("column")
 
 
 def _latencies(decode_seconds: pd.Series) -> dict[str, float]:
@@ -191,11 +216,3 @@ def _by_group(episodes: pd.DataFrame, measure_of: Callable[[pd.DataFrame], dict[
     """Unweighted means over difficulty groups; groups without a value of a measure are left out of its mean."""
     groups = pd.DataFrame([measure_of(group) for _, group in episodes.groupby("difficulty", sort=True)])
     return {str(name): float(value) for name, value in groups.mean().items()}
-
-
-def _success(episodes: pd.DataFrame, macro: bool) -> Estimate:
-    grouped = [group["success"] for _, group in episodes.groupby("difficulty", sort=True)] if macro else []
-    parts: Sequence[pd.Series] = grouped or [episodes["success"]]
-    counted = [(int(part.sum()), len(part)) for part in parts]
-    rate = sum(successes / episodes_ for successes, episodes_ in counted) / len(counted)
-    return Estimate(rate, *(stats.macro_wilson(counted) if macro else stats.wilson(*counted[0])))

@@ -18,7 +18,9 @@ from kerv_cli.report import stressed
 from kerv_cli.report.choose import choices, sentence
 from kerv_cli.report.decided import read_verdicts
 from kerv_cli.report.measures import MACRO, MICRO
-from kerv_cli.report.summary import summary_frame
+from kerv_cli.report.motion import differences
+from kerv_cli.report.reprice import machine_columns
+from kerv_cli.report.summary import SPEEDS, motion_frame, summary_frame
 from kerv_cli.report.tables import StudyData, is_number, rows_of
 
 LOSS = 3.0
@@ -51,6 +53,7 @@ def render(
     figures: Sequence[str],
     sections: Sequence[Section],
     files: Sequence[Path],
+    priced: pd.DataFrame | None = None,
 ) -> str:
     """The page.
 
@@ -58,6 +61,7 @@ def render(
         whole, per_task: the study's `study_table` and `per_task_table`.
         figures: HTML elements.
         files: the study's tables and plots; the page links the tables.
+        priced: `repriced_table` of the machines that the report was asked for.
     """
     template = Environment(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
@@ -74,14 +78,16 @@ def render(
         absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
         planned=len({cell.id for cell in data.plan.cells}),
         how_to_run=_how_to_run(store),
-        suite=_suite(whole),
+        suite=_suite(whole, priced),
+        motion=motion_frame(whole),
+        reasons=differences(rows_of(whole, MICRO)),
         stopped=[] if stopped is None else rows_of(stopped),
         figures=figures,
         sections=sections,
         tasks=_by_task(per_task),
-        recordings=_recordings(store),
+        recordings=[Link(path.stem, _href(path, store.root)) for path in sorted(store.rollouts.glob("*.rrd"))],
         files=[Link(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
-        commands=_commands(data),
+        commands=[(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()],
     )
 
 
@@ -93,8 +99,8 @@ def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str
         rows = rows_of(whole, MICRO)
         rates = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
         return f"Success: {rates}."
-    choice = choices(whole, per_task.iloc[:0], data.plan.axis, LOSS)[0]
-    text = sentence(choice, data.plan.axis, LOSS, data.plan.baseline)
+    choice = choices(whole, per_task.iloc[:0], LOSS)[0]
+    text = sentence(choice, LOSS, data.plan.baseline)
     return text[:1].upper() + text[1:] + "."
 
 
@@ -133,16 +139,18 @@ def _about(whole: pd.DataFrame) -> str:
     )
 
 
-def _suite(whole: pd.DataFrame) -> pd.DataFrame:
-    """The table of all settings, pooled over tasks, with the two numbers that the average over difficulty changes."""
+def _suite(whole: pd.DataFrame, priced: pd.DataFrame | None) -> pd.DataFrame:
+    """The table of all settings, pooled over tasks, with speed per episode on other machines, and the numbers that the
+    average over difficulty changes."""
     frame = summary_frame(whole, MICRO)
-    macro = {row["label"]: row for row in rows_of(whole, MACRO)}
-    if not macro or whole["difficulty"].astype(str).str.count(";").max() == 0:
+    for number, (name, texts) in enumerate({} if priced is None else machine_columns(priced).items()):
+        at = list(frame.columns).index("per step") + 1 + number
+        frame.insert(at, name, [texts.get(label, "–") for label in frame["setting"]])
+    if MACRO not in set(whole["averaging"]) or whole["difficulty"].astype(str).str.count(";").max() == 0:
         return frame
-    success = [f"{100 * macro[label]['success']:.1f}" for label in frame["setting"]]
-    speed = [_number(macro[label]["speedup"]) for label in frame["setting"]]
-    frame.insert(len(frame.columns), "success %, by difficulty", success)
-    frame.insert(len(frame.columns), "speedup, by difficulty", speed)
+    macro = summary_frame(whole, MACRO)
+    for name in ("success %", *SPEEDS.values()):
+        frame[f"{name}, by difficulty"] = macro[name]
     return frame
 
 
@@ -153,44 +161,24 @@ def _how_to_run(store: StudyStore) -> str:
     return f"Run `kerv sweep study={store.name}{where}`"
 
 
-def _number(value: float) -> str:
-    return f"{value:.2f}" if is_number(value) else "–"
-
-
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
-    """A row per task, a column per setting: successes and the speedup. A study of stress has many settings: they are
-    the rows there, and the tasks the columns."""
-    labels = list(dict.fromkeys(per_task["label"]))
+    """A row per task, a column per setting: successes and speeds, per episode and per step. A study of stress has
+    many settings: they are the rows there, and the tasks the columns."""
+    texts = {(row["label"], row["task"]): _cell(row) for row in rows_of(per_task)}
+    labels, tasks = list(dict.fromkeys(per_task["label"])), sorted(set(per_task["task"]))
     if stressed.is_stressed(per_task):
-        cells = {(row["label"], row["task"]): row for row in rows_of(per_task)}
-        tasks = sorted(set(per_task["task"]))
         return pd.DataFrame(
-            {"setting": label, **{task: _cell(cells.get((label, task))) for task in tasks}} for label in labels
+            {"setting": label, **{task: texts.get((label, task), "–") for task in tasks}} for label in labels
         )
-    rows = []
-    for task in sorted(set(per_task["task"])):
-        settings = {row["label"]: row for row in rows_of(per_task[per_task["task"] == task])}
-        rows.append({"task": task, **{label: _cell(settings.get(label)) for label in labels}})
-    return pd.DataFrame(rows)
+    return pd.DataFrame({"task": task, **{label: texts.get((label, task), "–") for label in labels}} for task in tasks)
 
 
-def _cell(row: Mapping[str, Any] | None) -> str:
-    if row is None:
-        return "–"
+def _cell(row: Mapping[str, Any]) -> str:
     share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
     if row["label"] == row["baseline"] or not is_number(row["speedup"]):
         return share
-    return f"{share} · {row['speedup']:.2f}×"
-
-
-def _recordings(store: StudyStore) -> list[Link]:
-    return [Link(path.stem, _href(path, store.root)) for path in sorted(store.rollouts.glob("*.rrd"))]
+    return f"{share} · {row['episode_speedup']:.2f}×, {row['speedup']:.2f}×"
 
 
 def _href(path: Path, page: Path) -> str:
     return quote(Path(os.path.relpath(path, page)).as_posix())
-
-
-def _commands(data: StudyData) -> list[tuple[str, str]]:
-    """(setting, the overrides that make it)."""
-    return [(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()]

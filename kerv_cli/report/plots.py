@@ -14,15 +14,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.engine.record import PHASES
-from kerv_cli.report.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours
+from kerv_cli.report.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours, shared_legend
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.scatter import success_floor, tradeoff_figure
+from kerv_cli.report.scatter import limit_success, tradeoff_figure
 from kerv_cli.report.stressed import is_stressed, stress_figure
+from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import is_number, rows_of
 
 _PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
 _PANELS = (
-    ("speedup", "Speedup", "time per step, baseline ÷ setting", 1.0),
+    ("episode_speedup", "Speed per episode", "time per episode, baseline ÷ setting", 1.0),
+    ("speedup", "Speed per control step", "time per step, baseline ÷ setting", 1.0),
     ("success", "Success", "episodes, % and 95 % interval", 100.0),
     ("AL", "Acceptance length", "tokens committed per verification", 1.0),
 )
@@ -38,14 +40,15 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
 
     Args:
         table: `study_table`.
-        axis: column for the x axis, e.g. `threshold.r`; empty, or without two numbers in it: one row per setting.
+        axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: one row per
+            setting.
         title: the study's.
         averaging: the rows that are drawn; named in the figure.
     """
     rows = table[table["averaging"] == averaging].reset_index(drop=True)
     if is_stressed(rows):
         return {"": stress_figure(rows, title, about(rows, averaging), averaging)}
-    numbers = axis_numbers(rows[~_is_baseline(rows)], axis).nunique() > 1
+    numbers = any(len(group) > 1 for group in series_of(rows, axis).values())
     with mpl.rc_context(STYLE):
         figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
         if rows["time_per_step_ms"].notna().any():
@@ -114,9 +117,9 @@ def _stem(label: str, axis: str) -> str:
 def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
     series = series_of(rows, axis)
     names = [*(name for name, group in series.items() if len(group) > 1), str(rows["baseline"].iloc[0])]
-    columns = max(1, min(6, int(12.0 / (0.7 + 0.08 * max(map(len, names))))))
+    columns = max(1, min(6, int(15.0 / (0.7 + 0.08 * max(map(len, names))))))
     longest = max((len(name) for name, group in series.items() if len(group) == 1), default=0)
-    figure = new_figure(12.0, 4.4 + 0.21 * math.ceil(len(names) / columns) + min(1.6, 0.075 * longest))
+    figure = new_figure(15.0, 4.4 + 0.21 * math.ceil(len(names) / columns) + min(1.6, 0.075 * longest))
     axes = figure.subplots(1, len(_PANELS))
     ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
     beside = _positions_beside(ticks, [label for label, group in series.items() if len(group) == 1])
@@ -131,10 +134,11 @@ def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
         _draw_baseline(panel, rows, measure, scale)
         panel.set(title=name, ylabel=unit, xlabel=axis)
         _name_ticks(panel, ticks, beside)
-        _limit(panel, measure, rows)
-    entries = [pair for panel in axes for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in entries}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+        if measure == "success":
+            limit_success(panel, rows)
+        else:
+            panel.margins(y=0.12)
+    shared_legend(figure, axes, columns)
     return figure
 
 
@@ -177,36 +181,30 @@ def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) 
     if not len(reference):
         return
     row = reference.iloc[0]
-    value = 1.0 / scale if measure in ("speedup", "AL") else row[measure]  # AR commits one token per forward
+    value = 1.0 / scale if measure in (*SPEEDS, "AL") else row[measure]  # AR commits one token per forward
     panel.axhline(value * scale, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
     if measure == "success":
         panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=INK, alpha=0.06, linewidth=0)
 
 
-def _limit(panel: Axes, measure: str, rows: pd.DataFrame) -> None:
-    """Axis limits: success from where it matters to 102 %, ratios by their values with a margin."""
-    if measure == "success":
-        panel.set_ylim(success_floor(rows), 102)
-    else:
-        panel.margins(y=0.12)
-
-
 def _by_setting(rows: pd.DataFrame) -> Figure:
-    figure = new_figure(12.0, 2.0 + 0.38 * len(rows))
+    figure = new_figure(15.0, 2.0 + 0.38 * len(rows))
     axes = figure.subplots(1, len(_PANELS), sharey=True)
     for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
         for number, row in enumerate(rows_of(rows)):
             _draw_dot(panel, number, row, measure, scale)
         reference = rows[_is_baseline(rows)]
         if len(reference) and measure != "AL":
-            level = 1.0 if measure == "speedup" else reference.iloc[0][measure] * scale
+            level = 1.0 if measure in SPEEDS else reference.iloc[0][measure] * scale
             panel.axvline(level, color=INK, linewidth=1.2, linestyle=":")
         panel.set(title=name, xlabel=unit)
         panel.grid(axis="y", visible=False)
         if measure == "speedup":
             _draw_ceilings(panel, rows)
-        low, high = (success_floor(rows), 102) if measure == "success" else (0, 1.08 * panel.get_xlim()[1])
-        panel.set_xlim(low, high)
+        if measure == "success":
+            limit_success(panel, rows, "x")
+        else:
+            panel.set_xlim(0, 1.08 * panel.get_xlim()[1])
         _separate(panel, rows)
     _name_rows(axes[0], _grouped_names(rows))
     return figure

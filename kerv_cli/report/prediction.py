@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import find_target
-from kerv_cli.methods.calibration import Calibration, Errors, calibration_place, read_calibration
+from kerv_cli.methods.calibration import Calibration, CalibrationArtifact, Errors
 from kerv_cli.methods.kinematics.prediction import PREDICTORS
 from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
 
@@ -48,12 +48,12 @@ def read_predictions(results: Path, target: str) -> Predictions | None:
         CheckpointError: the calibration is damaged or of another format.
     """
     try:
-        path = calibration_place(str(results), None, find_target(str(results), target))
+        path = CalibrationArtifact().place(str(results), None, find_target(str(results), target))
     except UsageError:  # no such target
         return None
     if not path.is_file():
         return None
-    calibration = read_calibration(path)
+    calibration = CalibrationArtifact().read(path)
     return Predictions(target, calibration, sha256_of(path)) if calibration.errors else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,28 +20,37 @@ from kerv_cli.report.measures import MICRO
 from kerv_cli.report.page import Section, render
 from kerv_cli.report.plots import about, study_figures
 from kerv_cli.report.publish import check_publishable
+from kerv_cli.report.reprice import ASSUMES, Machine, open_machines, repriced_summary, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
 from kerv_cli.report.tables import StudyData, load_study, per_task_table, study_table, write_csv
 from kerv_cli.report.task_map import has_task_map, task_map
 
 
-@dataclass(frozen=True)
+@dataclass
 class Report:
     """Files and tables of a report. files: in the order of writing. tables: study -> its `study_table`. agreement: the
-    `agreement_table` with another run of the study."""
+    `agreement_table` with another run of the study. priced: the `repriced_table` of the machines asked for."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
     agreement: pd.DataFrame | None = None
+    priced: pd.DataFrame | None = None
 
 
-def report(results: Path | str, study: str | None = None, publish: bool = False, against: str | None = None) -> Report:
+def report(
+    results: Path | str,
+    study: str | None = None,
+    publish: bool = False,
+    against: str | None = None,
+    on: Sequence[str] = (),
+) -> Report:
     """Writes a study's files, or those of every study that has a complete cell and of every calibration.
 
     In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
     plots/<study>*.png and, where small, .svg. Always studies/<study>/report.html. Tables and plots of
     prediction_<target> are added for a study whose methods predict actions; with `against`, the results folder of
-    another run of the study, tables/<study>_agreement.csv. The same cells give the same bytes.
+    another run of the study, tables/<study>_agreement.csv; with `on`, names of profiles, tables/<study>_on.csv. The
+    same cells give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
@@ -48,7 +58,7 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
         CheckpointError: a cell is damaged.
         StorageError: the disk refused.
     """
-    reporter = _Reporter(Path(results), publish)
+    reporter = _Reporter(Path(results), publish, open_machines(results, on))
     if study:
         reporter.report_study(study)
         if against is None:
@@ -56,6 +66,8 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
         return replace(reporter.report, agreement=reporter.agreement(study, Path(against)))
     if against is not None:
         raise UsageError(f"against={against}: name the study of which it holds another run, study=NAME")
+    if on:
+        raise UsageError(f"on={','.join(on)}: name the study whose decodes are to be priced, study=NAME")
     names = begun_studies(results)
     calibrated = prediction.calibrated_targets(Path(results))
     if not names and not calibrated:
@@ -70,8 +82,8 @@ def report(results: Path | str, study: str | None = None, publish: bool = False,
 class _Reporter:
     """Writes the files of studies; sections that several of them share are computed and written once."""
 
-    def __init__(self, results: Path, publish: bool) -> None:
-        self.results, self.publish = results, publish
+    def __init__(self, results: Path, publish: bool, machines: Sequence[Machine] = ()) -> None:
+        self.results, self.publish, self.machines = results, publish, machines
         self.folder = results if publish else results / "report"
         self.report = Report([], {})
         self._sections: dict[str, Section | None] = {}
@@ -80,6 +92,7 @@ class _Reporter:
         """The files of one study; errors as `report`."""
         store = StudyStore(self.results, name)
         data = load_study(store)
+        priced = repriced_table(data, self.machines) if self.machines else None
         whole, per_task = study_table(data), per_task_table(data)
         if self.publish:
             check_publishable(data, whole)
@@ -93,13 +106,13 @@ class _Reporter:
             figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, "successes of each task"))
         plots = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
         settings = [cell.settings for cell in data.plan.cells]
-        sections = [self.latency_section(data), self.stress_section(whole, name)]
+        sections = [self.machines_section(priced), self.latency_section(data), self.stress_section(whole, name)]
         sections += [self.prediction_section(target) for target in prediction.predicting_targets(settings)]
         page = store.root / "report.html"
         files = self.report.files[before:]
         with atomic_path(page) as temporary:
             present = [section for section in sections if section is not None]
-            temporary.write_text(render(store, data, whole, per_task, plots, present, files), encoding="utf-8")
+            temporary.write_text(render(store, data, whole, per_task, plots, present, files, priced), encoding="utf-8")
         self.report.files.append(page)
 
     def agreement(self, name: str, against: Path) -> pd.DataFrame:
@@ -129,6 +142,15 @@ class _Reporter:
             figure=self._save_plot(prediction.prediction_figure(title, table), predictions.name),
             table=prediction.prediction_summary(table),
         )
+
+    def machines_section(self, priced: pd.DataFrame | None) -> Section | None:
+        """Writes the study's decodes at other machines' costs; None where none was asked for."""
+        if priced is None:
+            return None
+        name = f"{priced['study'].iloc[0]}_on"
+        self._save_table(priced, name)
+        self.report.priced = priced
+        return Section("On other machines", f"{ASSUMES}: tables/{name}.csv.", "", repriced_summary(priced))
 
     def latency_section(self, data: StudyData) -> Section | None:
         """Writes success at the latencies of a study whose world goes on; None where it waits."""

@@ -1,4 +1,4 @@
-"""Figure of success against speedup: every setting is a labelled point."""
+"""Figure of success against speed per episode: every setting is a labelled point."""
 
 from __future__ import annotations
 
@@ -26,28 +26,26 @@ _POINT = 72.0  # per inch
 
 
 def tradeoff_figure(rows: pd.DataFrame, title: str, about: str) -> Figure:
-    """Speedup on x, success on y, bars for the 95 % intervals. A setting without a speedup, such as the scripted
-    expert, is a dashed level of success."""
+    """Speed per episode on x, success on y, bars for the 95 % intervals. A setting without a speed, such as the
+    scripted expert, is a dashed level of success."""
     figure = new_figure(11.0, 6.4)
     panel = figure.subplots()
     drawn = rows_of(rows)
-    points = [row for row in drawn if is_number(row["speedup"])]
+    points = [row for row in drawn if is_number(row["episode_speedup"])]
     shades = setting_colours(points)
     for row, shade in zip(points, shades, strict=True):
         _draw_point(panel, row, shade)
     for row in drawn:
-        if not is_number(row["speedup"]):
+        if not is_number(row["episode_speedup"]):
             _draw_level(panel, row)
     panel.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
-    panel.set(xlabel="speedup: time per step, baseline ÷ setting", ylabel="success, % of episodes")
+    panel.set(xlabel="speed: time per episode, baseline ÷ setting", ylabel="success, % of episodes")
     panel.margins(x=0.14)
     panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
-    panel.set_ylim(success_floor(rows), 103)
-    panel.set_yticks([tick for tick in panel.get_yticks() if tick <= 100])
-    panel.set_ylim(success_floor(rows), 103)
-    panel.set_title("Success against speedup")
+    limit_success(panel, rows)
+    panel.set_title("Success against speed per episode")
     entitle(figure, title, about)  # before the labels: it moves the panel
-    labels = [(row["speedup"], 100 * row["success"], str(row["label"])) for row in points]
+    labels = [(row["episode_speedup"], 100 * row["success"], str(row["label"])) for row in points]
     place_labels(figure, panel, labels, shades)
     return figure
 
@@ -58,12 +56,19 @@ def success_floor(rows: pd.DataFrame) -> float:
     return max(0.0, 5.0 * math.floor((min(lows, default=0.0) - 3.0) / 5.0))
 
 
+def limit_success(panel: Axes, rows: pd.DataFrame, axis: str = "y") -> None:
+    """Limits an axis of success: from `success_floor` to a little above 100 %, without a tick there."""
+    floor = success_floor(rows)
+    panel.set(**{f"{axis}lim": (floor, 103)})
+    panel.set(**{f"{axis}ticks": [tick for tick in getattr(panel, f"get_{axis}ticks")() if floor <= tick <= 100]})
+
+
 def _draw_point(panel: Axes, row: dict[str, Any], shade: str) -> None:
-    x, y = row["speedup"], 100 * row["success"]
+    x, y = row["episode_speedup"], 100 * row["success"]
     bars: Any = {"color": shade, "linewidth": 1.6, "alpha": 0.4}
     panel.plot([x, x], [100 * row["success_low"], 100 * row["success_high"]], **bars)
-    if is_number(row["speedup_low"]):
-        panel.plot([row["speedup_low"], row["speedup_high"]], [y, y], **bars)
+    if is_number(row["episode_speedup_low"]):
+        panel.plot([row["episode_speedup_low"], row["episode_speedup_high"]], [y, y], **bars)
     panel.plot(x, y, "o", color=shade, markersize=7)
 
 

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-
-RESAMPLES = 10_000
-BOOTSTRAP_SEED = 20_260_301  # fixed: the same cells give the same table
-_AT_ONCE = 500_000  # numbers drawn or multiplied at a time: memory
 
 
 class Interval(NamedTuple):
@@ -31,18 +26,20 @@ class Estimate(NamedTuple):
 
 
 class PairedCounts(NamedTuple):
-    """Episodes by success of the baseline and of the method from the same initial state."""
+    """Episodes by success of the baseline and of the method from the same initial state; expected ones need not be
+    whole."""
 
-    both: int
-    only_baseline: int
-    only_method: int
-    neither: int
+    both: float
+    only_baseline: float
+    only_method: float
+    neither: float
 
 
+_Z = NormalDist().inv_cdf(0.975)
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
 
 
-def wilson(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
+def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Interval:
     """Wilson score interval of a success rate (Newcombe, Statistics in Medicine 17, 1998, method 3); NaN without
     episodes. Written out here, as McNemar's test is: scipy.stats alone takes 60 MB."""
     if episodes == 0:
@@ -55,22 +52,18 @@ def wilson(successes: int, episodes: int, confidence: float = 0.95) -> Interval:
     return Interval(low, high)
 
 
-def macro_wilson(groups: Sequence[tuple[int, int]], confidence: float = 0.95) -> Interval:
-    """Interval of the unweighted mean of the groups' success rates, from their Wilson intervals.
+def mean_of(groups: Sequence[Estimate]) -> Estimate:
+    """The unweighted mean of independent estimates, e.g. of the groups' success rates.
 
-    A mean of proportions has no Wilson interval of its own; the method of variance estimates recovery (Zou and
-    Donner, 2008) combines those of the groups and is the Wilson interval where there is one group.
-
-    Args:
-        groups: (successes, episodes) per group, at least one episode each.
+    A mean of proportions has no Wilson interval of its own; the method of variance estimates recovery (Zou and Donner,
+    2008) combines those of the groups, lopsided as they are, and is the interval of the group where there is one.
     """
     if not groups:
-        return Interval(math.nan, math.nan)
-    rates = np.array([successes / episodes for successes, episodes in groups])
-    bounds = np.array([wilson(successes, episodes, confidence) for successes, episodes in groups])  # (groups, 2)
-    spread = np.sqrt(((bounds - rates[:, None]) ** 2).sum(axis=0)) / len(groups)
-    mean = float(rates.mean())
-    return Interval(mean - float(spread[0]), mean + float(spread[1]))
+        return NO_ESTIMATE
+    values, lows, highs = np.array(groups).T
+    below, above = (math.sqrt(((bounds - values) ** 2).sum()) / len(groups) for bounds in (lows, highs))
+    mean = float(values.mean())
+    return Estimate(mean, mean - below, mean + above)
 
 
 def paired_counts(baseline: np.ndarray, method: np.ndarray) -> PairedCounts:
@@ -107,43 +100,97 @@ def paired_difference(counts: PairedCounts, confidence: float = 0.95) -> Estimat
     return Estimate(difference, low, high)
 
 
-def ratio(numerators: np.ndarray, denominators: np.ndarray) -> Estimate:
-    """Sum over sum of two arrays (episodes,), with the 95 % interval of a ratio estimator: episodes are independent,
-    what happens within one is not (Cochran, Sampling Techniques, section 2.11; Student's t, as there may be few of
-    them). An episode with a denominator of 0 says nothing and does not count. NaN bounds for one that counts."""
+def _spread(effects: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> float:
+    """Half the width of the 95 % interval of a sum of effects (n,) that is 0 at the estimate.
+
+    The clusters of a stratum are independent and what is in one is not: the sum's variance is that of the clusters'
+    sums, stratum by stratum, with Student's t at as many degrees of freedom as clusters less strata. Strata of one
+    cluster have no variance of their own and count as the clusters of one stratum (Cochran, Sampling Techniques,
+    section 5A.12), which adds how much the strata differ. NaN for a single cluster.
+    """
     from scipy.special import stdtrit
 
+    at, of = _numbers_of(strata), _numbers_of([f"{a}|{b}" for a, b in zip(strata, clusters, strict=True)])
+    sums, stratum = np.bincount(of, effects), np.zeros(int(of.max()) + 1, int)
+    stratum[of] = at
+    stratum = np.where(np.bincount(stratum)[stratum] == 1, -1, stratum)
+    variance, freedom = 0.0, 0
+    for number in np.unique(stratum):
+        parts = sums[stratum == number]
+        # the only stratum of one cluster has nothing to be compared with: the whole sum counts
+        variance += len(parts) * float(parts.var(ddof=1)) if len(parts) > 1 else float(parts[0]) ** 2
+        freedom += len(parts) - 1
+    return float(stdtrit(freedom, 0.975)) * math.sqrt(variance) if freedom else math.nan
+
+
+def ratio(
+    numerators: np.ndarray,
+    denominators: np.ndarray,
+    strata: Sequence[str] | None = None,
+    clusters: Sequence[str] | None = None,
+) -> Estimate:
+    """Sum over sum of two arrays (episodes,), with the 95 % interval of a ratio estimator: clusters are independent,
+    what happens within one is not. An episode with a denominator of 0 says nothing and does not count. NaN bounds for
+    one that counts.
+
+    Args:
+        strata: (episodes,) task of each; without, all are of one.
+        clusters: (episodes,) seed of each, so that repeats count together; without, every episode is one.
+    """
     a, b = np.asarray(numerators, dtype=np.float64), np.asarray(denominators, dtype=np.float64)
-    a, b = a[b > 0], b[b > 0]
+    counts = b > 0
+    tasks = np.zeros(a.size, int) if strata is None else np.asarray(strata)
+    seeds = np.arange(a.size) if clusters is None else np.asarray(clusters)
+    a, b = a[counts], b[counts]
     value = float(a.sum() / b.sum())
-    if a.size < 2:
-        return Estimate(value, math.nan, math.nan)
-    spread = float(((a - value * b) ** 2).sum() * a.size / (a.size - 1))
-    reach = float(stdtrit(a.size - 1, 0.975)) * math.sqrt(spread) / float(b.sum())
+    reach = _spread((a - value * b) / b.sum(), tasks[counts].tolist(), seeds[counts].tolist())
     return Estimate(value, value - reach, value + reach)
 
 
-def pairs_to_settle(counts: PairedCounts, margin: float, z: float = 1.96) -> float:
+def share(parts: np.ndarray, wholes: np.ndarray, strata: Sequence[str], clusters: Sequence[str]) -> Estimate:
+    """`ratio` of parts that are at most their wholes, with Wilson's 95 % interval for as many observations as would
+    give the ratio's variance. At most one per cluster: a few small parts say little of a large one to come."""
+    value, low, high = ratio(parts, wholes, strata, clusters)
+    seen = np.asarray(wholes) > 0
+    size = float(len(set(zip(np.asarray(strata)[seen], np.asarray(clusters)[seen], strict=True))))
+    reach = (high - low) / 2
+    if reach > 0:
+        size = min(size, value * (1 - value) * (_Z / reach) ** 2)
+    bounds = wilson(value * size, size)
+    return Estimate(value, bounds.low, bounds.high)
+
+
+def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     """About how many pairs would show non-inferiority at `margin`, if the four outcomes' rates stayed as they are: the
-    lower bound of the normal interval of the difference then lies at -margin. Infinite where the difference itself lies
+    least that bring the lower bound of `paired_difference` above -margin. Infinite where the difference itself lies
     there or below; NaN without pairs."""
     pairs = sum(counts)
     if not pairs:
         return math.nan
-    difference = (counts.only_method - counts.only_baseline) / pairs
-    # one discordant pair at least: none so far does not prove that there are none
-    discordant = max(1, counts.only_method + counts.only_baseline) / pairs
-    room = margin + difference
-    return max(1, math.ceil(z**2 * (discordant - difference**2) / room**2)) if room > 0 else math.inf
+    if (counts.only_method - counts.only_baseline) / pairs <= -margin:
+        return math.inf
+
+    def shows(wanted: float) -> bool:
+        more = PairedCounts(*(count * wanted / pairs for count in counts))
+        return paired_difference(more).low > -margin
+
+    low, high = 0.0, 1.0
+    while not shows(high):
+        low, high = high, 2 * high
+    while high - low > max(0.5, high / 1000):
+        middle = (low + high) / 2
+        low, high = (low, middle) if shows(middle) else (middle, high)
+    return math.ceil(high)
 
 
 def mcnemar(counts: PairedCounts) -> float:
     """Exact two-sided p of McNemar's test, that discordant pairs favour either side equally; 1 without such pairs."""
-    discordant = counts.only_baseline + counts.only_method
+    lost, won = int(counts.only_baseline), int(counts.only_method)
+    discordant = lost + won
     if discordant == 0:
         return 1.0
     # whole numbers until the last division: exact
-    fewer, ways, tail = min(counts.only_baseline, counts.only_method), 1, 1
+    fewer, ways, tail = min(lost, won), 1, 1
     for chosen in range(fewer):
         ways = ways * (discordant - chosen) // (chosen + 1)
         tail += ways
@@ -156,15 +203,12 @@ def speedup(
     strata: Sequence[str],
     groups: Sequence[str] | None = None,
     blocks: Sequence[str] | None = None,
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = BOOTSTRAP_SEED,
 ) -> Estimate:
-    """Ratio of mean times, baseline over method, with a paired bootstrap 95 % interval.
+    """Ratio of mean times, baseline over method, with the 95 % interval of its logarithm.
 
-    Within every stratum (the task) blocks are drawn with replacement, then pairs within each drawn block, both times of
-    a pair together; every draw gives a ratio of means. So the interval takes into account that the episodes of a block
-    share the machine's state. Where pairs do not depend on their block, it is wider than necessary, never narrower.
+    Blocks are the clusters of a task, because the episodes of a block share the machine's state. Where every task has
+    one block, the tasks are the clusters, and the interval contains how much they differ; where there is one block in
+    all, its pairs are, and the interval says nothing of another state of the machine.
 
     Args:
         baseline: (pairs,) time of the baseline's episodes, any unit.
@@ -174,71 +218,17 @@ def speedup(
         blocks: (pairs,) block of each pair; without, every pair is a block.
 
     Returns:
-        NaN without pairs; NaN bounds where a stratum has one pair only, which resampling cannot vary.
+        NaN without pairs; NaN bounds for a single one.
     """
     a, b = np.asarray(baseline, dtype=np.float64), np.asarray(method, dtype=np.float64)
     if a.size == 0:
         return NO_ESTIMATE
-    times = np.stack([a, b], axis=1)  # (pairs, 2)
     weights = _weights(a.size, groups)
-    mean_a, mean_b = weights @ times
-    value = float(mean_a / mean_b)
-    stratum_numbers = _numbers_of(strata)
-    if np.bincount(stratum_numbers).min() < 2:
-        return Estimate(value, math.nan, math.nan)
-    block_numbers = np.arange(a.size) if blocks is None else _numbers_of(blocks)
-    # by stratum, then block; stable, so pairs of a block keep their order
-    order = np.lexsort((block_numbers, stratum_numbers))
-    sizes = _block_sizes(stratum_numbers[order], block_numbers[order])
-    means, first = np.zeros((resamples, 2)), 0
-    for counts, drawn in _draws(sizes, resamples, seed):
-        rows = order[first : first + counts.shape[1]]
-        # a stratum lies within one group, so its pairs have equal weights
-        means += _weighted_sums(counts, times[rows]) * (weights[rows].sum() / drawn[:, None])
-        first += len(rows)
-    low, high = np.quantile(means[:, 0] / means[:, 1], [0.025, 0.975])
-    return Estimate(value, float(low), float(high))
-
-
-def _block_sizes(strata: np.ndarray, blocks: np.ndarray) -> tuple[tuple[int, ...], ...]:
-    """Per stratum the numbers of pairs of its blocks, from numbers (pairs,) that are sorted by both."""
-    starts = np.flatnonzero(np.diff(strata, prepend=-1))
-    parts = np.split(blocks, starts[1:])
-    return tuple(tuple(np.unique(part, return_counts=True)[1].tolist()) for part in parts)
-
-
-@functools.lru_cache(maxsize=2)
-def _draws(sizes: tuple[tuple[int, ...], ...], resamples: int, seed: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Per stratum how often every resample draws each pair (resamples, pairs), and how many pairs it draws
-    (resamples,): by block, then within the block. They depend on the sizes of the blocks alone, so that the settings of
-    a study, which share their tasks and seeds, share them."""
-    generator = np.random.default_rng(seed)
-    return tuple(_stratum_draws(np.array(stratum), resamples, generator) for stratum in sizes)
-
-
-def _stratum_draws(sizes: np.ndarray, resamples: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """How often every resample draws each pair of one stratum (resamples, pairs), and how many pairs it draws
-    (resamples,). sizes (blocks,): the number of pairs in each block."""
-    first, pairs = np.cumsum(sizes) - sizes, int(sizes.sum())
-    choices = generator.integers(0, sizes.size, size=(resamples, sizes.size))
-    counts = np.empty((resamples, pairs), np.uint16)
-    rows = max(1, _AT_ONCE // (sizes.size * int(sizes.max())))
-    for begin in range(0, resamples, rows):
-        blocks = choices[begin : begin + rows]
-        within = generator.random((*blocks.shape, int(sizes.max())))
-        lengths = sizes[blocks][..., None]
-        indices = first[blocks][..., None] + (within * lengths).astype(np.int64)
-        indices += pairs * np.arange(len(blocks))[:, None, None]
-        used = np.arange(sizes.max()) < lengths  # as many pairs as the block has
-        tallies = np.bincount(indices[used], minlength=len(blocks) * pairs)
-        counts[begin : begin + rows] = tallies.reshape(-1, pairs)
-    return counts, sizes[choices].sum(axis=1)
-
-
-def _weighted_sums(counts: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Sums (resamples, 2) of the times (pairs, 2), weighted by the counts (resamples, pairs)."""
-    rows = max(1, _AT_ONCE // counts.shape[1])
-    return np.concatenate([counts[i : i + rows].astype(np.float64) @ times for i in range(0, len(counts), rows)])
+    mean_a, mean_b = float(weights @ a), float(weights @ b)
+    pairs = [str(number) for number in range(a.size)]
+    clusters = pairs if blocks is None or len(set(zip(strata, blocks, strict=True))) == 1 else blocks
+    reach = math.exp(_spread(weights * (a / mean_a - b / mean_b), strata, clusters))
+    return Estimate(mean_a / mean_b, mean_a / mean_b / reach, mean_a / mean_b * reach)
 
 
 def _numbers_of(names: Sequence[str]) -> np.ndarray:

@@ -13,10 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.drawing import DASHES, STYLE, entitle, new_figure, setting_colours
+from kerv_cli.report.drawing import DASHES, STYLE, entitle, new_figure, setting_colours, shared_legend
 from kerv_cli.report.measures import MICRO, paired_columns
-from kerv_cli.report.scatter import success_floor
+from kerv_cli.report.scatter import limit_success
 from kerv_cli.report.tables import is_number, rows_of
+
+Row = dict[str, Any]
+"""A setting's row of `study_table`."""
 
 BEHIND = 0.10
 """A method falls behind where its success is lower than the baseline's, under the same stress, by this or more."""
@@ -36,11 +39,11 @@ def stem(label: str) -> str:
     return re.sub(r",?\s+(kind|level)=\S+", "", label)
 
 
-def by_kind(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, dict[str, list[dict[str, Any]]]]:
+def by_kind(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, dict[str, list[Row]]]:
     """Kind -> method -> rows of the table along the level, beginning with the method's unstressed row."""
     rows = rows_of(table, averaging)
     plain = {stem(str(row["label"])): row for row in rows if row["stress"] == NONE}
-    kinds: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    kinds: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         if row["stress"] != NONE:
             kinds.setdefault(str(row["stress"]), {}).setdefault(stem(str(row["label"])), []).append(row)
@@ -61,7 +64,7 @@ def stress_figure(table: pd.DataFrame, title: str, about: str, averaging: str = 
     shades = dict(zip(names, setting_colours(first[name] for name in names), strict=True))
     across = min(_COLUMNS, len(kinds))
     down = -(-len(kinds) // across)
-    floor = success_floor(table[table["averaging"] == averaging])
+    averaged = table[table["averaging"] == averaging]
     with mpl.rc_context(STYLE):
         figure = new_figure(max(8.0, 3.1 * across), 1.4 + 2.7 * down)
         panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
@@ -70,16 +73,14 @@ def stress_figure(table: pd.DataFrame, title: str, about: str, averaging: str = 
                 shift = _DODGE * (number - (len(names) - 1) / 2)
                 _draw(panel, methods.get(name, []), shades[name], _dashes(number), name, shift)
             levels = sorted({int(row["stress_level"]) for group in methods.values() for row in group})
-            panel.set(title=kind, xlabel="level", xticks=levels, ylim=(floor, 103))
+            panel.set(title=kind, xlabel="level", xticks=levels)
+            limit_success(panel, averaged)
             if index % across == 0:
                 panel.set_ylabel("success, % of episodes")
         for panel in panels[len(kinds) :]:
             panel.set_visible(False)
         entitle(figure, title, about)
-        lines = {
-            label: line for panel in panels for line, label in zip(*panel.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(lines.values(), lines.keys(), loc="outside lower center", ncols=min(6, len(lines)))
+        shared_legend(figure, panels, 6)
     return figure
 
 
@@ -87,7 +88,7 @@ def _dashes(number: int) -> Any:
     return "-" if number == 0 else DASHES[(number - 1) % len(DASHES)]
 
 
-def _draw(panel: Axes, rows: list[dict[str, Any]], shade: str, dashes: Any, name: str, shift: float) -> None:
+def _draw(panel: Axes, rows: list[Row], shade: str, dashes: Any, name: str, shift: float) -> None:
     rows = [row for row in rows if is_number(row["success"])]
     if not rows:
         return
@@ -126,7 +127,7 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _sum(rows: list[dict[str, Any]], method: str, name: str, reference: str) -> dict[str, Any]:
+def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
     counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
     episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
     bounds = stats.wilson(successes, episodes)
@@ -158,11 +159,11 @@ def verdict(table: pd.DataFrame) -> str:
     return f"{bound} (* with 95 % confidence behind it): {'; '.join(clauses)}."
 
 
-def _stems(rows: Iterable[dict[str, Any]]) -> list[str]:
+def _stems(rows: Iterable[Row]) -> list[str]:
     return list(dict.fromkeys(stem(str(row["label"])) for row in rows))
 
 
-def _levels_text(rows: Iterable[dict[str, Any]]) -> str:
+def _levels_text(rows: Iterable[Row]) -> str:
     """The levels of each kind as text, `camera 3/4*, light 4`; a star where the interval of the difference lies below
     0."""
     levels: dict[str, list[str]] = {}

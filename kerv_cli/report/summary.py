@@ -13,13 +13,23 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from kerv_cli.report.measures import MICRO
+from kerv_cli.report.measures import MICRO, own_columns
+from kerv_cli.report.motion import differences
 from kerv_cli.report.tables import is_number, rows_of
 
 APART = "*"
 WIDE = 130
 """Columns of a terminal that hold every measure."""
 
+SPEEDS = {"episode_speedup": "per episode", "speedup": "per step"}
+"""Speed against the baseline -> its heading."""
+
+_MOTION = {
+    "steps_to_success": "control steps",
+    "path_m": "path, m",
+    "jerk": "jerk, m/s³",
+    "gripper_switches": "switches",
+}
 _ALWAYS = {"AL": "AL", "AFEP": "AFEP", "forwards_per_step": "forwards / step"}
 _WHERE_USED = {
     "skip_rate": "skipped",
@@ -49,13 +59,18 @@ class SummaryTable:
         first, several = self.table["baseline"].iloc[0], self.table["baseline"].nunique() > 1
         against = f"{first}, under the same stress" if several else first
         yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {against}")
-        if frame["speedup"].str.endswith(APART).any():
+        if frame["per step"].str.endswith(APART).any():
             yield Text(f"{APART} of those pairs alone that were measured in turn")
         untimed = list(dict.fromkeys(self.table.loc[self.table["time_per_step_ms"].isna(), "label"]))
         if untimed:
             yield Text(f"not timed, for success alone: {', '.join(map(str, untimed))}")
         if "ceiling" in frame:
-            yield Text("ceiling: speedup if every chunk were accepted whole at once")
+            yield Text("ceiling: speed per step if every chunk were accepted whole at once")
+        yield from (Text(reason) for reason in differences(rows_of(self.table, self.averaging)))
+        motion = motion_frame(self.table, self.averaging)
+        if motion is not None and options.max_width >= WIDE:
+            yield Text("Successful episodes, and ratios over the pairs in which both succeeded", style="bold")
+            yield _printed(motion)
 
 
 def _printed(frame: pd.DataFrame) -> Table:
@@ -63,7 +78,7 @@ def _printed(frame: pd.DataFrame) -> Table:
     for name in frame.columns:
         left = name == "setting"
         head = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
-        interval = name in ("success %", "speedup")  # labels wrap, intervals do not
+        interval = name in ("success %", "per episode", "per step")  # labels wrap, intervals do not
         printed.add_column(head, justify="left" if left else "right", overflow="fold", no_wrap=interval)
     for row in frame.itertuples(index=False):
         printed.add_row(*(escape(str(value)) for value in row))
@@ -76,8 +91,9 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
 
 
 def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
-    """Fewer columns, for a terminal: drops AFEP, lost/won and deviation, and joins the shares of decodes in one."""
-    frame = frame.drop(columns=["AFEP", "lost/won", "deviation"], errors="ignore")
+    """Fewer columns, for a terminal, and the shares of decodes in one."""
+    dropped = ["AL", "AFEP", "ms / step", "p95 ms", "ceiling", "lost/won", "deviation"]
+    frame = frame.drop(columns=dropped, errors="ignore")
     shares = [name for key, name in _WHERE_USED.items() if key in _PERCENT and name in frame]
     if shares:
         together = frame[shares].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
@@ -89,7 +105,8 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """The rows of one averaging as text: 95 % intervals in brackets, `–` for missing values; columns that no row uses
     are left out."""
     rows = rows_of(table, averaging)
-    used = {key: name for key, name in _WHERE_USED.items() if any(is_number(row[key]) and row[key] for row in rows)}
+    optional = {**_WHERE_USED, **{name: name.replace("_", " ") for name in own_columns()}}
+    used = {key: name for key, name in optional.items() if any(is_number(row[key]) and row[key] for row in rows)}
     limited = any(is_number(row["ceiling"]) for row in rows)
     return pd.DataFrame([_cells(row, _ALWAYS | used, limited) for row in rows])
 
@@ -99,13 +116,29 @@ def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) ->
     return {
         "setting": str(row["label"]),
         "success %": _interval(row, "success", 100.0, 0),
-        "speedup": _one(row) if reference else _interval(row, "speedup", 1.0, 2) + _apart(row),
+        **{name: _one(row) if reference else _interval(row, key, 1.0, 2) + _apart(row) for key, name in SPEEDS.items()},
         **({"ceiling": number(row["ceiling"])} if limited else {}),
+        "p95 ms": number(row["latency_p95_ms"]),
         "ms / step": number(row["time_per_step_ms"]),
         **{name: _percent(row[key]) if key in _PERCENT else number(row[key]) for key, name in columns.items()},
         "lost/won": "" if reference or not row["pairs"] else f"{row['only_baseline']}/{row['only_method']}",
         "p": "" if reference or not row["pairs"] else _p(row["mcnemar_p"]),
     }
+
+
+def motion_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame | None:
+    """The measures of `motion` as text, each with its ratio to the baseline's; None where no row has them."""
+    rows = rows_of(table, averaging)
+    if not any(is_number(row[key]) for row in rows for key in _MOTION):
+        return None
+    frame = []
+    for row in rows:
+        cells = {"setting": str(row["label"])}
+        for key, name in _MOTION.items():
+            cells[name] = number(row[key])
+            cells[f"{name}: ratio"] = "" if row["label"] == row["baseline"] else _interval(row, f"{key}_ratio", 1.0, 2)
+        frame.append(cells)
+    return pd.DataFrame(frame)
 
 
 def _one(row: Mapping[str, Any]) -> str:

@@ -24,8 +24,7 @@ from kerv_cli.lab.identity import (
     without,
     work_of,
 )
-from kerv_cli.lab.plan import Cell, seeds_text
-from kerv_cli.lab.plan_file import StudyPlan
+from kerv_cli.lab.plan import Cell, StudyPlan, seeds_text
 from kerv_cli.lab.store import StoredCell, StudyStore
 from kerv_cli.report.ceiling import (
     NONE,
@@ -36,6 +35,7 @@ from kerv_cli.report.ceiling import (
     verifies_in_prefill,
 )
 from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, measure
+from kerv_cli.report.motion import motion
 from kerv_cli.worlds import specs
 
 _MACHINE = ("executor", "workers", "device_name", "host")
@@ -191,7 +191,8 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "baseline": data.references[label],
     }
     best = _ceiling(data, cells[0], episodes, averaging)
-    return [head, {**measure(episodes, baseline, averaging), **best.columns()}, *_origin(data, cells)]
+    measures = {**measure(episodes, baseline, averaging), **motion(episodes, baseline, averaging), **best.columns()}
+    return [head, measures, *_origin(data, cells)]
 
 
 def _ceiling(data: StudyData, cell: Cell, episodes: pd.DataFrame, averaging: str) -> Ceiling:

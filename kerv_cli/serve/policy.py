@@ -11,7 +11,7 @@ from kerv_cli.base.settings import ServeSettings
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import check, compose, needs
+from kerv_cli.methods.compose import Method
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
 
 WARM_UP = 4  # decodes
@@ -28,10 +28,10 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
         raise UnknownName("gripper", settings.gripper, GRIPPERS)
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
-    description, method = artifacts.description, settings.parts()
-    check(method, settings.chunk, description.chunk)
-    artifacts.check(needs(method))
-    decoder = compose(method, artifacts.target, artifacts.load, settings.task_name, settings.chunk)
+    description, method = artifacts.description, Method.of(settings)
+    method.check(description)
+    artifacts.check(method.needs)
+    decoder = method.decoder(artifacts.target, artifacts.load, settings.task_name)
     interface = Interface(
         name=settings.policy.target,
         method=settings.method,

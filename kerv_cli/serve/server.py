@@ -12,17 +12,41 @@ import http
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.serve.latency import Latencies
 from kerv_cli.serve.session import Interface, Session
 from kerv_cli.serve.wire import packed, unpacked
 
 Log = Callable[[str], None]
 HEALTH = "/healthz"
 BUSY, GONE = 1013, 1001  # websocket close codes: try again later, going away
+
+
+@dataclass
+class Latencies:
+    """Milliseconds of every answer, for the log. decode: inference time; whole: from the message's arrival to the
+    answer's end."""
+
+    decode: list[float] = field(default_factory=list)
+    whole: list[float] = field(default_factory=list)
+
+    def add(self, decode: float, whole: float) -> None:
+        """One answer."""
+        self.decode.append(decode)
+        self.whole.append(whole)
+
+    def __str__(self) -> str:
+        parts = [f"{len(self.whole)} answers"]
+        for name, values in (("decode", self.decode), ("answer", self.whole)):
+            if values:
+                p50, p95 = np.percentile(values, [50, 95])
+                parts.append(f"{name} p50 {p50:.1f} p95 {p95:.1f} worst {max(values):.1f} ms")
+        return ", ".join(parts)
 
 
 class PolicyServer:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -53,6 +53,10 @@ class TargetDescription(Description):
     words: tuple[str, ...]
     provenance: dict[str, Any]
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.settings.get("chunk"), int):
+            raise ValueError("settings lack chunk, the control steps of a decode")
+
     @property
     def chunk(self) -> int:
         """H, control steps it was trained to decode at once."""
@@ -87,14 +91,6 @@ class TargetDescription(Description):
 
 
 T = TypeVar("T", bound=Description)
-
-_TRAINED_BY = {
-    "target": "train target",
-    "drafter": "train drafter",
-    "early": "train drafter drafter=early",
-    "score": "train score",
-}
-"""Kind of a description -> the command that makes one."""
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
@@ -171,6 +167,30 @@ def save_module(
     return digest
 
 
+def target_fields(
+    family: str,
+    settings: Mapping[str, Any],
+    environment: str,
+    actions: ActionSpace,
+    observation: ObservationSpace,
+    cameras: Sequence[str] = (),
+    words: Sequence[str] = (),
+    provenance: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """What `save_module` writes into a target.json; the arguments are the fields of `TargetDescription`. settings: what
+    the family's `build` reads, `chunk` among them."""
+    return {
+        "family": family,
+        "environment": environment,
+        "settings": dict(settings),
+        "actions": actions.as_dict(),
+        "observation": observation.as_dict(),
+        "cameras": list(cameras),
+        "words": list(words),
+        "provenance": dict(provenance or {}),
+    }
+
+
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
     """The JSON beside the weights, checked against its schema and their hash.
 
@@ -186,8 +206,7 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     """The JSON of a folder, checked against its schema but not against weights; errors as `read_description`."""
     path = folder / f"{kind}.json"
     if not path.is_file():
-        remedy = f"run 'kerv {_TRAINED_BY[kind]}', or name" if kind in _TRAINED_BY else "name"
-        raise CheckpointError(f"no {kind} in {folder}: {remedy} a folder that holds one")
+        raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
     status = os.stat(path)
     version = status.st_ino, status.st_size, status.st_mtime_ns
     description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]

@@ -21,13 +21,13 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
     BoundarySection,
     Calibration,
+    CalibrationArtifact,
     Demonstrations,
     SkipSection,
     Variability,
-    load_calibration,
     save_calibration,
 )
-from kerv_cli.methods.compose import compose
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.boundary import BoundaryRanges
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.observations import check_frames, check_shown, instruction_of
@@ -210,7 +210,7 @@ class CalibrationRun:
         """The decoder of pre-sampling: the settings' proposer, acceptance and threshold."""
         s = self.settings
         method = RolloutSettings(proposer=s.proposer, acceptance=s.acceptance, threshold=s.threshold)
-        return compose(method.parts(), self.artifacts.target, self.artifacts.load)
+        return Method.of(method).decoder(self.artifacts.target, self.artifacts.load)
 
     def finish(
         self, variability: dict[str, Variability], boundary: BoundarySection | None, skip: SkipSection | None
@@ -231,7 +231,7 @@ class CalibrationRun:
         }
         sections, earlier = self._fill_empty({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
-            target=MadeFor(self.description.sha256, space, chunk),
+            target=MadeFor.of(self.description),
             demos=Demonstrations(self.dataset.sha256, self.windows.episodes),
             window=self.settings.window,
             noise=noise,
@@ -246,7 +246,7 @@ class CalibrationRun:
         """Replaces empty sections by those of an earlier calibration of the same target -> (sections, provenance of the
         replaced ones)."""
         try:
-            earlier = load_calibration(self.path, self.description)
+            earlier = CalibrationArtifact().checked(self.path, self.description)
         except CheckpointError:  # missing, damaged or another target's: nothing to keep, and it is written anew
             earlier = None
         reasons = {

@@ -6,94 +6,23 @@ embeddings and tokens are what the drafter imitates, under the same causal mask 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.protocol import Target
-from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
+from kerv_cli.methods.eagle import DrafterSettings
+from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact, DrafterProposer
 from kerv_cli.methods.spec_vla.rules import Relaxed
-from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.imitation import Samples
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Rows
-
-
-@dataclass(frozen=True)
-class TeacherStates(Rows):
-    """The target's greedy decodes of n observations."""
-
-    prompt: Tensor  # (n, P, E) float16
-    hidden: Tensor  # (n, P + N − 1, E) float16
-    tokens: Tensor  # (n, N) int64
-
-    def parts(self, indices: Tensor) -> list[TeacherStates]:
-        """The rows at `indices` (B,), in batches of one prompt length: here one."""
-        return [self.where(indices)]
-
-    def prompts(self, count: int) -> list[Tensor]:
-        """At most `count` prompts (1, P, E), evenly spread."""
-        chosen = torch.linspace(0, len(self) - 1, min(count, len(self))).long().tolist()
-        return [self.prompt[i : i + 1] for i in chosen]
-
-
-@dataclass(frozen=True)
-class StatesByLength:
-    """Teacher states whose prompts differ in length: a group per length, rows counted through all groups."""
-
-    groups: tuple[TeacherStates, ...]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.groups))
-
-    def parts(self, indices: Tensor) -> list[TeacherStates]:
-        """The rows at `indices` (B,), in batches of one prompt length."""
-        batches, first = [], 0
-        for group in self.groups:
-            rows = indices[(indices >= first) & (indices < first + len(group))] - first
-            if len(rows):
-                batches.append(group.where(rows))
-            first += len(group)
-        return batches
-
-    def prompts(self, count: int) -> list[Tensor]:
-        """About `count` prompts (1, P, E): from every group in proportion to its rows, evenly spread."""
-        return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
-
-
-@torch.inference_mode()
-def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
-    """prompt (B, P, E) -> greedy tokens (B, N) and the hidden states (B, P + N − 1, E) that predict them."""
-    length, size = prompt.shape[1], target.chunk * target.actions.dofs
-    cache = target.new_cache(len(prompt), length + size)
-    hidden = [target.forward(prompt, torch.arange(length, device=prompt.device), cache)]
-    tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
-    for i in range(size - 1):
-        position = torch.tensor([length + i], device=prompt.device)
-        hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
-        tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
-    return torch.stack(tokens, 1), torch.cat(hidden, 1)
-
-
-@torch.inference_mode()
-def teach(
-    target: CompactTarget, samples: Samples, limit: int, on_progress: Callable[[int, int], None]
-) -> TeacherStates:
-    """The target's decodes of at most `limit` of the samples, evenly spread."""
-    chosen = torch.linspace(0, len(samples) - 1, min(limit, len(samples))).long()
-    parts = []
-    for indices in chosen.split(64):
-        prompt, _ = target.encode_batch(samples.inputs(indices, target.device))
-        tokens, hidden = greedy(target, prompt)
-        parts.append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
-        on_progress(sum(map(len, parts)), len(chosen))
-    return TeacherStates.joined(parts)
+from kerv_cli.training.recorded import StatesByLength, TeacherStates, teach
+from kerv_cli.training.runs import DrafterRun
 
 
 class Distillation:
@@ -107,9 +36,12 @@ class Distillation:
         held_out: TeacherStates | StatesByLength,
         settings: DrafterSettings,
     ) -> None:
-        self.drafter, self.target, self.settings = drafter, target, settings
+        self.module, self.target, self.settings = drafter, target, settings
         self.states, self.held_out = states, held_out
         self.device = target.device
+
+    def __len__(self) -> int:
+        return len(self.states)
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Mean loss over the unrolled passes for the states at `indices` (B,), and the token loss of each pass."""
@@ -149,7 +81,7 @@ class Distillation:
         """hidden (B, P + N − 2, E) at positions 0 … -> predictions of positions 1 … P + N − 2, same shape."""
         following = torch.cat([prompt[:, 1:], self.target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1], device=hidden.device)
-        predicted: Tensor = self.drafter(following, hidden, positions)
+        predicted: Tensor = self.module(following, hidden, positions)
         return predicted
 
     def compare(self, predicted: Tensor, hidden: Tensor, length: int) -> tuple[Tensor, Tensor]:
@@ -177,3 +109,27 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
     chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
     rounds = [r for c in chunks for r in c.rounds if r.tree_size]
     return sum(r.committed for r in rounds) / max(1, len(rounds))
+
+
+class EagleRun(DrafterRun):
+    """`kerv train drafter`: the EAGLE-style drafter; errors as `DrafterRun`, and noise on several processes."""
+
+    artifact = DrafterArtifact()
+    before: ClassVar[Mapping[str, float]] = {"width": 512, "rank": 64, "history": 2}
+
+    def begin(self) -> None:
+        """See `Run.begin`."""
+        super().begin()
+        noise = self.settings.drafter.noise
+        if noise and self.ranks.size > 1:
+            raise UsageError(
+                f"drafter.noise={noise} is drawn for a whole batch: train with one process, or without noise"
+            )
+
+    def lesson(self, progress: Callable[[int, int], None]) -> Distillation:
+        """The target's states of training and validation."""
+        settings, share = self.settings.drafter, self.settings.train.held_out
+        states, held_out = teach(self.target, self.dataset, settings.samples, share, progress)
+        torch.manual_seed(self.settings.train.seed)
+        drafter = Drafter.beside(settings, self.target).to(self.device)
+        return Distillation(drafter, self.target, states, held_out, settings)

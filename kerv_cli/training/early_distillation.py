@@ -6,23 +6,24 @@ The history is what the demonstration *executed*, noise included.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import DrafterSettings, TrainSettings
+from kerv_cli.base.settings import TrainSettings
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.methods.early.drafter import EarlyDrafter, choose, padded
+from kerv_cli.methods.early import EarlySettings
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, padded
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.distillation import greedy
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Observations, Rows, observed_steps, read_observations
-from kerv_cli.training.recorded import prompts_of, spread_steps
+from kerv_cli.training.observations import Observations, Rows, observed_steps, read_observations, split
+from kerv_cli.training.recorded import greedy, prompts_of, spread_steps
+from kerv_cli.training.runs import DrafterRun
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
@@ -66,7 +67,7 @@ class EarlyObservations(Observations):
 def teach_early(
     target: ReadableTarget,
     dataset: DemoDataset,
-    settings: DrafterSettings,
+    settings: EarlySettings,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> EarlySamples:
     """The target's decodes of about `settings.samples` observations, spread evenly over all episodes.
@@ -90,7 +91,7 @@ def teach_early(
 
 
 def _teach_recorded(
-    target: ReadableTarget, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
+    target: ReadableTarget, dataset: DemoDataset, settings: EarlySettings, on_progress: Callable[[int, int], None]
 ) -> EarlySamples:
     """The decodes of a target of any family that has `pooled`, one observation at a time; arguments as in
     `teach_early`."""
@@ -147,9 +148,12 @@ class EarlyDistillation:
     def __init__(
         self, early: EarlyDrafter, training: EarlySamples, held_out: EarlySamples, train: TrainSettings
     ) -> None:
-        self.early, self.training, self.held_out = early, training, held_out
+        self.module, self.training, self.held_out = early, training, held_out
         self.device = early.mean.device
         self.labels = soft_labels(early.actions.tokens, train.label_sigma).to(self.device)
+
+    def __len__(self) -> int:
+        return len(self.training)
 
     def logits(self, early: EarlyDrafter, samples: EarlySamples, indices: Tensor) -> Tensor:
         """The drafter's logits (B, N, V) for the samples at `indices` (B,)."""
@@ -158,7 +162,7 @@ class EarlyDistillation:
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Cross-entropy with the softened tokens of the target at `indices` (B,), and logged numbers."""
-        logits = self.logits(self.early, self.training, indices)
+        logits = self.logits(self.module, self.training, indices)
         loss = token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
         return loss, {"token_loss": float(loss.detach())}
 
@@ -196,3 +200,20 @@ def measure(logits: Tensor, samples: Decoded, strict: Tensor) -> Metrics:
         metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])
     metrics["token_accuracy"] = balanced((logits.argmax(-1) == samples.tokens).float().mean(1))
     return metrics
+
+
+class EarlyRun(DrafterRun):
+    """`kerv train drafter drafter=early`; errors as `DrafterRun`."""
+
+    artifact = EarlyArtifact()
+    before: ClassVar[Mapping[str, float]] = {"noise": 0.0, "unroll": 3, "state_weight": 1.0, "token_weight": 0.1}
+
+    def lesson(self, progress: Callable[[int, int], None]) -> EarlyDistillation:
+        """The target's tokens and pooled prompts."""
+        settings, train = self.settings.drafter, self.settings.train
+        samples = teach_early(self.target, self.dataset, settings, progress)
+        training, held_out = split(samples, train.held_out)
+        torch.manual_seed(train.seed)
+        early = EarlyDrafter.beside(settings, self.target)
+        early.standardise(training.features)
+        return EarlyDistillation(early.to(self.device), training, held_out, train)

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import write_json
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import BuildDrafterSettings, DrafterSettings
-from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.eagle.public import Convention, read_public, save_public
-from kerv_cli.targets.checkpoint import FORMAT
+from kerv_cli.base.settings import BuildDrafterSettings
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.eagle import DrafterSettings
+from kerv_cli.methods.eagle.drafter import DrafterArtifact
+from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
 
 
 def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:
@@ -31,23 +31,17 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     target: Any = artifacts.target
     shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
     folder = artifacts.place("drafter")
-    digest = save_public(folder, tensors)
+    drafter = PublicDrafter(shape)
+    drafter.load_state_dict(tensors, assign=True)  # stored in their own number format
     parameters = sum(tensor.numel() for tensor in tensors.values())
-    description = {
-        "format": FORMAT,
-        "kind": "drafter",
-        "sha256": digest,
-        "settings": asdict(DrafterSettings(kind="public", layers=shape.language.num_hidden_layers)),
-        "target": artifacts.description.sha256,
-        "actions": target.actions.as_dict(),
-        "provenance": {
-            "command": "kerv build drafter",
-            "settings": asdict(settings),
-            "parameters": parameters,
-            **provenance(device),
-        },
-        "public": asdict(shape),
+    origin = {
+        "command": "kerv build drafter",
+        "settings": asdict(settings),
+        "parameters": parameters,
+        **provenance(device),
     }
-    write_json(folder / "drafter.json", description)
+    made_for = MadeFor.of(artifacts.description)
+    own = asdict(DrafterSettings(kind="public", layers=shape.language.num_hidden_layers))
+    DrafterArtifact().save(folder, drafter, made_for, origin, settings=own, public=asdict(shape))
     figures = {"parameters": parameters, "layers": shape.language.num_hidden_layers, **asdict(convention)}
     return folder, figures

@@ -1,4 +1,5 @@
-"""Recorded observations for any target: the one interface between demonstrations and what is trained from them.
+"""Recorded observations for any target, and its own decodes of them: the one interface between demonstrations and what
+is trained from them.
 
 A demonstration holds frames, states and a task. `observation_at` turns one of its control steps into the observation
 that a target gets in an episode, and `Target.encode` does the rest. The compact target has a faster reader, in batches
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,8 +19,9 @@ from torch import Tensor
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.protocol import Target
-from kerv_cli.training.distillation import StatesByLength, TeacherStates, greedy
-from kerv_cli.training.observations import instruction_of
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training.imitation import Samples, load_samples
+from kerv_cli.training.observations import Rows, instruction_of, split
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
@@ -62,20 +65,103 @@ def prompts_of(
         yield target.encode(observation_at(episode, int(step), space, target.cameras, instruction))
 
 
+@dataclass(frozen=True)
+class TeacherStates(Rows):
+    """The target's greedy decodes of n observations."""
+
+    prompt: Tensor  # (n, P, E) float16
+    hidden: Tensor  # (n, P + N − 1, E) float16
+    tokens: Tensor  # (n, N) int64
+
+    def parts(self, indices: Tensor) -> list[TeacherStates]:
+        """The rows at `indices` (B,), in batches of one prompt length: here one."""
+        return [self.where(indices)]
+
+    def prompts(self, count: int) -> list[Tensor]:
+        """At most `count` prompts (1, P, E), evenly spread."""
+        chosen = torch.linspace(0, len(self) - 1, min(count, len(self))).long().tolist()
+        return [self.prompt[i : i + 1] for i in chosen]
+
+
+@dataclass(frozen=True)
+class StatesByLength:
+    """Teacher states whose prompts differ in length: a group per length, rows counted through all groups."""
+
+    groups: tuple[TeacherStates, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.groups))
+
+    def parts(self, indices: Tensor) -> list[TeacherStates]:
+        """The rows at `indices` (B,), in batches of one prompt length."""
+        batches, first = [], 0
+        for group in self.groups:
+            rows = indices[(indices >= first) & (indices < first + len(group))] - first
+            if len(rows):
+                batches.append(group.where(rows))
+            first += len(group)
+        return batches
+
+    def prompts(self, count: int) -> list[Tensor]:
+        """About `count` prompts (1, P, E): from every group in proportion to its rows, evenly spread."""
+        return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
+
+
+@torch.inference_mode()
+def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
+    """prompt (B, P, E) -> greedy tokens (B, N) and the hidden states (B, P + N − 1, E) that predict them."""
+    length, size = prompt.shape[1], target.chunk * target.actions.dofs
+    cache = target.new_cache(len(prompt), length + size)
+    hidden = [target.forward(prompt, torch.arange(length, device=prompt.device), cache)]
+    tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
+    for i in range(size - 1):
+        position = torch.tensor([length + i], device=prompt.device)
+        hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
+        tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
+    return torch.stack(tokens, 1), torch.cat(hidden, 1)
+
+
+@torch.inference_mode()
+def teach(
+    target: Target, dataset: DemoDataset, limit: int, held_out: float, on_progress: Callable[[int, int], None]
+) -> tuple[TeacherStates | StatesByLength, TeacherStates | StatesByLength]:
+    """The target's greedy decodes of about `limit` observations, evenly spread -> (training, held out) by whole
+    episodes, as `observations.split` divides them.
+
+    Raises:
+        UsageError: a share out of range. CheckpointError: a single episode, or a damaged one.
+    """
+    if not isinstance(target, CompactTarget):
+        return teach_recorded(target, dataset, limit, held_out, on_progress)
+    tasks = tuple(dict.fromkeys(e.task for e in dataset.episodes))
+    training, validation = split(load_samples(dataset, target.settings, target.words, tasks), held_out)
+    states = _in_batches(target, training, limit, on_progress)
+    return states, _in_batches(target, validation, max(60, limit // 50), lambda done, total: None)
+
+
+def _in_batches(
+    target: CompactTarget, samples: Samples, limit: int, on_progress: Callable[[int, int], None]
+) -> TeacherStates:
+    """The decodes of at most `limit` of the samples, evenly spread."""
+    chosen = torch.linspace(0, len(samples) - 1, min(limit, len(samples))).long()
+    parts = []
+    for indices in chosen.split(64):
+        prompt, _ = target.encode_batch(samples.inputs(indices, target.device))
+        tokens, hidden = greedy(target, prompt)
+        parts.append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
+        on_progress(sum(map(len, parts)), len(chosen))
+    return TeacherStates.joined(parts)
+
+
 @torch.inference_mode()
 def teach_recorded(
     target: Target,
     dataset: DemoDataset,
     limit: int,
     held_out: float,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: Callable[[int, int], None],
 ) -> tuple[StatesByLength, StatesByLength]:
-    """The target's greedy decodes of about `limit` observations, spread over all episodes -> (training, held out) by
-    whole episodes, as `observations.split` divides them. Prompts of one length lie together.
-
-    Raises:
-        UsageError: a share out of range. CheckpointError: a single episode, or a damaged one.
-    """
+    """`teach` for a target of any family, one observation at a time. Prompts of one length lie together."""
     count = len(dataset.episodes)
     if count < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")

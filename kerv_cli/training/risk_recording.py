@@ -14,7 +14,7 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance, versions
-from kerv_cli.base.registry import NoSettings, find, part_of
+from kerv_cli.base.registry import NoSettings, find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import CalibrateRiskSettings, RolloutSettings, as_plain
 from kerv_cli.engine.chunk import Chunk
@@ -27,10 +27,10 @@ from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.run import close_worlds, open_world
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.compose import compose
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.risk.gate import episode_numbers
-from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, save_risk
+from kerv_cli.methods.risk.recording import Draw, RiskManifest, RiskRecording, decoding_of, save_risk
 from kerv_cli.methods.risk.scores import Draft, Score
 from kerv_cli.training.risk_records import RiskRecords, Row
 from kerv_cli.worlds import resolve_tasks, spec_of
@@ -129,6 +129,7 @@ class RiskRun:
         return {
             "artifacts": self.hashes,
             "recorded": [s.sources, s.scores, s.unverified, s.scale, s.features],
+            "decoding": [asdict(s.acceptance), asdict(s.threshold), s.chunk],
             "world": asdict(s.world),
             "runtime": [runtime.device, runtime.dtype, runtime.threads],
             "engine": ENGINE,
@@ -178,10 +179,10 @@ class RiskRun:
             names = self.settings.scores
             scores[source.name] = {n: find("score", n).built(NoSettings(n), beside) for n in names}
         recorder = Recorder(target, sources, scores, self.settings)
-        method = RolloutSettings(acceptance=part_of("acceptance", "relaxed").settings()).parts()
+        method = RolloutSettings(acceptance=self.settings.acceptance, threshold=self.settings.threshold).parts()
         method["prefill_draft"] = _default_settings(self.settings.sources[0])
-        decoder = compose(method, target, self.artifacts.load, task)
-        return Decoder(target, replace(decoder.parts, skip=recorder)), recorder
+        decoder = Method(method, self.settings.chunk).decoder(target, self.artifacts.load, task)
+        return Decoder(target, replace(decoder.parts, skip=recorder), self.settings.chunk), recorder
 
     def finish(self, draw: Draw | None = None) -> RiskRecording:
         """Writes the recording in one step -> the recording. draw: adds pictures to its folder.
@@ -198,14 +199,13 @@ class RiskRun:
                     raise KervError(f"the record of {task}, seed {seed}, is gone from {self.records.folder}: run again")
                 rows += record[0]
                 features += record[1]
-        target = self.artifacts.description
         origin = {
             "command": "kerv calibrate risk",
             "settings": as_plain(self.settings),
             **provenance(self.settings.runtime.device),
         }
         manifest = RiskManifest(
-            target=MadeFor(target.sha256, target.actions, target.chunk),
+            target=MadeFor.of(self.artifacts.description),
             sources={name: self._drafts_from(name) for name in self.settings.sources},
             scale=self.settings.scale,
             tasks={task: list(self.seeds) for task in self.tasks},
@@ -213,6 +213,7 @@ class RiskRun:
             files={},
             provenance=origin,
             made_from={kind: digest for kind, digest in self.hashes.items() if kind != "target"},
+            decoding=decoding_of(vars(self.settings), self.settings.chunk, self.artifacts.target),
         )
         return save_risk(self.folder, manifest, rows, np.array(features) if features else None, draw)
 

@@ -1,33 +1,30 @@
-"""Training runs, from settings to a folder on disk: the target, the drafter and the early drafter."""
+"""Training runs, from settings to a folder on disk: the target, and the base of what drafts for it."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import artifact, find_target
 from kerv_cli.base.provenance import provenance
+from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
-from kerv_cli.methods.artifacts import artifact_folder
-from kerv_cli.methods.eagle.drafter import Drafter, save_drafter
-from kerv_cli.methods.early.drafter import EarlyDrafter, save_early
+from kerv_cli.methods.artifacts import MadeFor, Weights
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import subset
 from kerv_cli.training.demonstrations import open_demos
-from kerv_cli.training.distillation import Distillation, StatesByLength, TeacherStates, teach
-from kerv_cli.training.early_distillation import EarlyDistillation, teach_early
 from kerv_cli.training.imitation import (
     Imitation,
     Samples,
@@ -39,9 +36,8 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Job, Loop, Metrics
-from kerv_cli.training.observations import check_camera, check_shown, check_spaces, split
+from kerv_cli.training.observations import check_camera, check_shown, check_spaces
 from kerv_cli.training.ranks import Ranks, join
-from kerv_cli.training.recorded import teach_recorded
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
@@ -245,18 +241,38 @@ class TargetRun(Run):
         save_target(self.folder, module, environment, origin | self.init_hash, self.settings.train.stored)
 
 
+class Lesson(Protocol):
+    """What a drafter learns: its samples, loss and validation, as `Job` takes them."""
+
+    @property
+    def module(self) -> nn.Module:
+        """What is trained, on its device."""
+
+    def __len__(self) -> int:
+        """Number of training samples."""
+
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """See `Job.loss`."""
+
+    def validate(self, module: nn.Module) -> Metrics:
+        """See `Job.validate`."""
+
+
 class DrafterRun(Run):
-    """`kerv train drafter`: the EAGLE-style drafter.
+    """Base of what `kerv train drafter` runs: weights that draft for a target, trained on demonstrations.
+
+    artifact: the kind of what is written. before: settings that runs of before named too, with their values: they are
+    part of a run's identity.
 
     Raises:
         UsageError: `train.init` is set. CheckpointError: no such target or demonstrations.
     """
 
-    kind = noun = "drafter"
+    kind = "drafter"
+    artifact: Weights[Any]
+    before: ClassVar[Mapping[str, float]] = {}
     settings: TrainDrafterSettings
     target: Any  # a ReadableTarget
-    states: TeacherStates | StatesByLength
-    held_out: TeacherStates | StatesByLength
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
         self.settings = settings
@@ -265,7 +281,8 @@ class DrafterRun(Run):
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
-        self.folder = self.drafter_folder()
+        name = settings.policy.named(self.artifact.kind)
+        self.folder = self.artifact.place(settings.results, name, self.target_folder)
         dataset = open_demos(settings.results, settings.demos)
         self.dataset = subset(dataset, settings.task, settings.starts)
         description = read_target(self.target_folder)
@@ -274,103 +291,56 @@ class DrafterRun(Run):
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
 
-    def drafter_folder(self) -> Path:
-        """Where the drafter is written."""
-        return artifact_folder("drafter")(self.settings.results, self.settings.policy.drafter, self.target_folder)
+    @abstractmethod
+    def lesson(self, progress: Progress) -> Lesson:
+        """Reads the demonstrations through `target`: a fresh module and what it learns; progress(done, total)."""
+
+    def summary(self) -> str:
+        """What is trained and on what, for --plan."""
+        s, what = self.settings.drafter, f"{self.artifact.noun} of {self.target_folder}"
+        return f"{s.layers}-layer {what}, greedy decodes of {s.samples} observations"
 
     def plan(self) -> str:
         """One line for --plan: target, observations, steps and folder."""
-        s = self.settings
-        return (
-            f"{self.folder}: {s.drafter.layers}-layer {self.noun} of {self.target_folder}, greedy decodes of "
-            f"{s.drafter.samples} observations, {s.train.steps} steps of {s.train.batch}"
-        )
+        train = self.settings.train
+        return f"{self.folder}: {self.summary()}, {train.steps} steps of {train.batch}"
 
     def load(self, progress: Progress) -> None:
-        """Loads the target and lets it decode the demonstrations' observations; progress(done, total).
+        """Loads the target and reads the demonstrations; progress(done, total).
 
         Raises:
-            CheckpointError: target or demonstrations are damaged. UsageError: as `begin`; noise on several processes.
+            CheckpointError: target or demonstrations are damaged. UsageError: as `begin`.
         """
         self.begin()
-        if self.settings.drafter.noise and self.ranks.size > 1:
-            raise UsageError(
-                f"drafter.noise={self.settings.drafter.noise} is drawn for a whole batch: train with one process, or "
-                "without noise"
-            )
         self.target, self.description = load_target(self.target_folder, self.device)
-        self.teach(progress)
-
-    def teach(self, progress: Progress) -> None:
-        """Collects the target's states for training and validation."""
-        if not isinstance(self.target, CompactTarget):
-            limit, share = self.settings.drafter.samples, self.settings.train.held_out
-            self.states, self.held_out = teach_recorded(self.target, self.dataset, limit, share, progress)
-            return
-        tasks = tuple(dict.fromkeys(e.task for e in self.dataset.episodes))
-        samples = load_samples(self.dataset, self.target.settings, self.target.words, tasks)
-        training, held_out = split(samples, self.settings.train.held_out)
-        limit = self.settings.drafter.samples
-        self.states = teach(self.target, training, limit, progress)
-        self.held_out = teach(self.target, held_out, max(60, limit // 50), lambda done, total: None)
+        self.learnt = self.lesson(progress)
 
     def job(self) -> Job:
         """See `Run.job`."""
-        torch.manual_seed(self.settings.train.seed)
-        drafter = Drafter.beside(self.settings.drafter, self.target).to(self.device)
-        run = Distillation(drafter, self.target, self.states, self.held_out, self.settings.drafter)
-        return Job(drafter, len(self.states), run.loss, run.validate, self.save)
+        lesson = self.learnt
+        return Job(lesson.module, len(lesson), lesson.loss, lesson.validate, self.save)
 
     def identity(self) -> dict[str, Any]:
         """Shapes and the target's weights."""
         s = self.settings
         tasks = list(resolve_tasks(s.task)) if s.task else []
         covering = {"task": tasks, "starts": s.starts} if tasks or s.starts != "all" else {}
-        return {"drafter": asdict(s.drafter), "target": self.description.sha256, **covering}
+        return {"drafter": {**self.before, **asdict(s.drafter)}, "target": self.description.sha256, **covering}
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
         """See `Run.write`."""
-        assert isinstance(module, Drafter)
-        save_drafter(self.folder, module, self.target, self.description.sha256, origin, self.settings.train.stored)
-
-
-class EarlyRun(DrafterRun):
-    """`kerv train drafter drafter=early`; its errors are those of DrafterRun."""
-
-    noun = "early drafter"
-
-    def drafter_folder(self) -> Path:
-        """Where the early drafter is written."""
-        return artifact_folder("early")(self.settings.results, self.settings.policy.early, self.target_folder)
-
-    def teach(self, progress: Progress) -> None:
-        """Collects the target's tokens and pooled prompts."""
-        samples = teach_early(self.target, self.dataset, self.settings.drafter, progress)
-        self.training, self.validation = split(samples, self.settings.train.held_out)
-
-    def job(self) -> Job:
-        """See `Run.job`."""
-        torch.manual_seed(self.settings.train.seed)
-        early = EarlyDrafter.beside(self.settings.drafter, self.target)
-        early.standardise(self.training.features)
-        run = EarlyDistillation(early.to(self.device), self.training, self.validation, self.settings.train)
-        return Job(early, len(self.training), run.loss, run.validate, self.save)
-
-    def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
-        """See `Run.write`."""
-        assert isinstance(module, EarlyDrafter)
-        save_early(self.folder, module, self.description.sha256, origin, self.settings.train.stored)
-
-
-DRAFTER_RUNS: dict[str, type[DrafterRun]] = {"eagle": DrafterRun, "early": EarlyRun}
+        made_for, stored = MadeFor.of(self.description), self.settings.train.stored
+        self.artifact.save(self.folder, module, made_for, origin, stored, settings=asdict(self.settings.drafter))
 
 
 def drafter_run(settings: TrainDrafterSettings) -> DrafterRun:
     """The training run of `drafter.kind`.
 
     Raises:
-        UnknownName: no such kind.
+        UnknownName: no such kind. UsageError: settings of another kind.
     """
-    if settings.drafter.kind not in DRAFTER_RUNS:
-        raise UnknownName("drafter.kind", settings.drafter.kind, DRAFTER_RUNS)
-    return DRAFTER_RUNS[settings.drafter.kind](settings)
+    part = find("drafter", settings.drafter.kind, "drafter.kind")
+    if not isinstance(settings.drafter, part.settings):
+        raise UsageError(f"drafter.kind={part.name}: choose drafter={part.name}, each has settings of its own")
+    run: DrafterRun = part.built(settings)
+    return run

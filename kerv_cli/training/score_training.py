@@ -17,7 +17,7 @@ from kerv_cli.base.settings import TrainScoreSettings
 from kerv_cli.engine.loss import BAD, auc
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.risk.recording import FEATURES, RiskRecording
-from kerv_cli.methods.risk.scores import FLOOR, LearnedScore, save_score
+from kerv_cli.methods.risk.scores import FLOOR, LearnedScore, ScoreArtifact
 
 Metrics = dict[str, float]
 
@@ -74,8 +74,17 @@ class ScoreRun:
         metrics = {name: value for name, value in metrics.items() if math.isfinite(value)}  # no AUC without bad drafts
         origin = {"command": "kerv train score", "settings": asdict(s), "metrics": metrics, **provenance("cpu")}
         manifest = self.recording.manifest
-        source, hashes = (self.source, manifest.sources[self.source]), manifest.read_by(self.source, s.inputs)
-        save_score(self.folder, model, manifest.target, source, hashes, origin)
+        ScoreArtifact().save(
+            self.folder,
+            model,
+            manifest.target,
+            origin,
+            inputs=s.inputs,
+            features=model.features,
+            source=self.source,
+            source_sha256=manifest.sources[self.source],
+            made_from=manifest.read_by(self.source, s.inputs),
+        )
         return metrics
 
     def _inputs(self) -> Tensor:

@@ -16,4 +16,4 @@ for _name, _made_by, _needed in (
     ("object", "objects:Objects", ("model", "range")),
 ):
     add("stress", _name, f"kerv_cli.worlds.stress.{_made_by}", needed=_needed)
-add("stress", "none")
+add("stress", "none", needed=())

@@ -4,13 +4,19 @@ and a mask; the cache stores what was forwarded and every forward computes all o
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
-from examples.own_target import SEVEN
-from torch import Tensor
+from torch import Tensor, nn
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.places import artifact
+from kerv_cli.base.registry import add
+from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.targets.checkpoint import TargetDescription, load_state, save_module, target_fields
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 
 class Remembered:
@@ -26,16 +32,20 @@ class Remembered:
         self.seen[start : self.length] = np.tri(self.capacity, dtype=bool)[start : self.length]
 
 
-class OwnPolicy:
+class OwnPolicy(nn.Module):
     """The `Target` protocol around a model. Here: one layer of attention with random weights."""
 
     cameras, max_prompt, device, chunk, width = (), 16, torch.device("cpu"), 1, 32
+    table: Tensor
+    rows: Tensor
+    turn: Tensor
 
-    def __init__(self, actions: ActionSpace = SEVEN) -> None:
-        random = torch.Generator().manual_seed(0)
+    def __init__(self, actions: ActionSpace = SPEC.actions) -> None:
+        super().__init__()
+        random, shape = torch.Generator().manual_seed(0), (actions.tokens, self.width)
         self.actions = actions
-        self.table, self.rows = (torch.randn(actions.tokens, self.width, generator=random) for _ in range(2))
-        self.turn = torch.randn(self.width, generator=random)
+        for name, size in {"table": shape, "rows": shape, "turn": shape[1:]}.items():
+            self.register_buffer(name, torch.randn(size, generator=random))
 
     def model(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """x (B, T, E), positions (T,), mask (T, T) bool -> (B, T, E). Yours instead."""
@@ -67,8 +77,19 @@ class OwnPolicy:
         return hidden @ self.rows.T
 
 
-def build(folder: object, description: object, device: str, dtype: torch.dtype) -> OwnPolicy:
-    return OwnPolicy()
+def write(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
+    """`kerv build target target=own`: here random weights; yours are those in `settings.checkpoint`."""
+    folder, policy = artifact(settings.results, "target", settings.name), OwnPolicy()
+    fields = target_fields("own", {"chunk": policy.chunk}, SPEC.name, policy.actions, SPEC.observation)
+    save_module(folder, "target", policy, fields)
+    return folder, {"action tokens": policy.actions.tokens}
 
 
-register(Part("target", "own", "examples.own_policy:build"))
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> OwnPolicy:
+    """What every command calls that decodes."""
+    policy = OwnPolicy(description.actions)
+    load_state(policy, folder, "target")
+    return policy
+
+
+add("target", "own", f"{__name__}:build", importer=f"{__name__}:write")

@@ -1,9 +1,9 @@
-"""Example: a proposer of your own, with weights of its own, in two files.
+"""Example: a proposer of your own, with weights of its own and their training, in two files.
 
 This one is light: it says what there is, so that `--cfg`, completion and wrong overrides are answered before torch is
-imported. `KERV_PLUGINS=examples.own_proposer` registers it; then `kerv rollout proposer=follow`,
-`prefill_draft=follow` and `prefill_draft=merged prefill_draft.sources=[follow]` draft with it, and
-`+policy.others.follow=NAME` names its weights where they do not lie beside the target.
+imported. `KERV_PLUGINS=examples.own_proposer` registers it; then `kerv train drafter drafter=follow` trains it, and
+`kerv rollout proposer=follow`, `prefill_draft=follow` and `prefill_draft=merged prefill_draft.sources=[follow]` draft
+with it; `+policy.others.follow=NAME` names its weights where they do not lie beside the target.
 """
 
 from __future__ import annotations
@@ -22,7 +22,16 @@ class FollowSettings:
     depth: int = number(0, 0, 1024)  # tokens drafted at once, with its range; 0: all that are left
 
 
-register(Part("artifact", "follow", "examples.own_proposer_table:ARTIFACT"))
+@dataclass
+class FollowDrafterSettings:
+    """The table's training: `kerv train drafter drafter=follow drafter.share=0.5`."""
+
+    kind: str = "follow"
+    share: float = number(1.0, above=0, most=1)  # of every episode, from its beginning, is learned from
+
+
+register(Part("artifact", "follow", "examples.own_proposer_table:FollowArtifact"))
+register(Part("drafter", "follow", "examples.own_proposer_table:FollowRun", FollowDrafterSettings))
 register(
     Part(
         "proposer",

@@ -1,84 +1,113 @@
-"""The weights of `own_proposer`, as safetensors and JSON, and the proposer that drafts with them."""
+"""The weights of `own_proposer`, as safetensors and JSON, their training, and the proposer that drafts with them."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from examples.own_proposer import FollowSettings
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.methods.artifacts import Artifact, Request, artifact_folder
+from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
-from kerv_cli.targets.checkpoint import Description, TargetDescription, load_state, read_description, save_module
+from kerv_cli.training.loop import Metrics
+from kerv_cli.training.observations import Rows, split
+from kerv_cli.training.runs import DrafterRun
 
 
 class FollowTable(nn.Module):
-    """follows (D, V) int64: of every DoF, the token one control step after each token."""
-
-    follows: Tensor
+    """Of every DoF and token the logits (V,) of the token one control step later; fresh: itself."""
 
     def __init__(self, dofs: int, tokens: int) -> None:
         super().__init__()
-        self.register_buffer("follows", torch.arange(tokens).repeat(dofs, 1))
+        self.dofs, self.tokens = dofs, tokens
+        self.logits = nn.Parameter(0.1 * torch.eye(tokens).repeat(dofs, 1, 1))
 
     @classmethod
     def fit(cls, episodes: Iterable[np.ndarray], space: ActionSpace) -> FollowTable:
-        """episodes: (T, D) tokens each. A token that was never seen is followed by itself."""
-        table, counts = (
-            cls(space.dofs, space.tokens),
-            np.zeros((space.dofs, space.tokens, space.tokens), dtype=np.int64),
-        )
-        for tokens in episodes:
-            for before, after in itertools.pairwise(tokens):
-                counts[np.arange(space.dofs), before, after] += 1
-        seen = torch.from_numpy(counts.sum(2) > 0)
-        table.follows[seen] = torch.from_numpy(counts.argmax(2))[seen]
+        """The table of how often every token followed. episodes: (T, D) tokens each."""
+        table = cls(space.dofs, space.tokens)
+        with torch.no_grad():
+            for tokens in episodes:
+                for before, after in itertools.pairwise(tokens):
+                    table.logits[np.arange(space.dofs), before, after] += 1
         return table
+
+    @property
+    def follows(self) -> Tensor:
+        """(D, V) int64: the most probable token behind each."""
+        return self.logits.argmax(-1)
+
+    def forward(self, before: Tensor) -> Tensor:
+        """tokens (B, D) -> logits (B, D, V) of those one control step later."""
+        return self.logits[torch.arange(self.dofs), before]
+
+
+class FollowArtifact(Weights[WeightsDescription]):
+    """The table's files: its weights, and the JSON that all weights have."""
+
+    kind, noun = "follow", "table"
+    again = "run 'kerv train drafter drafter=follow'"
+    schema = WeightsDescription
+    any_chunk = True
+
+    def module(self, description: WeightsDescription, target: Any) -> FollowTable:
+        return FollowTable(description.actions.dofs, description.actions.tokens)
 
 
 @dataclass(frozen=True)
-class FollowDescription(Description):
-    """The JSON beside the weights. target: SHA-256 of the target's weights."""
+class Pairs(Rows):
+    """n control steps of demonstrations."""
 
-    target: str
-    actions: ActionSpace
-
-
-def save(folder: Path, table: FollowTable, target: TargetDescription) -> str:
-    """Writes weights and description -> SHA-256 of the weights."""
-    return save_module(folder, "follow", table, {"target": target.sha256, "actions": target.actions.as_dict()})
+    before: Tensor  # (n, D) tokens
+    after: Tensor  # (n, D) tokens, one control step later
+    episodes: Tensor  # (n,)
 
 
-def described(folder: Path, request: Request) -> FollowDescription:
-    """Raises CheckpointError: missing, damaged, or another target's."""
-    own, target = read_description(folder, "follow", FollowDescription), request.description
-    own.actions.check_same(target.actions, f"the table in {folder}", "the target", statistics=True)
-    if own.target != target.sha256:
-        raise CheckpointError(f"the table in {folder} is of target {own.target[:12]}, not of {target.sha256[:12]}")
-    return own
+class FollowLesson:
+    """What follows what in the demonstrations."""
+
+    def __init__(self, module: FollowTable, training: Pairs, held_out: Pairs) -> None:
+        self.module, self.training, self.held_out = module, training, held_out
+
+    def __len__(self) -> int:
+        return len(self.training)
+
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        logits = self.module(self.training.before[indices])
+        return F.cross_entropy(logits.flatten(0, 1), self.training.after[indices].flatten()), {}
+
+    @torch.no_grad()
+    def validate(self, module: nn.Module) -> Metrics:
+        return {"score": float((module(self.held_out.before).argmax(-1) == self.held_out.after).float().mean())}
 
 
-def load(folder: Path, request: Request) -> FollowTable:
-    """The weights; errors as `described`."""
-    actions = described(folder, request).actions
-    table = FollowTable(actions.dofs, actions.tokens)
-    load_state(table, folder, "follow")
-    return table
+class FollowRun(DrafterRun):
+    """`kerv train drafter drafter=follow`."""
 
+    artifact = FollowArtifact()
 
-ARTIFACT = Artifact(
-    "follow", artifact_folder("follow"), lambda folder, request: described(folder, request).sha256, load
-)
+    def summary(self) -> str:
+        return f"a table of {self.target_folder}"
+
+    def lesson(self, progress: Callable[[int, int], None]) -> FollowLesson:
+        space, count, pairs = self.target.actions, len(self.dataset.episodes), []
+        for index in range(count):
+            labels = self.dataset.load(index).labels
+            tokens = torch.from_numpy(space.encode(labels[: math.ceil(len(labels) * self.settings.drafter.share)]))
+            pairs.append(Pairs(tokens[:-1], tokens[1:], torch.full((len(tokens) - 1,), index)))
+            progress(index + 1, count)
+        table = FollowTable(space.dofs, space.tokens).to(self.device)
+        return FollowLesson(table, *split(Pairs.joined(pairs), self.settings.train.held_out))
 
 
 class FollowProposer(ChainProposer):
@@ -87,7 +116,7 @@ class FollowProposer(ChainProposer):
     name = "follow"
 
     def __init__(self, table: FollowTable, depth: int = 0) -> None:
-        self.follows, self.depth = table.follows.numpy(), depth
+        self.follows, self.depth = table.follows.cpu().numpy(), depth
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         history, first = chunk.situation.history.values(), len(chunk.tokens)

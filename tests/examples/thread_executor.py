@@ -1,5 +1,4 @@
-"""An executor from outside: threads of this process. Registered by `KERV_PLUGINS=thread_executor`, chosen by
-`runtime.executor=threads`."""
+"""Example: an executor of your own: threads of this process."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.registry import Part, register
+from kerv_cli.base.registry import add
 
 
 @dataclass
@@ -36,4 +35,4 @@ def build(options: ThreadOptions, slots: int, threads: int, folder: Path) -> Thr
     return Threads(slots, options.name)
 
 
-register(Part("executor", "threads", "thread_executor:build", settings=ThreadOptions))
+add("executor", "threads", f"{__name__}:build", ThreadOptions)

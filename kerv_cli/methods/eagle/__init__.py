@@ -11,6 +11,19 @@ _DRAFTER = "kerv_cli.methods.eagle.drafter:"
 
 
 @dataclass
+class DrafterSettings:
+    """Decoder layers of the target's width behind its states, and their training (§2.2)."""
+
+    kind: str = "eagle"
+    layers: int = number(1, 0, 1024)
+    noise: float = number(0.0, 0, 100)  # uniform noise on the input states, training only
+    unroll: int = number(3, 1, 64)  # passes fed with its own predicted states, as drafting does; 1: the paper's
+    samples: int = number(12_000, 1, 10**8)  # observations whose greedy decodes it is trained on
+    state_weight: float = number(1.0, 0, 1e6)  # smooth-L1 on the hidden state
+    token_weight: float = number(0.1, 0, 1e6)  # soft cross-entropy with the target's distribution
+
+
+@dataclass
 class DrafterProposerSettings:
     """EAGLE-style drafter (§2.2). The default is a greedy chain as deep as the chunk: on a CPU it beats a tree, because
     relaxed acceptance accepts most of what siblings would catch, and every verified node costs time (study=tree)."""
@@ -21,6 +34,7 @@ class DrafterProposerSettings:
     nodes: int = number(15, 1, MOST_TOKENS)  # tree nodes kept after reranking
 
 
-add("artifact", "drafter", _DRAFTER + "ARTIFACT")
+add("artifact", "drafter", _DRAFTER + "DrafterArtifact")
+add("drafter", "eagle", "kerv_cli.training.distillation:EagleRun", DrafterSettings)
 _build = (_DRAFTER + "DrafterProposer.build", DrafterProposerSettings)
 add("proposer", "drafter", *_build, needs=("drafter",), colour=0x56B4E9, when=STATES)

@@ -9,7 +9,7 @@ beginning, in training and at inference.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,20 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import DrafterSettings
-from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.protocol import Cache as AnyCache
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.engine.unread import Unread
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import PublicShape, load_public
-from kerv_cli.targets.checkpoint import FLOAT32, Description, read_description, save_module
 from kerv_cli.targets.compact.cache import Cache
-from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.compact.trunk import LayerStack
 
 
@@ -214,65 +211,30 @@ class DrafterProposer:
         return self.target.embed(upload([tokens], self.target.device))
 
 
-@dataclass(frozen=True)
-class DrafterDescription(Description):
-    """A drafter's JSON. target: hash of the weights it imitates; actions: the action space whose tokens it drafts.
-    public: shape and convention of one in the public layout."""
+@dataclass(frozen=True, kw_only=True)
+class DrafterDescription(WeightsDescription):
+    """A drafter's JSON. public: shape and convention of one in the public layout."""
 
     settings: DrafterSettings
-    target: str
-    actions: ActionSpace
-    provenance: dict[str, Any]
     public: PublicShape | None = None
 
 
-def save_drafter(
-    folder: Path,
-    drafter: Drafter,
-    target: Target,
-    target_sha256: str,
-    provenance: dict[str, Any],
-    stored: str = FLOAT32,
-) -> str:
-    """Writes the drafter and its description, which names its target by hash -> sha256 of the drafter's weights."""
-    description = {
-        "settings": asdict(drafter.settings),
-        "target": target_sha256,
-        "actions": target.actions.as_dict(),
-        "provenance": provenance,
-    }
-    return save_module(folder, "drafter", drafter, description, stored)
+class DrafterArtifact(Weights[DrafterDescription]):
+    """The drafter's files; it drafts for a target with chunks of any length."""
 
+    kind = noun = "drafter"
+    again = "run 'kerv train drafter'"
+    schema = DrafterDescription
+    any_chunk = True
 
-def read_drafter(folder: Path, target_sha256: str, actions: ActionSpace) -> DrafterDescription:
-    """The description of the drafter in `folder`. actions: the target's.
+    def module(self, description: DrafterDescription, target: ReadableTarget) -> Drafter:
+        """A fresh drafter."""
+        return Drafter.beside(description.settings, target)
 
-    Raises:
-        CheckpointError: none there, a damaged one, one of another target or action space.
-    """
-    description = read_description(folder, "drafter", DrafterDescription)
-    made_for, again = MadeFor(description.target, description.actions), "run 'kerv train drafter'"
-    present = MadeFor(target_sha256, actions)
-    made_for.check_same(present, f"the drafter in {folder}", "trained", again)
-    return description
-
-
-def load_drafter(folder: Path, target: ReadableTarget, target_sha256: str) -> tuple[Any, DrafterDescription]:
-    """The drafter, ready for inference, and its description; errors as `read_drafter`."""
-    description = read_drafter(folder, target_sha256, target.actions)
-    if description.public is not None:
-        return load_public(folder, description.public, target), description
-    drafter = Drafter.beside(description.settings, target)
-    return load_packed(drafter, folder, "drafter", target.device, target.dtype), description
-
-
-def _check(folder: Path, request: Request) -> str:
-    return read_drafter(folder, request.description.sha256, request.description.actions).sha256
-
-
-def _load(folder: Path, request: Request) -> DraftsStates:
-    target: Any = request.target
-    return load_drafter(folder, target, request.description.sha256)[0]
-
-
-ARTIFACT = Artifact("drafter", artifact_folder("drafter"), _check, _load)
+    def load(self, place: Path, request: Request) -> DraftsStates:
+        """The drafter, ready for inference, of whichever layout."""
+        public = self.checked(place, request.description).public
+        if public is not None:
+            return load_public(place, public, request.target)
+        drafter: Drafter = super().load(place, request)
+        return drafter

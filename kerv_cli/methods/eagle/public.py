@@ -7,7 +7,6 @@ of drafted tokens, and which keys they see. Everything else follows from the lay
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,11 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.files import read_json
 from kerv_cli.base.manifests import read
 from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors, save_tensors
+from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import Language
 from kerv_cli.targets.openvla.layout import Sizes, layer_tensors
 from kerv_cli.targets.openvla.loading import SINGLE, check_layout, conversion, open_shards
@@ -152,13 +151,6 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
     skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
     shape = PublicShape(language, bias, convention.check(), skipped.stop - skipped.start)
     return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}
-
-
-def save_public(folder: Path, tensors: Mapping[str, Tensor]) -> str:
-    """Writes the weights -> their SHA-256."""
-    folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(folder / WEIGHTS, tensors)
-    return sha256_of(folder / WEIGHTS)
 
 
 def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> PublicDrafter:

@@ -1,13 +1,31 @@
 """The early drafter: the whole chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours).
-Registration."""
+Settings and
+registration."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from kerv_cli.base.limits import number
 from kerv_cli.base.registry import PREFILL, add
 
 _DRAFTER = "kerv_cli.methods.early.drafter:"
 
-add("artifact", "early", _DRAFTER + "ARTIFACT")
+
+@dataclass
+class EarlySettings:
+    """A residual network from the prompt and the last actions to the whole chunk, and its training (§5)."""
+
+    kind: str = "early"
+    layers: int = number(2, 0, 1024)  # residual blocks
+    width: int = number(384, 1, 65_536)  # hidden units
+    rank: int = number(32, 1, 65_536)  # features per token in front of the bins
+    history: int = number(0, 0, 1024)  # last executed actions it reads
+    samples: int = number(100_000, 1, 10**8)  # observations whose greedy decodes it is trained on, at most
+
+
+add("artifact", "early", _DRAFTER + "EarlyArtifact")
+add("drafter", "early", "kerv_cli.training.early_distillation:EarlyRun", EarlySettings)
 # chains: it drafts whole chains, so that a merged draft can take it as a source
 _build = _DRAFTER + "EarlyProposer.build"
 add("proposer", "early", _build, needs=("early",), colour=0xD4A6C8, when=PREFILL, chains=True)

@@ -9,8 +9,7 @@ costs one small pass.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.settings import DrafterSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
@@ -27,12 +24,11 @@ from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import TokenTree
 from kerv_cli.engine.unread import TreeRows, Unread
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
-from kerv_cli.targets.checkpoint import FLOAT32, Description, TargetDescription, read_description, save_module
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.kernels import FastLinear, RowNorm, gain_of
 from kerv_cli.targets.compact.packable import Packable, Packed
-from kerv_cli.targets.compact.packed import load_packed
 
 SURE = 0.05
 """Estimate from which fallback sources do not draft: 89 % of such chunks were accepted whole (mt10-vision, r = 9)."""
@@ -75,7 +71,7 @@ class EarlyDrafter(Packable):
     strict: Tensor
     packed: PackedEarly | None
 
-    def __init__(self, settings: DrafterSettings, actions: ActionSpace, chunk: int, features: int) -> None:
+    def __init__(self, settings: EarlySettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
         self.settings, self.actions, self.chunk = settings, actions, chunk
         self.tokens = chunk * actions.dofs
@@ -90,7 +86,7 @@ class EarlyDrafter(Packable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     @classmethod
-    def beside(cls, settings: DrafterSettings, target: ReadableTarget) -> EarlyDrafter:
+    def beside(cls, settings: EarlySettings, target: ReadableTarget) -> EarlyDrafter:
         """A fresh early drafter for the target's action space, H and F."""
         return cls(settings, target.actions, target.chunk, target.pooled_width)
 
@@ -314,62 +310,20 @@ class EarlyProposer(ChainProposer):
         return self.drafted(chunk).odds >= SURE
 
 
-@dataclass(frozen=True)
-class EarlyDescription(Description):
-    """An early drafter's JSON. target: hash of the weights it imitates; chunk: H that it drafts; actions: the action
-    space of its tokens."""
+@dataclass(frozen=True, kw_only=True)
+class EarlyDescription(WeightsDescription):
+    """An early drafter's JSON."""
 
-    settings: DrafterSettings
-    target: str
-    chunk: int
-    actions: ActionSpace
-    provenance: dict[str, Any]
+    settings: EarlySettings
 
 
-def save_early(
-    folder: Path, early: EarlyDrafter, target_sha256: str, provenance: dict[str, Any], stored: str = FLOAT32
-) -> str:
-    """Writes the early drafter and its description, which names its target by hash -> sha256 of its own weights."""
-    description = {
-        "settings": asdict(early.settings),
-        "target": target_sha256,
-        "chunk": early.chunk,
-        "actions": early.actions.as_dict(),
-        "provenance": provenance,
-    }
-    return save_module(folder, "early", early, description, stored)
+class EarlyArtifact(Weights[EarlyDescription]):
+    """The early drafter's files."""
 
-
-def read_early(folder: Path, target: TargetDescription) -> EarlyDescription:
-    """The description of the early drafter in `folder`.
-
-    Raises:
-        CheckpointError: none there, a damaged one, one of another target, chunk or action space.
-    """
+    kind, noun = "early", "early drafter"
     again = "run 'kerv train drafter drafter=early'"
-    if not (folder / "early.json").is_file():
-        raise CheckpointError(f"no early drafter in {folder}: {again}")
-    early = read_description(folder, "early", EarlyDescription)
-    made_for = MadeFor(early.target, early.actions, early.chunk)
-    present = MadeFor(target.sha256, target.actions, target.chunk)
-    made_for.check_same(present, f"the early drafter in {folder}", "trained", again)
-    return early
+    schema = EarlyDescription
 
-
-def load_early(
-    folder: Path, target: ReadableTarget, description: TargetDescription
-) -> tuple[EarlyDrafter, EarlyDescription]:
-    """The early drafter of `target`, ready for inference, and its description; errors as `read_early`."""
-    early_description = read_early(folder, description)
-    early = EarlyDrafter.beside(early_description.settings, target)
-    return load_packed(early, folder, "early", target.device, target.dtype), early_description
-
-
-def _load(folder: Path, request: Request) -> EarlyDrafter:
-    target: Any = request.target
-    return load_early(folder, target, request.description)[0]
-
-
-ARTIFACT = Artifact(
-    "early", artifact_folder("early"), lambda folder, request: read_early(folder, request.description).sha256, _load
-)
+    def module(self, description: EarlyDescription, target: ReadableTarget) -> EarlyDrafter:
+        """A fresh early drafter."""
+        return EarlyDrafter.beside(description.settings, target)

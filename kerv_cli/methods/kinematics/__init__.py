@@ -12,7 +12,7 @@ from kerv_cli.base.registry import PREFILL, NoSettings, add, find
 _PREDICTION = "kerv_cli.methods.kinematics.prediction:"
 _THRESHOLDS = "kerv_cli.methods.kinematics.thresholds:"
 
-add("artifact", "calibration", "kerv_cli.methods.calibration:ARTIFACT")
+add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact")
 
 # --- predictors, and proposers that draft by them (§3.1, §6)
 

@@ -28,7 +28,7 @@ class QdrantSearchSettings:
     url: str | None = None  # a server, e.g. http://localhost:6333; None: the engine in this process
 
 
-add("artifact", "datastore", _DATASTORE + "ARTIFACT")
+add("artifact", "datastore", _DATASTORE + "DatastoreArtifact")
 _retrieval = (_DATASTORE + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
 add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
 # what searches (§4.1): every backend finds the same neighbours

@@ -27,20 +27,19 @@ from torch import Tensor
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import CheckpointError, UnknownName
-from kerv_cli.base.manifests import check_files, content_of, read_file
+from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import Stateless
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
 from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, artifact_folder
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.retrieval.search import ExactIndex, Index, best
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
-FORMAT = 2
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 CROSS = 0.1  # probability that a path changes to other neighbours
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
@@ -179,8 +178,7 @@ class Datastore:
                 statistics or another chunk length, or from evaluation seeds.
             UsageError: an unknown backend, one whose packages are not installed, a server that does not answer.
         """
-        manifest = read_manifest(folder)
-        check_target(manifest, description, folder)
+        manifest = DatastoreArtifact().checked(folder, description)
         parts = _arrays(folder, manifest)
         index = None
         if search is not None:
@@ -239,32 +237,6 @@ def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
     return {"vectors": vectors, "shards": shards, "projection": projection, **payload}
 
 
-def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a datastore; checks that its files are unchanged and its seeds training seeds.
-
-    Raises:
-        CheckpointError: missing, damaged, of another format, or from evaluation seeds.
-    """
-    path = folder / "manifest.json"
-    if not path.is_file():
-        raise CheckpointError(f"no datastore in {folder}: {AGAIN}")
-    manifest = read_file(Manifest, path, f"a datastore's manifest of format {FORMAT}: {AGAIN}")
-    check_files(folder, manifest.files, AGAIN)
-    check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, folder)
-    return manifest
-
-
-def check_target(manifest: Manifest, description: TargetDescription, folder: Path) -> None:
-    """Refuses a datastore that was made for another target, chunk length or action space.
-
-    Raises:
-        CheckpointError: another chunk length, action space or action statistics, other weights.
-    """
-    present = MadeFor(description.sha256, description.actions, description.chunk)
-    made_for = MadeFor(manifest.target, manifest.actions, manifest.chunk)
-    made_for.check_same(present, f"the datastore in {folder}", "built", AGAIN)
-
-
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
     import pyarrow.parquet as pq
 
@@ -274,17 +246,34 @@ def _read_payload(path: Path) -> dict[str, np.ndarray]:
     return {"tokens": flat.reshape(len(table), -1), **columns}
 
 
-def _check(folder: Path, request: Request) -> str:
-    manifest = read_manifest(folder)
-    check_target(manifest, request.description, folder)
-    return manifest.content
+class DatastoreArtifact(Artifact[Manifest]):
+    """The datastore's files."""
 
+    kind = noun = "datastore"
+    made, again = "built", AGAIN
+    schema = Manifest
 
-def _load(folder: Path, request: Request) -> Datastore:
-    return Datastore.open(folder, request.description, request.search)
+    def json(self, place: Path) -> Path:
+        """`manifest.json`."""
+        return place / "manifest.json"
 
+    def read(self, place: Path) -> Manifest:
+        """See `Artifact.read`; the seeds must be training seeds."""
+        manifest = super().read(place)
+        check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, place)
+        return manifest
 
-ARTIFACT = Artifact("datastore", artifact_folder("datastore"), _check, _load)
+    def made_for(self, description: Manifest) -> MadeFor:
+        """The target that it was built for."""
+        return MadeFor(description.target, description.actions, description.chunk)
+
+    def digest(self, place: Path, description: Manifest) -> str:
+        """`Manifest.content`."""
+        return description.content
+
+    def load(self, place: Path, request: Request) -> Datastore:
+        """The datastore, opened."""
+        return Datastore.open(place, request.description, request.search)
 
 
 def neighbour_tree(

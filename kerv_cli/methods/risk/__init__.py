@@ -3,12 +3,16 @@ it may look at, and the recording that certifies its level."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 
+from kerv_cli.base.files import sha256_of
 from kerv_cli.base.limits import MOST_DECODES, number
 from kerv_cli.base.registry import add, find
 
 _SCORES = "kerv_cli.methods.risk.scores:"
+CERTIFICATE = 2  # raised where the same recording certifies another level or raises the alarm elsewhere
 
 
 @dataclass
@@ -39,8 +43,13 @@ def needs_of_risk(settings: RiskSkipSettings) -> tuple[str, ...]:
     return (*certified, *find("score", settings.score, "skip.score").needs(None))
 
 
-add("artifact", "risk", "kerv_cli.methods.risk.recording:ARTIFACT")
-add("artifact", "score", _SCORES + "ARTIFACT")
+def hash_of_recording(path: Path) -> str:
+    """Hash of a recording's description and of what is made of it: another certificate is other work."""
+    return hashlib.sha256(f"{sha256_of(path)} {CERTIFICATE}".encode()).hexdigest()
+
+
+add("artifact", "risk", "kerv_cli.methods.risk.recording:RiskArtifact")
+add("artifact", "score", _SCORES + "ScoreArtifact")
 _gate = ("kerv_cli.methods.risk.gate:RiskSkip.build", RiskSkipSettings, needs_of_risk, check_risk)
 add("skip", "risk", *_gate, colour=0x3B6FB6, takes_draft=True, merges=True, retrieves=True)
 for _name, _score, _needs in (

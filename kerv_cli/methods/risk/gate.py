@@ -1,5 +1,4 @@
-"""Risk-controlled verification: a calibrated gate, and its online audit: has the risk left ε? (docs/methods.md §4.6,
-ours)"""
+"""Risk-controlled verification: a calibrated gate with its audits (docs/methods.md §4.6, ours)."""
 
 from __future__ import annotations
 
@@ -19,10 +18,9 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd.rules import retrieval_of
 from kerv_cli.methods.merged.proposer import first_source
 from kerv_cli.methods.risk import RiskSkipSettings
-from kerv_cli.methods.risk.recording import RiskRecording
+from kerv_cli.methods.risk.alarm import Audit
+from kerv_cli.methods.risk.recording import RiskRecording, decoding_of
 from kerv_cli.methods.risk.scores import Draft, Score
-
-BETS = np.linspace(0.1, 0.9, 9)  # shares of the wealth that can be lost on one loss
 
 
 def episode_numbers(purpose: str, task: str, seed: int) -> np.random.Generator:
@@ -37,14 +35,21 @@ class RiskSkip(Skip):
     An episode's first `opening` decodes are verified, and so is everything after an alarm, until the audit ends it. A
     verified draft with a loss of `doubt` or more, for whatever reason it was verified, is followed by another
     verification, so that trust does not outlast what contradicts it.
-    level: least score that is trusted. scale: ε_a, normalised action units, of the loss.
+    level: least score that is trusted. scale: ε_a, normalised action units, of the loss. alarm: evidence at which the
+    alarm is raised; None: 1/δ.
     """
 
     def __init__(
-        self, settings: RiskSkipSettings, source: DraftsChunks, score: Score, level: float, scale: float
+        self,
+        settings: RiskSkipSettings,
+        source: DraftsChunks,
+        score: Score,
+        level: float,
+        scale: float,
+        alarm: float | None = None,
     ) -> None:
         self.settings, self.source, self.score, self.level, self.scale = settings, source, score, level, scale
-        self.audit = Audit(settings.epsilon, settings.delta)
+        self.audit = Audit(settings.epsilon, settings.delta, alarm)
         self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
         self.decodes = 0  # of this episode
         self.suspicious = False  # the last decode was verified with a loss of `doubt` or more
@@ -55,7 +60,8 @@ class RiskSkip(Skip):
         """skip=risk.
 
         Raises:
-            CheckpointError: the recording does not know the source or the score, or is too small to certify anything.
+            CheckpointError: the recording does not know the source or the score, was decoded otherwise, or is too small
+                to certify anything.
         """
         draft = context.built["prefill_draft"]
         source = retrieval_of(context) if draft is None else first_source(draft)
@@ -63,9 +69,11 @@ class RiskSkip(Skip):
         if settings.level is not None:
             return cls(settings, source, score, settings.level, LOSS_SCALE)
         recording: RiskRecording = context.artifact("risk")
+        recording.check_decoding(decoding_of(context.method, context.chunk, context.target))
         recording.check_size(source.name, settings.epsilon, settings.delta)
         level = recording.certified(source.name, settings.score, settings.epsilon, settings.delta).level
-        return cls(settings, source, score, level, recording.manifest.scale)
+        alarm = recording.alarm_level(source.name, settings, level)
+        return cls(settings, source, score, level, recording.manifest.scale, alarm)
 
     def begin(self, task: str, seed: int) -> None:
         """An episode begins. Which decodes are audited depends on task and seed alone."""
@@ -121,59 +129,3 @@ class RiskSkip(Skip):
             self.audit.add(loss)
             if self.audit.alarm and not trust.alarm:
                 chunk.trust = replace(chunk.trust, alarm=True)
-
-
-class Evidence:
-    """Anytime-valid evidence about the mean of losses in [0, 1], from those added so far: two e-processes, each a
-    mixture of bets (Waudby-Smith and Ramdas 2024). Whoever stops when one reaches 1/δ errs with probability δ at most,
-    whenever he looks.
-
-    above: against "the mean is at most ε"; below: against "the mean is at least ε".
-    """
-
-    def __init__(self, epsilon: float) -> None:
-        self.epsilon = epsilon
-        self.reset()
-
-    def reset(self) -> None:
-        """No loss was added."""
-        self._above = np.ones(len(BETS))
-        self._below = np.ones(len(BETS))
-
-    def add(self, loss: float) -> None:
-        """One more loss."""
-        excess = loss - self.epsilon
-        self._above *= 1 + BETS / self.epsilon * excess
-        self._below *= 1 - BETS / (1 - self.epsilon) * excess
-
-    @property
-    def above(self) -> float:
-        """e-value of "the risk has left ε"."""
-        return float(self._above.mean())
-
-    @property
-    def below(self) -> float:
-        """e-value of "the risk is within ε"."""
-        return float(self._below.mean())
-
-
-class Audit:
-    """Collects the losses of decodes that the gate would have skipped but that were verified. Raises an alarm when the
-    evidence that the risk is above ε reaches 1/δ, and ends it when the evidence since then that it is not does."""
-
-    def __init__(self, epsilon: float, delta: float) -> None:
-        self.evidence, self.level = Evidence(epsilon), 1 / delta
-        self.alarm = False
-
-    def reset(self) -> None:
-        """A new episode begins: nothing is carried over, so that episodes do not depend on their order."""
-        self.evidence.reset()
-        self.alarm = False
-
-    def add(self, loss: float) -> None:
-        """The loss of one audited decode."""
-        self.evidence.add(loss)
-        reached = self.evidence.below if self.alarm else self.evidence.above
-        if reached >= self.level:
-            self.alarm = not self.alarm
-            self.evidence.reset()

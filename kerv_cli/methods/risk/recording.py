@@ -20,23 +20,43 @@ import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of, write_folder, write_json
-from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.registry import find
-from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
+from kerv_cli.engine.chunk import steps_of
+from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
+from kerv_cli.methods.risk import RiskSkipSettings, hash_of_recording
+from kerv_cli.methods.risk.alarm import alarm_level
+from kerv_cli.methods.risk.betting import p_value
 
-FORMAT = 1
 GRID = 40  # candidate levels: quantiles of the scores
 DECODES, FEATURES = "decodes.parquet", "features.npy"
 AGAIN = "run 'kerv calibrate risk'"
 ROW = [("source", pa.string()), ("task", pa.string()), ("seed", pa.int64()), ("index", pa.int64())]
 """Columns of DECODES before `loss` and one column per score: what drafted, the episode, the decode in it."""
 
+_DECODING = ("acceptance", "threshold")
+_OLDER_DECODING = {
+    "acceptance.kind": "relaxed",
+    "acceptance.strict_dofs": True,
+    "threshold.kind": "fixed",
+    "threshold.r": 9,
+}
+
+
+def decoding_of(method: Mapping[str, Any], chunk: int, target: Any) -> dict[str, Any]:
+    """What drafts, scores and losses depend on besides artifacts, as flat settings: acceptance and threshold, by whose
+    radius a drafter chooses its tokens, chunk length and number format. method: kind -> settings. chunk: 0: the
+    target's."""
+    parts = {f"{kind}.{name}": value for kind in _DECODING for name, value in asdict(method[kind]).items()}
+    dtype = str(target.dtype).removeprefix("torch.")
+    return {**parts, "chunk": steps_of(chunk, target.chunk), "runtime.dtype": dtype}
+
 
 @dataclass(frozen=True)
 class RiskManifest:
     """Description of a recording. sources: proposer of the drafts -> hash of its artifact, empty where it has none.
     scale: ε_a. tasks: task -> seeds, all of them selection seeds. scores: columns. files: name ->
-    SHA-256. made_from: what sources and scores read, kind of artifact -> hash; absent from older recordings."""
+    SHA-256. made_from: what sources and scores read, kind of artifact -> hash. decoding: as `decoding_of`. Both are
+    absent from older recordings."""
 
     target: MadeFor
     sources: dict[str, str]
@@ -46,6 +66,7 @@ class RiskManifest:
     files: dict[str, str]
     provenance: dict[str, Any] = field(default_factory=dict)
     made_from: dict[str, str] = field(default_factory=dict)
+    decoding: dict[str, Any] = field(default_factory=dict)
     format: Literal[1] = 1
     kind: Literal["risk"] = "risk"
 
@@ -57,6 +78,13 @@ class RiskManifest:
     def artifacts(self) -> dict[str, str]:
         """Kind -> hash of the artifacts it was made from; an older recording names the early drafter alone."""
         return self.made_from or {name: digest for name, digest in self.sources.items() if digest}
+
+    @property
+    def decoded_with(self) -> dict[str, Any]:
+        """`decoding`; an older recording was made with the one method that there was."""
+        runtime = self.provenance.get("settings", {}).get("runtime", {})
+        older = {"chunk": self.target.chunk, "runtime.dtype": runtime.get("dtype", "float32")}
+        return self.decoding or {**_OLDER_DECODING, **older}
 
     def read_by(self, source: str, scores: Sequence[str]) -> dict[str, str]:
         """Those of `artifacts` that a source's drafts and these scores read."""
@@ -115,6 +143,28 @@ class RiskRecording:
             self._certified[key] = certify(values, losses.losses, losses.episodes, epsilon, delta)
         return self._certified[key]
 
+    def alarm_level(self, source: str, settings: RiskSkipSettings, level: float) -> float:
+        """Evidence at which the alarm of a gate with this least trusted score is raised; see `alarm.alarm_level`."""
+        losses = self.losses(source)
+        trusted = losses.scores[settings.score] >= level
+        decodes = [np.flatnonzero(losses.episodes == number) for number in range(int(losses.episodes.max()) + 1)]
+        return alarm_level([(trusted[part], losses.losses[part]) for part in decodes], settings)
+
+    def check_decoding(self, used: Mapping[str, Any]) -> None:
+        """Refuses a method that decodes otherwise than this recording did. used: as `decoding_of`.
+
+        Raises:
+            CheckpointError: it does; names both values and the command that records anew.
+        """
+        recorded = self.manifest.decoded_with
+        others = [name for name in used if name in recorded and used[name] != recorded[name]]
+        kinds = {name.split(".")[0] for name in others if name.endswith(".kind")}
+        others = [name for name in others if name.split(".")[0] not in kinds or name.endswith(".kind")]
+        if others:
+            values = " and ".join(f"{name}={recorded[name]}, not {used[name]}" for name in others)
+            words = " ".join(f"{name.removesuffix('.kind')}={used[name]}" for name in others)
+            raise CheckpointError(f"the risk was recorded with {values}: run 'kerv calibrate risk {words}'")
+
     def check_size(self, source: str, epsilon: float, delta: float) -> None:
         """Refuses a recording of too few episodes to certify anything.
 
@@ -159,65 +209,26 @@ def save_risk(
     return recording
 
 
-def read_risk(folder: Path, request: Request) -> RiskManifest:
-    """The manifest in `folder`, which must have been recorded for this target.
+class RiskArtifact(Artifact[RiskManifest]):
+    """The recording's files."""
 
-    Raises:
-        CheckpointError: none there, damaged, or another target's.
-    """
-    path = folder / "risk.json"
-    if not path.is_file():
-        raise CheckpointError(f"no recorded risk in {folder}: {AGAIN}")
-    manifest = _manifest(folder)
-    check_files(folder, manifest.files, AGAIN)
-    target = request.description
-    manifest.target.check_same(
-        MadeFor(target.sha256, target.actions, target.chunk), f"the risk in {folder}", "recorded", AGAIN
-    )
-    return manifest
+    kind, noun, made, again = "risk", "risk recording", "recorded", AGAIN
+    schema = RiskManifest
 
+    def sources(self, description: RiskManifest) -> Mapping[str, str]:
+        """What sources and scores read."""
+        return description.artifacts
 
-def _manifest(folder: Path) -> RiskManifest:
-    return read_file(RiskManifest, folder / "risk.json", f"a recording of format {FORMAT}: {AGAIN}")
+    def digest(self, place: Path, description: RiskManifest) -> str:
+        """Of the description and of what is made of it: another certificate is other work."""
+        return hash_of_recording(self.json(place))
 
-
-def _sources(folder: Path) -> MadeFrom:
-    return MadeFrom(f"the risk in {folder}", "recorded", AGAIN, _manifest(folder).artifacts)
-
-
-def _check(folder: Path, request: Request) -> str:
-    read_risk(folder, request)
-    return sha256_of(folder / "risk.json")
-
-
-def _load(folder: Path, request: Request) -> RiskRecording:
-    return RiskRecording(read_risk(folder, request), pq.read_table(folder / DECODES))
-
-
-ARTIFACT = Artifact("risk", artifact_folder("risk"), _check, _load, _sources)
+    def load(self, place: Path, request: Request) -> RiskRecording:
+        """The recorded decodes."""
+        return RiskRecording(self.checked(place, request.description), pq.read_table(place / DECODES))
 
 
 # --- levels at which a gate's risk is certified: Learn-then-Test over episodes (Angelopoulos et al. 2021)
-
-
-def hoeffding_bentkus(mean: float, alpha: float, n: int) -> float:
-    """p-value of the hypothesis that n independent variables in [0, 1] with this mean have an expectation above alpha;
-    the smaller of Hoeffding's and Bentkus' tails (Bates et al. 2021, §3.1)."""
-    from scipy.stats import binom  # 60 MB, which most commands do not need
-
-    if n == 0 or mean >= alpha:
-        return 1.0
-    entropy = (1 - mean) * math.log((1 - mean) / (1 - alpha)) + (mean * math.log(mean / alpha) if mean > 0 else 0.0)
-    bentkus = math.e * float(binom.cdf(math.ceil(n * mean), n, alpha))
-    return min(1.0, math.exp(-n * entropy), bentkus)
-
-
-def betting(values: np.ndarray, alpha: float) -> float:
-    """p-value of the same hypothesis from the values (n,) themselves: 1 ÷ the wealth of a mixture of bets against it
-    (Waudby-Smith and Ramdas 2024). Sharper than `hoeffding_bentkus` where they vary little."""
-    bets = np.linspace(0.1, 0.95, 10)[:, None] / (1 - alpha)
-    wealth = np.exp(np.log1p(bets * (alpha - values[None])).sum(1)).mean()
-    return float(min(1.0, 1 / max(wealth, 1e-300)))
 
 
 @dataclass(frozen=True)
@@ -244,10 +255,9 @@ def episode_means(skipped: np.ndarray, losses: np.ndarray, episodes: np.ndarray)
     return means
 
 
-def p_value(means: np.ndarray, epsilon: float) -> float:
-    """Of the hypothesis that the episodes' expected mean loss is above ε: the smaller of two tests, doubled."""
-    tails = hoeffding_bentkus(float(means.mean()), epsilon, len(means)), betting(means, epsilon)
-    return min(1.0, 2 * min(tails))
+def shuffled(means: np.ndarray) -> np.ndarray:
+    """The values (n,) in a random order that their number determines: the recording's is task by task."""
+    return np.random.default_rng(0).permutation(means)
 
 
 def certify(scores: np.ndarray, losses: np.ndarray, episodes: np.ndarray, epsilon: float, delta: float) -> Certified:
@@ -265,7 +275,7 @@ def certify(scores: np.ndarray, losses: np.ndarray, episodes: np.ndarray, epsilo
         if len(np.unique(episodes[skipped])) < needed:
             continue
         means = episode_means(skipped, losses, episodes)
-        p = p_value(means, epsilon)
+        p = p_value(shuffled(means), epsilon, delta)
         if p > delta:
             break
         best = Certified(level, float(skipped.mean()), float(means.mean()), p, len(means))
@@ -276,6 +286,6 @@ def certify(scores: np.ndarray, losses: np.ndarray, episodes: np.ndarray, epsilo
 def episodes_needed(epsilon: float, delta: float) -> int:
     """Fewest episodes that certify anything, none of them with a loss."""
     n = 1
-    while p_value(np.zeros(n), epsilon) > delta:
+    while p_value(np.zeros(n), epsilon, delta) > delta:
         n += 1
     return n

@@ -15,19 +15,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.registry import NoSettings, find
-from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import DraftsChunks
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import upload
-from kerv_cli.methods.artifacts import Artifact, MadeFor, MadeFrom, Request, artifact_folder
+from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.retrieval.datastore import RetrievalProposer
-from kerv_cli.targets.checkpoint import Description, load_state, read_description, save_module
+from kerv_cli.targets.compact.packed import load_packed
 
-AGAIN = "run 'kerv train score'"
 HIDDEN = 64
 FLOOR = -50.0  # scores below, −inf among them, are read as this
 LEAST_ODDS = 1e-30
@@ -192,74 +190,32 @@ class LearnedScore(nn.Module):
         return float(self(torch.cat([features.float(), values], 1)).sigmoid())
 
 
-@dataclass(frozen=True)
-class ScoreDescription(Description):
-    """A learned score's JSON. target: hash of the weights whose prompts it reads. source: the proposer of
-    its drafts, and that artifact's hash. made_from: artifacts that drafts and inputs read, kind -> hash; absent from
-    older scores."""
+@dataclass(frozen=True, kw_only=True)
+class ScoreDescription(WeightsDescription):
+    """A learned score's JSON. source: the proposer of its drafts, and that artifact's hash. made_from: artifacts that
+    drafts and inputs read, kind -> hash; absent from older scores."""
 
     inputs: list[str]
     features: int
-    target: str
     source: str
     source_sha256: str
-    chunk: int
-    actions: ActionSpace
-    provenance: dict[str, Any]
     made_from: dict[str, str] = field(default_factory=dict)
 
-    @property
-    def artifacts(self) -> dict[str, str]:
-        """Kind -> hash of the artifacts it was made from; an older score names its source alone, the early drafter."""
-        return self.made_from or ({self.source: self.source_sha256} if self.source_sha256 else {})
 
+class ScoreArtifact(Weights[ScoreDescription]):
+    """The learned score's files."""
 
-def save_score(
-    folder: Path,
-    model: LearnedScore,
-    made_for: MadeFor,
-    source: tuple[str, str],
-    made_from: Mapping[str, str],
-    provenance: dict[str, Any],
-) -> str:
-    """Writes the score -> SHA-256 of its weights. source: name and hash of the drafts' proposer.
-    made_from: kind -> hash."""
-    described = {
-        "inputs": list(model.inputs),
-        "features": model.features,
-        "target": made_for.sha256,
-        "source": source[0],
-        "source_sha256": source[1],
-        "chunk": made_for.chunk,
-        "actions": made_for.actions.as_dict(),
-        "made_from": dict(made_from),
-        "provenance": provenance,
-    }
-    return save_module(folder, "score", model, described)
+    kind, noun = "score", "learned score"
+    again = "run 'kerv train score'"
+    schema = ScoreDescription
 
+    def sources(self, description: ScoreDescription) -> Mapping[str, str]:
+        """See `Artifact.sources`; an older score names its source alone, the early drafter."""
+        digest = description.source_sha256
+        return description.made_from or ({description.source: digest} if digest else {})
 
-def read_score(folder: Path, request: Request) -> ScoreDescription:
-    """The description in `folder`; errors as `targets.checkpoint.read_description`, and for another target."""
-    description = read_description(folder, "score", ScoreDescription)
-    target = request.description
-    MadeFor(description.target, description.actions, description.chunk).check_same(
-        MadeFor(target.sha256, target.actions, target.chunk), f"the score in {folder}", "trained", AGAIN
-    )
-    return description
-
-
-def _sources(folder: Path) -> MadeFrom:
-    description = read_description(folder, "score", ScoreDescription)
-    return MadeFrom(f"the score in {folder}", "trained", AGAIN, description.artifacts)
-
-
-def _load(folder: Path, request: Request) -> LearnedScore:
-    description = read_score(folder, request)
-    model = LearnedScore(description.inputs, description.features)
-    load_state(model, folder, "score")
-    return model.eval()
-
-
-ARTIFACT = Artifact(
-    *("score", artifact_folder("score"), lambda folder, request: read_score(folder, request).sha256, _load, _sources)
-)
+    def load(self, place: Path, request: Request) -> LearnedScore:
+        """The network, in float32 on the target's device."""
+        description = self.checked(place, request.description)
+        model = LearnedScore(description.inputs, description.features)
+        return load_packed(model, place, self.kind, request.target.device, torch.float32)

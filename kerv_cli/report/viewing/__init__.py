@@ -9,7 +9,7 @@ from kerv_cli.engine.record import EpisodeRecord
 
 
 def save_recording(record: EpisodeRecord, path: Path, method: str, limits: Mapping[str, float]) -> None:
-    """As `rerun_log.save_episode`. Picklable; Rerun is imported by the first call."""
+    """Writes an episode as a recording, see `rerun_log.save_episode`. Picklable; the first call imports Rerun."""
     from kerv_cli.report.viewing.rerun_log import save_episode
 
     save_episode(record, path, method=method, limits=limits)

@@ -59,19 +59,20 @@ class EpisodeMeta:
 
 def blueprint(meta: EpisodeMeta) -> rrb.Blueprint:
     """The layout: camera, path and summary on the left; tokens and series over time in the middle; the current decode
-    on the right. Playback is paused."""
+    on the right."""
     left: list[rrb.View] = [_path(meta), _document("summary", "Episode")]
     shares = [4.0, 3.6]
     if meta.frames:
         left.insert(0, rrb.Spatial2DView(origin="/camera", name="Camera"))
         shares.insert(0, 4.0)
+    columns = rrb.Vertical(*left, row_shares=shares), _over_time(meta), _current_decode(meta)
+    return paused(rrb.Horizontal(*columns, column_shares=[3, 5, 4]))
+
+
+def paused(views: rrb.Horizontal) -> rrb.Blueprint:
+    """These views alone, without the viewer's panels; playback is paused."""
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*left, row_shares=shares),
-            _over_time(meta),
-            _current_decode(meta),
-            column_shares=[3, 5, 4],
-        ),
+        views,
         rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),

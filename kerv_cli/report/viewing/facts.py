@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.report.viewing.token_outcomes import OUTCOMES
+from kerv_cli.report.viewing.token_outcomes import OUTCOMES, acceptance
 
 _SHOWN_SYMBOLS = set("→✓×≈·–…≤≥±αφσ") | {s.symbol for s in OUTCOMES.values()}
 
@@ -37,8 +37,7 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, Any]:
         "compensated_tokens": sum(d.compensated for d in record.decodes),
     }
     if rounds:
-        facts["acceptance_length"] = sum(r.committed for r in rounds) / len(rounds)
-        facts["accepted_per_round"] = sum(r.accepted for r in rounds) / len(rounds)
+        facts["acceptance_length"], facts["accepted_per_round"] = acceptance(rounds)
     return facts
 
 

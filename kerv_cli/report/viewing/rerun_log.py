@@ -124,7 +124,7 @@ def meta_of(record: EpisodeRecord, chunks: Chunks, limits: Mapping[str, float]) 
         drafted=any(o.kind not in ("target", "scripted", "dropped") for chunk in chunks for o in chunk),
         threshold=any(_threshold(d) for d in record.decodes),
         signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
-        most=max(max(d.forwards, acceptance(d)[0] if d.verifications else 0) for d in record.decodes),
+        most=max(max(d.forwards, acceptance(d.rounds)[0] if d.verifications else 0) for d in record.decodes),
         slowest=1000 * max(d.seconds for d in record.decodes),
         widest=max((max(_threshold(d), default=0) for d in record.decodes), default=0),
         limited=tuple(limits),
@@ -327,7 +327,7 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
         Series(
             "decode/acceptance",
             ["AL, tokens per verification", "drafts accepted per verification"],
-            [acceptance(d) if d.verifications else () for d in decodes],
+            [acceptance(d.rounds) if d.verifications else () for d in decodes],
             [0x56B4E9FF, 0x009E73FF],
         ),
         Series("decode/threshold", limit_names, limits, [0xE69F00FF, *_DOF_COLORS]),

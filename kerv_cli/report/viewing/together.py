@@ -12,7 +12,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path
-from kerv_cli.report.viewing.blueprint import STEP
+from kerv_cli.report.viewing.blueprint import paused
 from kerv_cli.report.viewing.viewer import chunks_of, read_back
 
 SIDES = ("left", "right")
@@ -54,16 +54,7 @@ def _encode(paths: Sequence[Path], contents: Sequence[dict[str, Any]]) -> bytes:
         ]
         recording.send_chunks(moved)
     columns = [_column(side, name, content) for side, name, content in zip(SIDES, methods, contents, strict=True)]
-    recording.send_blueprint(
-        rrb.Blueprint(
-            rrb.Horizontal(*columns),
-            rrb.TimePanel(state="collapsed", timeline=STEP, play_state="paused"),
-            rrb.BlueprintPanel(state="collapsed"),
-            rrb.SelectionPanel(state="collapsed"),
-            auto_layout=False,
-            auto_views=False,
-        )
-    )
+    recording.send_blueprint(paused(rrb.Horizontal(*columns)))
     return bytes(memory.drain_as_bytes())
 
 

@@ -144,7 +144,7 @@ def decode_line(decode: DecodeRecord) -> str:
     """Forwards, verifications, acceptance, compensation and time of a decode, in one line."""
     parts = [f"{decode.forwards} forward{'s' * (decode.forwards != 1)}"]
     if decode.verifications:
-        length, accepted = acceptance(decode)
+        length, accepted = acceptance(decode.rounds)
         parts.append(f"{decode.verifications} verified · AL {length:.2f} · accepted {accepted:.2f}")
     if decode.compensated:
         parts.append(f"{decode.compensated} compensated")
@@ -166,9 +166,10 @@ def trust_words(trust: Trust) -> str:
     return ", ".join([*words, *(["ALARM"] * trust.alarm)])
 
 
-def acceptance(decode: DecodeRecord) -> tuple[float, float]:
-    """AL (tokens committed per verification) and accepted per round (docs/methods.md §7) of a decode that verified."""
-    rounds = [r for r in decode.rounds if r.is_verification]
+def acceptance(rounds: Sequence[Round]) -> tuple[float, float]:
+    """AL (tokens committed per verification) and accepted per round (docs/methods.md §7); rounds: at least one that
+    verified."""
+    rounds = [r for r in rounds if r.is_verification]
     return sum(r.committed for r in rounds) / len(rounds), sum(r.accepted for r in rounds) / len(rounds)
 
 

@@ -10,7 +10,7 @@ import torch
 
 from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import TargetSettings
-from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module
+from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
 from kerv_cli.targets.compact.packed import load_packed
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
@@ -21,17 +21,11 @@ def save_target(
 ) -> str:
     """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
     `save_module`."""
-    description = {
-        "family": "compact",
-        "environment": environment,
-        "settings": asdict(target.settings),
-        "actions": target.actions.as_dict(),
-        "observation": target.observation.as_dict(),
-        "cameras": list(target.cameras),
-        "words": list(target.words.words),
-        "provenance": provenance,
-    }
-    return save_module(folder, "target", target, description, stored)
+    fields = target_fields(
+        *("compact", asdict(target.settings), environment, target.actions, target.observation),
+        *(target.cameras, target.words.words, provenance),
+    )
+    return save_module(folder, "target", target, fields, stored)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:

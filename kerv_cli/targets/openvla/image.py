@@ -7,6 +7,7 @@ of the area (`crop`), resized bilinearly: the sides are cut by the square root o
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError, UsageError
@@ -102,18 +104,32 @@ def _interpolated(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 def resized(image: np.ndarray, size: int) -> np.ndarray:
     """image (h, w, 3) uint8 -> (size, size, 3) uint8, bicubic with antialiasing."""
-    from PIL import Image
-
     if image.shape[:2] == (size, size):
         return image
     return np.asarray(Image.fromarray(image).resize((size, size), Image.Resampling.BICUBIC))
 
 
-def pixels_of(image: np.ndarray, shape: Shape, normalisations: Sequence[Normalisation], crop: bool) -> Tensor:
-    """image (h, w, 3) uint8 -> (1, 6, s, s) float32: normalised for the first tower, then for the second."""
+def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
+    """image (h, w, 3) uint8 -> (size, size, 3) uint8 as OpenVLA's evaluation on LIBERO prepares a frame before its crop
+    (`resize_image` of its libero_utils): through JPEG as TensorFlow writes it (quality 95, colour at half resolution),
+    because the training data were, then Lanczos with antialiasing."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
+    pixels = np.asarray(Image.open(file), dtype=np.float32)
+    # channel by channel as floats: Pillow would cut off the overshoot of whole numbers between its two passes
+    channels = (Image.fromarray(pixels[:, :, i]).resize((size, size), Image.Resampling.LANCZOS) for i in range(3))
+    return np.stack([np.asarray(one) for one in channels], -1).round().clip(0, 255).astype(np.uint8)
+
+
+def pixels_of(
+    image: np.ndarray, shape: Shape, normalisations: Sequence[Normalisation], crop: bool, libero: bool = False
+) -> Tensor:
+    """image (h, w, 3) uint8 -> (1, 6, s, s) float32: normalised for the first tower, then for the second. crop: show
+    the central part. libero: as `as_in_libero`, before that."""
     parts = []
     for tower, normal in zip(shape.towers, normalisations, strict=True):
-        view = cropped(image, tower.image) if crop else image
+        view = as_in_libero(image, tower.image) if libero else image
+        view = cropped(view, tower.image) if crop else view
         pixels = torch.from_numpy(np.array(resized(view, tower.image), dtype=np.float32)) / 255
         mean, std = torch.tensor(normal.mean), torch.tensor(normal.std)
         parts.append(((pixels - mean) / std).permute(2, 0, 1))

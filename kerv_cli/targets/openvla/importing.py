@@ -11,8 +11,8 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.settings import BuildTargetSettings
-from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.targets.checkpoint import FORMAT
+from kerv_cli.base.spaces import ObservationSpace
+from kerv_cli.targets.checkpoint import FORMAT, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.image import read_normalisations
 from kerv_cli.targets.openvla.layout import layout
@@ -53,38 +53,27 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         files=shards.sizes(),
         prompt=settings.prompt,
         crop=settings.crop,
+        libero=settings.libero,
         int8=settings.int8,
         prompt_tokens=settings.prompt_tokens,
         image_size=shape.towers[0].image,
     )
     origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
     folder = artifact(settings.results, "target", settings.name)
-    camera = spec.camera_name(settings.camera) if spec else settings.camera or "primary"
-    description = _description(target_settings, spec, actions, camera, hashes)
-    write_json(folder / "target.json", {**description, "provenance": {**origin, **provenance(settings.runtime.device)}})
+    fields = target_fields(
+        *("openvla", asdict(target_settings), spec.name if spec else "none", actions),
+        spec.observation if spec else SEES_NOTHING_ELSE,
+        cameras=[spec.camera_name(settings.camera) if spec else settings.camera or "primary"],
+        provenance={**origin, **provenance(settings.runtime.device)},
+    )
+    computed = {"prompt": settings.prompt, "crop": settings.crop, "int8": settings.int8}
+    if settings.libero:  # hashes of older targets lack it
+        computed["libero"] = True
+    digest = digest_of(hashes, computed)
+    write_json(folder / "target.json", {"format": FORMAT, "kind": "target", "sha256": digest, **fields})
     prompt = shape.patches + len(prompter.ids("move"))
     figures = {"parameters": parameters, "prompt tokens": prompt, "action tokens": actions.tokens, "DoFs": actions.dofs}
     return folder, figures
-
-
-def _description(
-    settings: OpenVLASettings, spec: EnvironmentSpec | None, actions: ActionSpace, camera: str, hashes: dict[str, str]
-) -> dict[str, Any]:
-    """The contents of target.json, but for the provenance."""
-    computed = {"prompt": settings.prompt, "crop": settings.crop, "int8": settings.int8}
-    observation = spec.observation if spec else SEES_NOTHING_ELSE
-    return {
-        "format": FORMAT,
-        "kind": "target",
-        "sha256": digest_of(hashes, computed),
-        "family": "openvla",
-        "environment": spec.name if spec else "none",
-        "settings": asdict(settings),
-        "actions": actions.as_dict(),
-        "observation": observation.as_dict(),
-        "cameras": [camera],
-        "words": [],
-    }
 
 
 def _environment(name: str | None) -> EnvironmentSpec | None:

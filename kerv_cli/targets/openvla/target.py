@@ -33,7 +33,8 @@ from kerv_cli.targets.openvla.trunk import KeyValueCache
 class OpenVLASettings:
     """`settings` of a target.json of family openvla. checkpoint: folder of the published files. statistics: name of the
     data set whose actions it emits. prompt: openvla or openvla_v01. crop: whether the central 90 % of an image are
-    shown (for checkpoints fine-tuned with augmented images). int8: the language model's layers with one byte a weight.
+    shown (for checkpoints fine-tuned with augmented images). libero: whether an image goes through JPEG and Lanczos, as
+    in OpenVLA's evaluation on LIBERO. int8: the language model's layers with one byte a weight.
     prompt_tokens: longest prompt without the patches. image_size: pixels of a tower. chunk: H. files: name -> bytes."""
 
     checkpoint: str
@@ -41,6 +42,7 @@ class OpenVLASettings:
     files: dict[str, int]
     prompt: str = "openvla"
     crop: bool = False
+    libero: bool = False
     int8: bool = False
     prompt_tokens: int = 64
     image_size: int = 224
@@ -105,7 +107,7 @@ class OpenVLATarget:
         if camera not in observation.images:
             raise CheckpointError(f"the target is shown camera '{camera}', whose image was not drawn")
         image = check_image(observation.images[camera], camera)
-        patches = self.see(pixels_of(image, self.shape, self.normalisations, self.settings.crop))
+        patches = self.see(pixels_of(image, self.shape, self.normalisations, self.settings.crop, self.settings.libero))
         words = self.words(observation.instruction)
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
 

@@ -87,6 +87,32 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
+def entry_of(path: Path, episode: DemoEpisode) -> dict[str, Any]:
+    """The manifest's entry of an episode that lies in `path`."""
+    own = {name: getattr(episode, name) for name in ("seed", "perturbed", "steps")}
+    return {**own, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
+
+
+def totals(
+    entries: Mapping[str, Sequence[Mapping[str, Any]]], failed: Mapping[str, Sequence[int]], missing: int
+) -> dict[str, Any]:
+    """The manifest's fields that sum up its episodes. entries: task -> `entry_of`; failed: task -> seeds."""
+    tasks = {}
+    for task, rows in entries.items():
+        episodes = sorted(rows, key=lambda entry: entry["seed"])
+        mean = round(sum(entry["steps"] for entry in rows) / len(rows), 2)
+        tasks[task] = {"mean_steps": mean, "failed_seeds": sorted(failed.get(task, ())), "episodes": episodes}
+    seeds = [entry["seed"] for rows in entries.values() for entry in rows]
+    ends = {"first": min(seeds), "last": max(seeds)}
+    return {
+        "seeds": ends,
+        "episodes": len(seeds),
+        "missing": missing,
+        "sha256": dataset_hash(tasks),
+        "tasks": tasks,
+    }
+
+
 @dataclass(frozen=True)
 class DemoEntry(EpisodeEntry):
     """An episode of a dataset, and its file."""

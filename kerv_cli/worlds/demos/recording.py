@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.camera import CameraConfig, choose_backend
-from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, dataset_hash, episode_path, with_environment
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, entry_of, episode_path, totals, with_environment
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
 from kerv_cli.worlds.spec import EnvironmentSpec, Expert, World
@@ -211,7 +211,11 @@ def record(
         entries, failed = _collect(config, out, on_progress, make_actor)
     finally:
         _release_world()
-    manifest = {**identity, **_summary(config, entries, failed)}
+    empty = [task for task, rows in entries.items() if not rows]
+    if empty:
+        raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
+    missing = config.episodes * len(config.tasks) - sum(map(len, entries.values()))
+    manifest = {**identity, **totals(entries, failed, missing)}
     write_json(out / "manifest.json", manifest)
     return read(DemoManifest, manifest, str(out / "manifest.json"))
 
@@ -339,13 +343,7 @@ def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Act
             write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
             return None
         save_episode(path, episode)
-    return {
-        "seed": seed,
-        "perturbed": episode.perturbed,
-        "steps": episode.steps,
-        "bytes": path.stat().st_size,
-        "sha256": sha256_of(path),
-    }
+    return entry_of(path, episode)
 
 
 def _world_for(task: str, config: DemoConfig) -> World:
@@ -369,22 +367,3 @@ def _valid_episode(path: Path, task: str, seed: int, spec: EnvironmentSpec) -> D
     except CheckpointError:
         return None
     return episode if (episode.task, episode.seed) == (task, seed) else None
-
-
-def _summary(config: DemoConfig, entries: _Entries, failed: _Failures) -> dict[str, Any]:
-    empty = [task for task, rows in entries.items() if not rows]
-    if empty:
-        raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
-    tasks = {}
-    for task in config.tasks:
-        rows = sorted(entries[task], key=lambda entry: entry["seed"])
-        mean = sum(entry["steps"] for entry in rows) / len(rows)
-        tasks[task] = {"mean_steps": round(mean, 2), "failed_seeds": sorted(failed[task]), "episodes": rows}
-    seeds = [entry["seed"] for rows in entries.values() for entry in rows]
-    return {
-        "seeds": {"first": min(seeds), "last": max(seeds)},
-        "episodes": len(seeds),
-        "missing": config.episodes * len(config.tasks) - len(seeds),
-        "sha256": dataset_hash(tasks),
-        "tasks": tasks,
-    }

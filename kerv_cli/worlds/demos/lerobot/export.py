@@ -7,6 +7,7 @@ between them are left out and the rate is lower.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -152,18 +153,16 @@ class Export:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
-            with atomic_path(data_path(self.folder, file)) as temporary:
-                first, size = self.table(self.dataset.load(index), file), 0
-                with pq.ParquetWriter(temporary, first.schema, compression="snappy") as writer:
-                    table = first
-                    while True:
-                        writer.write_table(table)
-                        size += table.nbytes
-                        index += 1
-                        progress(index, total)
-                        if index == total or size > FILE_MB * 2**20:
-                            break
-                        table = self.table(self.dataset.load(index), file)
+            with atomic_path(data_path(self.folder, file)) as temporary, contextlib.ExitStack() as stack:
+                writer, size = None, 0
+                while index < total and size <= FILE_MB * 2**20:
+                    table = self.table(self.dataset.load(index), file)
+                    writer = writer or stack.enter_context(
+                        pq.ParquetWriter(temporary, table.schema, compression="snappy")
+                    )
+                    writer.write_table(table)
+                    size, index = size + table.nbytes, index + 1
+                    progress(index, total)
             file += 1
 
     def info(self) -> dict[str, Any]:

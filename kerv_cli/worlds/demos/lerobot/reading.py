@@ -16,10 +16,10 @@ import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
-from kerv_cli.worlds.demos.dataset import FORMAT, dataset_hash, episode_path
+from kerv_cli.worlds.demos.dataset import FORMAT, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot.layout import (
     ACTION,
@@ -61,8 +61,9 @@ class Source:
             raise CheckpointError(f"{folder} has no images or no {ACTION}: it cannot be learned from")
         if camera and camera not in cameras:
             raise UnknownName("camera", camera, cameras)
-        rows = [row for path in sorted(folder.glob("meta/episodes/*/*.parquet")) for row in _rows(path)]
-        tasks = {int(row["task_index"]): str(_task_of(row)) for row in _rows(folder / TASKS)}
+        rows = [row for path in sorted(folder.glob("meta/episodes/*/*.parquet")) for row in _table(path).to_pylist()]
+        named = _table(folder / TASKS).to_pylist()
+        tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in named}
         return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
 
     @property
@@ -87,10 +88,7 @@ class Source:
         """The rows of one episode, in order."""
         indices = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
         path = self.folder / str(self.info.get("data_path") or DATA).format(**indices)
-        try:
-            table = pq.read_table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
-        except (OSError, ValueError) as error:
-            raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
+        table = _table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
         if len(table) != int(episode["length"]):
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
@@ -128,9 +126,7 @@ def import_lerobot(
         state = episode.states.shape[1]
         path = episode_path(folder, episode.task, episode.seed)
         save_episode(path, episode)
-        size, digest = path.stat().st_size, sha256_of(path)
-        entry = {"seed": episode.seed, "perturbed": False, "steps": episode.steps, "bytes": size, "sha256": digest}
-        entries.setdefault(episode.task, []).append(entry)
+        entries.setdefault(episode.task, []).append(entry_of(path, episode))
         progress(done + 1, len(chosen))
     manifest = _manifest(source, settings, entries, names, np.concatenate(actions), state)
     write_json(folder / "recording.json", {k: manifest[k] for k in ("format", "environment", "config")})
@@ -174,8 +170,6 @@ def _manifest(
 ) -> dict[str, Any]:
     proprioception = source.names(STATE, "state")
     observation = ObservationSpace(tuple(proprioception[:state]), state, (), (0.0, 0.0, 0.0))
-    tasks = {task: _summary(rows) for task, rows in entries.items()}
-    seeds = [e["seed"] for rows in entries.values() for e in rows]
     config = {
         "source": str(source.folder.resolve()),
         "camera": {"name": source.camera},
@@ -190,19 +184,11 @@ def _manifest(
         "observation": observation.as_dict(),
         "config": config,
         "versions": {"lerobot": str(source.info["codebase_version"])},
-        "seeds": {"first": min(seeds), "last": max(seeds)},
-        "episodes": len(seeds),
-        "missing": 0,
-        "sha256": dataset_hash(tasks),
-        "tasks": tasks,
+        **totals(entries, {}, missing=0),
         "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
     }
     plain: dict[str, Any] = json.loads(json.dumps(manifest))
     return plain
-
-
-def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"mean_steps": sum(e["steps"] for e in rows) / len(rows), "failed_seeds": [], "episodes": rows}
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
@@ -258,13 +244,9 @@ def _identifier(name: str) -> str:
     return re.sub(r"\W+", "_", name).strip("_").lower() or "recorded"
 
 
-def _task_of(row: Mapping[str, Any]) -> Any:
-    return row.get("task", row.get("__index_level_0__"))
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
+def _table(path: Path, **options: Any) -> pa.Table:
     try:
-        return list(pq.read_table(path).to_pylist())
+        return pq.read_table(path, **options)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
 

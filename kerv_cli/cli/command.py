@@ -1,0 +1,257 @@
+"""What a command is: a registered part of the kind `command`. Typer's command, the composition of its settings,
+`--cfg`, `--help` and completion derive from that one declaration.
+
+The command's function takes what it names: `settings` (composed and checked), `words` (the overrides as typed), `names`
+(words that are no overrides), `cfg` (where it prints settings itself), and options of its own in typer's notation.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import Field, fields
+from typing import Annotated, Any, TypeVar
+
+import typer
+from typer.core import TyperCommand
+
+from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
+from kerv_cli.base.settings import CommandSettings, choices_of
+
+F = TypeVar("F", bound=Callable[..., None])
+
+
+def command(name: str, settings: type = CommandSettings, keys: str = "", **traits: Any) -> Callable[[F], F]:
+    """Declares the function below as `kerv NAME`; its docstring is the help.
+
+    Args:
+        settings: dataclass of the settings; NoSettings: it takes none.
+        keys: the settings that people use, for the help.
+        traits: examples: command lines that work, for the help. names: help of words that are no overrides.
+            lists: settings whose lists need no brackets. typed: word on the command line -> the setting it sets, where
+            the two differ. writes: whether it stores results, so that a folder that cannot be written is refused first (default: true). each: the command
+            whose settings all other words go to. completes: what makes completions of names.
+    """
+
+    def declared(run: F) -> F:
+        add("command", name, f"{run.__module__}:{run.__name__}", settings, help=run.__doc__ or "", keys=keys, **traits)
+        return run
+
+    return declared
+
+
+def schemas_of(part: Part) -> list[tuple[str, type]]:
+    """The command and its settings' class, then that of `each`."""
+    others = [find("command", part.traits["each"])] if "each" in part.traits else []
+    return [(one.name, one.settings) for one in (part, *others)]
+
+
+def top_keys(part: Part) -> list[str]:
+    """What can stand in front of `=` or a dot: typed words, groups of conf/, settings."""
+    schemas = [schema for _, schema in schemas_of(part)]
+    groups = [group for schema in schemas for group in choices_of(schema)]
+    names = [at.name for schema in schemas for at in fields(schema)]
+    hidden = {key for key in part.traits.get("typed", {}).values() if "." not in key}
+    return [key for key in dict.fromkeys([*part.traits.get("typed", {}), *groups, *names]) if key not in hidden]
+
+
+def typer_command(part: Part) -> TyperCommand:
+    """Typer's command of a registered one. Its module is imported now."""
+    run = load(part.build)
+    parameters = inspect.signature(run, eval_str=True).parameters
+    own = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _GIVEN]
+
+    def called(overrides: list[str] | None = None, cfg: bool = False, **options: Any) -> None:
+        words, names = _divided(part, overrides or [], "names" in parameters)
+        given = {"words": words, "names": names, "cfg": cfg}
+        if "settings" in parameters or (cfg and "cfg" not in parameters):
+            given["settings"] = _composed(part, words, cfg)
+        run(**{name: value for name, value in given.items() if name in parameters}, **options)
+
+    shown = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
+    called.__signature__ = inspect.Signature([_option("overrides", None, _words(part)), *shown, *own])  # type: ignore[attr-defined]
+    single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    help = "\n\n".join(filter(None, (inspect.cleandoc(part.traits.get("help", "")), part.traits.get("names"))))
+    single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(called)
+    made: Any = typer.main.get_command(single)
+    made.part = part
+    return made
+
+
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
+_GIVEN = ("settings", "words", "names", "cfg")
+_CFG = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
+
+
+def _option(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _words(part: Part) -> Any:
+    """The argument of all words that are no options; the help says what they can be in sections of its own."""
+    metavar = "NAME" if "names" in part.traits else "KEY=VALUE"
+    argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
+    return Annotated[list[str] | None, argument]
+
+
+def complete(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Completions of a word of the command that is typed."""
+    return completions(" ".join(ctx.command_path.split()[1:]), list(ctx.params.get("overrides") or []), incomplete)
+
+
+def completions(command: str, typed: Sequence[str], incomplete: str) -> list[str]:
+    """`me` -> `method=`; `method=s` -> every method that begins so; `threshold.` -> the keys of the chosen threshold.
+
+    Args:
+        command: e.g. `rollout`, `train drafter`.
+        typed: the overrides in front of it: a chosen part has keys of its own.
+    """
+    part = parts("command")[command]
+    key, equals, _ = incomplete.partition("=")
+    if equals:
+        words = [f"{key}={name}" for name in _values(part, key)]
+    elif "." in incomplete:
+        words = [f"{name}=" for name in _keys(part, typed, incomplete)]
+    else:
+        keys = [] if part.settings is NoSettings else [f"{name}=" for name in top_keys(part)]
+        below = [] if typed else [one.name.removeprefix(f"{command} ") for one in commands_below(f"{command} ")]
+        words = [*part.traits.get("completes", list)(), *below, *keys]
+    return [word for word in dict.fromkeys(words) if word.startswith(incomplete)]
+
+
+def _values(part: Part, key: str) -> list[str]:
+    if key == "task":
+        from kerv_cli.worlds import task_names
+
+        return list(task_names())
+    if key in part.traits.get("values", {}):
+        return list(part.traits["values"][key]())
+    if key == "world.stress.kind":
+        return list(parts("stress"))
+    for _, schema in schemas_of(part):
+        if key in choices_of(schema):
+            from kerv_cli.base.config import groups
+
+            return groups()[key]
+        for at in fields(schema):
+            if at.name == key and "names" in at.metadata:
+                return list(at.metadata["names"])
+    return []
+
+
+def _keys(part: Part, typed: Sequence[str], incomplete: str) -> list[str]:
+    """Dotted keys of the command with the parts that were chosen in front."""
+    from kerv_cli.base.config import keys_of
+
+    for name, schema in schemas_of(part):
+        if incomplete.split(".")[0] in {at.name for at in fields(schema)}:
+            choices = [word for word in typed if word.split("=", 1)[0] in choices_of(schema)]
+            return keys_of(name.replace(" ", "_"), choices, schema)
+    return []
+
+
+def _divided(part: Part, words: list[str], named: bool) -> tuple[list[str], list[str]]:
+    """(overrides, names). named: the command takes names; else every word has to be an override."""
+    if not named:
+        return words, []
+    keys = set(top_keys(part)) if part.settings is not NoSettings else set()
+    overrides = [word for word in words if "=" in word and word.lstrip("+").partition("=")[0].split(".")[0] in keys]
+    return overrides, [word for word in words if word not in overrides]
+
+
+def _composed(part: Part, words: list[str], cfg: bool) -> Any:
+    """The command's settings. With --cfg they are printed and the command ends.
+
+    Raises:
+        UsageError: as `config.compose`. StorageError: as `places.check_writable`.
+    """
+    from kerv_cli.base.config import compose, to_yaml
+    from kerv_cli.base.places import check_writable
+
+    typed = part.traits.get("typed", {})
+    pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
+    lists = part.traits.get("lists", ())
+    plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
+    settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
+    if cfg:
+        typer.echo(to_yaml(settings), nl=False)
+        raise typer.Exit(0)
+    if part.traits.get("writes", True) and hasattr(settings, "results"):
+        check_writable(settings.results)
+    return settings
+
+
+class CommandWithSettings(TyperCommand):
+    """Adds to the help what the command's words can be."""
+
+    part: Part
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Writes the settings that people use, commands below this one, and examples."""
+        keys = [_row(self.part, key) for key in self.part.traits.get("keys", "").split()]
+        below = [part for name, part in parts("command").items() if name.startswith(f"{self.part.name} ")]
+        if keys:
+            with formatter.section(f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)"):
+                formatter.write_dl(keys)
+        if below:
+            with formatter.section("Commands"):
+                formatter.write_dl([(part.name, summary_of(part)) for part in below])
+        if self.part.traits.get("examples"):
+            with formatter.section("Examples"):
+                for line in self.part.traits["examples"]:
+                    formatter.write(f"{'':{formatter.current_indent}}{line}\n")
+
+
+def summary_of(part: Part) -> str:
+    """What stands before the first full stop or semicolon of a command's help."""
+    return re.split(r"[.;]\s", part.traits.get("help", "") + " ")[0]
+
+
+def _row(part: Part, key: str) -> tuple[str, str]:
+    """(key=default, type and description) of a setting. key: as typed."""
+    name = part.traits.get("typed", {}).get(key, key)
+    schema = next(schema for _, schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
+    at, value = _field(schema, name)
+    default = choices_of(schema).get(name, _of_file(schema, name, value))
+    kind = "name" if name in choices_of(schema) else _type_name(at)
+    return f"{key}={_plain(default)}", f"{kind}: {at.metadata.get('help', '')}"
+
+
+def _field(schema: type, key: str) -> tuple[Field[Any], Any]:
+    """The field of a dotted key, and its default."""
+    value: Any = schema()
+    for name in key.split("."):
+        at, value = next(at for at in fields(value) if at.name == name), getattr(value, name)
+    return at, value
+
+
+def _of_file(schema: type, key: str, default: Any) -> Any:
+    """The value of a dotted key in the file of conf/ that its group chooses; `default` where that does not say."""
+    from kerv_cli.base.config import conf_dir
+    from kerv_cli.base.files import read_yaml
+
+    group, *path = key.split(".")
+    file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
+    value = read_yaml(file.read_text(encoding="utf-8")) if path and file.is_file() else {}
+    for name in path:
+        value = value.get(name, {}) if isinstance(value, dict) else {}
+    return default if value == {} else value
+
+
+def _type_name(at: Field[Any]) -> str:
+    if "names" in at.metadata:
+        return " | ".join(at.metadata["names"])
+    plain = str(at.type).removesuffix(" | None").split("[")[0]
+    return {"str": "text", "bool": "true or false", "dict": "mapping", "float": "number"}.get(plain, plain)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{','.join(map(str, value))}]"
+    return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def commands_below(prefix: str) -> Iterator[Part]:
+    """The commands whose names begin so, in the order of registration."""
+    return (part for name, part in parts("command").items() if name.startswith(prefix))

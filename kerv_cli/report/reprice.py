@@ -1,0 +1,246 @@
+"""A study's decodes at the costs of another machine and target: what each setting would cost there if it decoded the
+same tokens in the same control steps (docs/measuring.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.places import as_path, shipped_dir
+from kerv_cli.engine.cost import FORMAT, HOST_PHASES, Profile, Work, missing, prices, read_profile, work_of
+from kerv_cli.lab.identity import batch_of
+from kerv_cli.lab.plan import Cell
+from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.tables import StudyData, rows_of
+
+ASSUMES = (
+    "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
+    "and target decoded the same tokens in the same control steps; success is the recorded policy's"
+)
+_COLUMNS = ("seed", "index", "rounds", "similarity", *(f"seconds.{phase}" for phase in HOST_PHASES))
+_SHIPPED = "-profile.json"
+_ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
+_SPEEDS = ("episode_speedup", "speedup")
+_TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A profile under the name by which it was asked for."""
+
+    name: str
+    profile: Profile
+
+    @property
+    def title(self) -> str:
+        """Target and device; of a projection, that nobody measured it."""
+        about = self.profile.about
+        known = [str(about[key]) for key in ("target", "device_name") if about.get(key)]
+        return ", ".join(known or [self.name]) + (", projected" if about.get("projected") else "")
+
+
+def open_machines(results: Path | str, names: Iterable[str]) -> list[Machine]:
+    """The profiles of these names: paths, documents in <results>/bench, or those that kerv ships.
+
+    Raises:
+        UsageError: no such document, one without a profile, or one of another kerv.
+    """
+    folders = (Path(results) / "bench", shipped_dir().parent / "bench")
+    machines = []
+    for name in names:
+        places = (as_path(name), *(folder / f"{name}{end}" for folder in folders for end in (".json", _SHIPPED)))
+        path = next((place for place in places if place.is_file()), None)
+        if path is None:
+            known = sorted({p.name.removesuffix(_SHIPPED) for folder in folders for p in folder.glob(f"*{_SHIPPED}")})
+            raise UsageError(
+                f"on={name}: no such profile, make one with 'kerv bench target=TARGET'"
+                + (f", or take one of {', '.join(known)}" if known else "")
+            )
+        try:
+            machines.append(Machine(name, read_profile(path, FORMAT)))
+        except CheckpointError as error:
+            raise UsageError(f"on={name}: {error}") from error
+    return machines
+
+
+def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame:
+    """One row per machine and label, pooled over tasks: speeds against the baseline there, per episode and per control
+    step, with paired bootstrap intervals over the study's blocks; times; and the speeds as they were measured.
+
+    Raises:
+        UsageError: a profile lacks a cost that the study needs, or is of chunks of another length; a setting has no
+            times of its own.
+    """
+    episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
+    labels = [label for label in data.plan.labels if label in episodes and _decodes(episodes[label])]
+    works = {label: _recorded(data, label) for label in labels}
+    rows = []
+    for machine in machines:
+        _check(machine, works)
+        priced = {label: _priced(episodes[label], works[label], machine.profile) for label in labels}
+        for label in labels:
+            reference = data.references[label]
+            baseline = priced[reference] if reference in priced else priced[label].iloc[:0]
+            values = measure(priced[label], baseline, MICRO, apart=True)
+            measured = measure(episodes[label], episodes.get(reference, episodes[label].iloc[:0]), MICRO)
+            rows.append(
+                {
+                    "study": data.plan.name,
+                    "label": label,
+                    "baseline": reference,
+                    "on": machine.name,
+                    "machine": machine.title,
+                    "projected": bool(machine.profile.about.get("projected")),
+                    "same": _same(
+                        machine.profile.about, data.complete.get(reference, data.complete[label])[0], episodes[label]
+                    ),
+                    **_speeds(values, ""),
+                    **{name: values[name] for name in _TIMES},
+                    **_speeds(measured, "measured_"),
+                    "measured_on": ";".join(dict.fromkeys(episodes[label]["device_name"])),
+                    "episodes": len(episodes[label]),
+                    "pairs": values["pairs"],
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def _same(about: Mapping[str, Any], cell: Cell, episodes: pd.DataFrame) -> bool:
+    """Whether a profile is of the machine that these episodes ran on, and of the target of `cell`, the baseline's."""
+    here = {name: set(episodes[name]) for name in ("device_name", "dtype", "threads")}
+    here["target"] = {cell.settings["policy"]["target"]}
+    return not about.get("projected") and all({about.get(name)} == values for name, values in here.items())
+
+
+def _speeds(values: Mapping[str, Any], prefix: str) -> dict[str, float]:
+    return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in _SPEEDS for end in ("", "_low", "_high")}
+
+
+def _decodes(episodes: pd.DataFrame) -> bool:
+    return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The work of a label's decodes. episode: (decodes,) row of the label's episodes that each belongs to. size: N."""
+
+    work: Work
+    episode: np.ndarray
+    size: int
+
+
+def _recorded(data: StudyData, label: str) -> Recorded:
+    """The decodes of a label's cells, in the order of its episodes."""
+    cells = data.complete[label]
+    if (batch := batch_of(cells[0].settings)) > 1:
+        raise UsageError(
+            f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
+        )
+    tables, owners, first = [], [], 0
+    for cell in cells:
+        stored = data.cells[cell.id]
+        own = stored.of(cell)["seed"].tolist()
+        table = _read(stored.folder / "decodes.parquet")
+        row_of = {seed: first + number for number, seed in enumerate(own)}
+        keep = pc.is_in(table["seed"], pa.array(own, pa.int64()))
+        table = table.filter(keep)
+        owners.append(np.array([row_of[seed] for seed in table["seed"].to_pylist()]))
+        tables.append(table)
+        first += len(own)
+    whole = pa.concat_tables(tables, promote_options="default").combine_chunks()
+    proposer = cells[0].settings.get("proposer", {})
+    drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
+    work, size = _work(whole, drafter)
+    return Recorded(work, np.concatenate(owners), size)
+
+
+def _read(path: Path) -> pa.Table:
+    file = pq.ParquetFile(path)
+    present = [name for name in _COLUMNS if name in file.schema_arrow.names]
+    return file.read(columns=present, use_threads=False)
+
+
+def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:
+    """The work of a table of decodes, and N."""
+    rounds = table["rounds"].combine_chunks()
+    counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
+    flat = rounds.flatten()
+    columns = {name: flat.field(name).to_numpy(zero_copy_only=False) for name in (*_ROUND, "committed")}
+    decode = np.repeat(np.arange(len(counts)), counts)
+    size = int(np.bincount(decode, columns.pop("committed")).max())
+    phases = {
+        phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy())
+        if f"seconds.{phase}" in table.column_names
+        else np.zeros(len(counts))
+        for phase in HOST_PHASES
+    }
+    looked_up = np.zeros(len(counts), bool)
+    if "similarity" in table.column_names:
+        looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
+    return work_of(columns, counts, phases, looked_up, size, drafter), size
+
+
+def _check(machine: Machine, works: Mapping[str, Recorded]) -> None:
+    """Raises UsageError for a profile that cannot price the study."""
+    target = machine.profile.about.get("target", "TARGET")
+    for label, recorded in works.items():
+        needs = recorded.work.needs
+        if lacks := missing(needs, machine.profile):
+            raise UsageError(
+                f"on={machine.name}: no cost of '{lacks[0]}', which setting '{label}' needs: measure it with "
+                f"'kerv bench target={target}'"
+            )
+        if machine.profile.tokens < recorded.size:
+            raise UsageError(
+                f"on={machine.name}: its costs are of chunks of {machine.profile.tokens} tokens, setting '{label}' "
+                f"decodes {recorded.size}: measure them with 'kerv bench target={target} tokens=[{recorded.size}]'"
+            )
+
+
+def _priced(episodes: pd.DataFrame, recorded: Recorded, profile: Profile) -> pd.DataFrame:
+    """The episodes, with the seconds that their decodes would take there."""
+    seconds = prices(recorded.work, profile)
+    whole = np.bincount(recorded.episode, seconds, len(episodes))
+    order = np.argsort(recorded.episode, kind="stable")
+    stops = np.cumsum(np.bincount(recorded.episode, minlength=len(episodes)))[:-1]
+    return episodes.assign(seconds=whole, decode_seconds=pd.Series(np.split(seconds[order], stops), episodes.index))
+
+
+def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
+    """As text: a row per setting, per episode before per control step; as measured, then a column pair per machine."""
+    rows: dict[str, dict[str, str]] = {}
+    for row in rows_of(table):
+        cells = rows.setdefault(row["label"], {"setting": row["label"]})
+        is_baseline = row["label"] == row["baseline"]
+        for head, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
+            for name, unit in (("episode_speedup", "per episode"), ("speedup", "per step")):
+                cells[f"{head}: {unit}"] = "1" if is_baseline else _interval(row, f"{prefix}{name}")
+    return pd.DataFrame(rows.values())
+
+
+def machine_columns(table: pd.DataFrame) -> dict[str, dict[str, str]]:
+    """Heading -> label -> speed per episode there: as measured where the study ran on that machine with that target,
+    else priced, marked `≈`."""
+    columns: dict[str, dict[str, str]] = {}
+    for row in rows_of(table):
+        prefix, mark = ("measured_", "") if row["same"] else ("", "≈ ")
+        text = "1" if row["label"] == row["baseline"] else mark + _interval(row, f"{prefix}episode_speedup")
+        columns.setdefault(f"per episode, {row['machine']}", {})[row["label"]] = text
+    return columns
+
+
+def _interval(row: Mapping[str, Any], name: str) -> str:
+    value, low, high = (row[f"{name}{end}"] for end in ("", "_low", "_high"))
+    if math.isnan(value):
+        return "–"
+    return f"{value:.2f}" if math.isnan(low) else f"{value:.2f} ({low:.2f}–{high:.2f})"

@@ -1,0 +1,166 @@
+"""How often the 95 % intervals of the tables contain the truth, by simulation: `python scripts/coverage.py [STUDIES]`.
+
+A simulated study has ten tasks, or one, in three groups of difficulty, and blocks of five seeds. Tasks differ in time,
+speedup, success and risk. The speedup of a block is off by 8 % (the machine's state), that of a pair by 5 %; episodes
+that fail run to the horizon; what an episode loses resembles itself, and one trusted decode in twenty is audited.
+Prints coverage in per cent, a row per interval and a column per number of blocks per task.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from kerv_cli.report import statistics as stats
+from kerv_cli.report.statistics import Estimate
+
+BLOCKS = (1, 2, 4, 10, 50)
+SEEDS, DRIFT, NOISE, HORIZON, AUDITED = 5, 0.08, 0.05, 500, 0.05
+GROUPS = ("easy", "hard", "medium")
+Drawn = tuple[Estimate, float]
+"""An interval and the truth."""
+
+
+class Tasks:
+    """What is true of the tasks of a study. Arrays (tasks,); lost, won: rates of the two kinds of discordant pairs."""
+
+    def __init__(self, count: int) -> None:
+        random = np.random.default_rng(count)
+        self.count = count
+        self.seconds, self.speedup = random.lognormal(0, 0.3, count), 2 * random.lognormal(0, 0.15, count)
+        self.steps = random.lognormal(4.4, 0.4, count)
+        self.lost, self.won = random.uniform(0.01, 0.06, count), random.uniform(0.01, 0.04, count)
+        self.neither = random.uniform(0.0, 0.1, count)
+        self.bad = random.uniform(0.02, 0.2, count)
+        self.group = np.arange(count) % min(count, len(GROUPS))
+        # a macro average is one of groups, each of equal tasks
+        self.macro = 1 / (np.bincount(self.group)[self.group] * len(np.unique(self.group)))
+
+
+class Study:
+    """A simulated study of so many blocks per task; arrays (pairs,) but for the tasks'."""
+
+    def __init__(self, tasks: Tasks, blocks: int, random: np.random.Generator) -> None:
+        per_task = blocks * SEEDS
+        self.tasks, n = tasks, tasks.count * per_task
+        self.task = np.repeat(np.arange(tasks.count), per_task)
+        self.block = np.repeat(np.arange(tasks.count * blocks), SEEDS)
+        self.seed = np.tile(np.arange(per_task), tasks.count)
+        self.group = tasks.group[self.task]
+        u, t = random.random(n), tasks
+        lost, won, neither = t.lost[self.task], t.won[self.task], t.neither[self.task]
+        self.method = (u >= lost) & (u < 1 - neither)
+        self.baseline = (u < lost) | ((u >= lost + won) & (u < 1 - neither))
+        drift = random.lognormal(-(DRIFT**2) / 2, DRIFT, tasks.count * blocks)[self.block]
+        self.step_method = t.seconds[self.task] * random.lognormal(-(NOISE**2) / 2, NOISE, n)
+        noise = random.lognormal(-(NOISE**2) / 2, NOISE, n)
+        self.step_baseline = t.seconds[self.task] * t.speedup[self.task] * drift * noise
+        world = t.steps[self.task] * random.lognormal(-0.02, 0.2, n)
+        self.steps_baseline = np.where(self.baseline, world * random.lognormal(-0.005, 0.1, n), HORIZON)
+        self.steps_method = np.where(self.method, world * random.lognormal(-0.005, 0.1, n), HORIZON)
+        self.trusted = 1 + random.poisson(self.steps_method / 8)
+        self.audits = random.binomial(self.trusted, AUDITED)
+        episode = random.beta(0.5 * t.bad[self.task], 0.5 * (1 - t.bad[self.task]))
+        wrong = random.binomial(self.audits, episode)
+        self.losses = wrong + 0.06 * (self.audits - wrong)
+
+    def micro(self, of_task: np.ndarray) -> float:
+        """Mean over tasks, which have as many episodes."""
+        return float(of_task.mean())
+
+    def names(self, of: np.ndarray) -> list[str]:
+        """Numbers as names."""
+        return [str(number) for number in of]
+
+    def averaged(self, estimate: Callable[[np.ndarray], Estimate]) -> Estimate:
+        """The mean over groups of what a mask of pairs gives."""
+        return stats.mean_of([estimate(self.group == number) for number in np.unique(self.group)])
+
+
+def success(study: Study, where: np.ndarray) -> Estimate:
+    """Success of the method with Wilson's interval."""
+    won, count = int(study.method[where].sum()), int(where.sum())
+    return Estimate(won / count, *stats.wilson(won, count))
+
+
+def difference(study: Study, where: np.ndarray) -> Estimate:
+    """Paired difference with Newcombe's interval."""
+    return stats.paired_difference(stats.paired_counts(study.baseline[where], study.method[where]))
+
+
+def risk(study: Study, where: np.ndarray) -> Estimate:
+    """Realised risk, per episode."""
+    loss, audits = (values / study.trusted for values in (study.losses, study.audits))
+    return stats.share(loss[where], audits[where], study.names(study.task[where]), study.names(study.seed[where]))
+
+
+def length(study: Study, where: np.ndarray) -> Estimate:
+    """Steps per second of the method: a ratio of sums over episodes, as AL is."""
+    seconds = study.step_method / study.tasks.seconds[study.task] * study.steps_method
+    return stats.ratio(seconds[where], study.steps_method[where], study.names(study.task[where]), None)
+
+
+def speedup(study: Study, per_episode: bool, macro: bool) -> Drawn:
+    """Ratio of mean times, and its truth."""
+    t, everywhere = study.tasks, np.ones(study.task.size, bool)
+    times = [study.step_baseline, study.step_method]
+    means = [t.seconds * t.speedup, t.seconds]
+    if per_episode:
+        times = [times[0] * study.steps_baseline, times[1] * study.steps_method]
+        fails = (t.won + t.neither, t.lost + t.neither)
+        means = [mean * (t.steps * (1 - f) + HORIZON * f) for mean, f in zip(means, fails, strict=True)]
+    weights = t.macro if macro else np.full(t.count, 1 / t.count)
+    groups = study.names(study.group[everywhere]) if macro else None
+    found = stats.speedup(times[0], times[1], study.names(study.task), groups, study.names(study.block))
+    return found, float((weights * means[0]).sum() / (weights * means[1]).sum())
+
+
+def intervals(study: Study) -> dict[str, Drawn]:
+    """Every interval of a table."""
+    t, everywhere = study.tasks, np.ones(study.task.size, bool)
+    rate, gap, lost = 1 - t.lost - t.neither, t.won - t.lost, t.bad + 0.06 * (1 - t.bad)
+    drawn = {
+        "success, Wilson": (success(study, everywhere), study.micro(rate)),
+        "difference, Newcombe": (difference(study, everywhere), study.micro(gap)),
+        "realised risk": (risk(study, everywhere), study.micro(lost)) if study.audits.any() else None,
+        "AL": (length(study, everywhere), 1.0),
+        "speedup per step": speedup(study, False, False),
+        "speedup per episode": speedup(study, True, False),
+    }
+    if t.count > 1:
+        drawn |= {
+            "success, macro": (study.averaged(lambda where: success(study, where)), float((t.macro * rate).sum())),
+            "difference, macro": (study.averaged(lambda where: difference(study, where)), float((t.macro * gap).sum())),
+            "risk, macro": (study.averaged(lambda where: risk(study, where)), float((t.macro * lost).sum())),
+            "speedup per step, macro": speedup(study, False, True),
+            "speedup per episode, macro": speedup(study, True, True),
+        }
+    return {name: pair for name, pair in drawn.items() if pair is not None}
+
+
+def coverage(tasks: int, blocks: int, studies: int, seed: int = 0) -> dict[str, float]:
+    """Interval -> share of simulated studies in which it contains the truth; studies without it do not count."""
+    random, truth = np.random.default_rng([seed, tasks, blocks]), Tasks(tasks)
+    inside: dict[str, list[bool]] = {}
+    for _ in range(studies):
+        for name, (found, true) in intervals(Study(truth, blocks, random)).items():
+            if not np.isnan(found.low):
+                inside.setdefault(name, []).append(found.low <= true <= found.high)
+    return {name: float(np.mean(hits)) for name, hits in inside.items()}
+
+
+def main(words: Sequence[str]) -> None:
+    """Prints the table."""
+    studies = int(words[0]) if words else 1000
+    for tasks in (10, 1):
+        table = {blocks: coverage(tasks, blocks, studies) for blocks in BLOCKS}
+        print(f"{tasks} task{'s' * (tasks > 1)}, {studies} studies; blocks of {SEEDS} seeds per task:", *BLOCKS)
+        for name in table[BLOCKS[-1]]:
+            row = [f"{100 * table[blocks].get(name, np.nan):5.1f}" for blocks in BLOCKS]
+            print(f"  {name:28}", *row)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

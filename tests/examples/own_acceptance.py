@@ -1,0 +1,26 @@
+"""Example: an acceptance rule of your own: the radius holds for the hand's position, all else must match."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from kerv_cli.base.registry import NoSettings, add
+from kerv_cli.engine.acceptance import Strict
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.context import Context
+
+
+class PositionOnly(Strict):
+    """Accepts the longest path within its limits, as its base does; another rule overrides `judge`."""
+
+    def limits(self, r: int) -> tuple[int, ...]:
+        free = range(self.space.dofs)[self.space.dofs_of("position")]
+        return tuple(r if dof in free else 0 for dof in range(self.space.dofs))
+
+
+def build(settings: NoSettings, context: Context) -> PositionOnly:
+    return PositionOnly(context.target.actions)
+
+
+add("acceptance", "position", f"{__name__}:build")

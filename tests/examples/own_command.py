@@ -1,0 +1,44 @@
+"""A command from outside: `kerv seeds`, registered by `KERV_PLUGINS=examples.own_command`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import typer
+
+from kerv_cli.base.limits import choice, number
+from kerv_cli.base.registry import add
+from kerv_cli.base.settings import EVALUATION_SEED, TaskSettings
+from kerv_cli.cli.common import AsJson, print_json
+
+
+@dataclass
+class SeedsSettings(TaskSettings):
+    """`kerv seeds`."""
+
+    episodes: int = number(3, 1, 100, help="seeds per task")
+    use: str = choice("evaluation", "evaluation", "demonstrations", help="what the seeds are for")
+
+
+def seeds(settings: SeedsSettings, as_json: AsJson = False) -> None:
+    """What `kerv seeds` does with its settings, which are composed and checked."""
+    from kerv_cli.worlds import resolve_tasks
+
+    first = EVALUATION_SEED if settings.use == "evaluation" else 0
+    numbers = {task: list(range(first, first + settings.episodes)) for task in resolve_tasks(settings.task)}
+    if as_json:
+        print_json(numbers)
+        return
+    for task, one in numbers.items():
+        typer.echo(f"{task}: {one[0]} to {one[-1]}")
+
+
+add(
+    "command",
+    "seeds",
+    f"{__name__}:seeds",
+    SeedsSettings,
+    help="Print the seeds of a task's episodes.",
+    keys="task episodes use",
+    examples=("kerv seeds task=reach", "kerv seeds use=demonstrations episodes=10 --json"),
+)

@@ -1,0 +1,45 @@
+"""Example: a threshold of your own: the radius grows by `step` bins with every decode of an episode."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from kerv_cli.base.limits import number
+from kerv_cli.base.registry import add
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.context import Context
+
+
+@dataclass
+class GrowingSettings:
+    """Bins."""
+
+    kind: str = "growing"
+    step: int = number(1, 0, 100)
+    most: int = number(9, 0, 254)
+
+
+class Growing:
+    """The `Threshold` protocol of `kerv_cli/engine/parts.py`."""
+
+    def __init__(self, settings: GrowingSettings) -> None:
+        self.settings, self.decodes = settings, 0
+
+    def reset(self) -> None:
+        self.decodes = 0
+
+    def radius(self) -> int:
+        return min(self.settings.most, self.settings.step * self.decodes)
+
+    def update(self, variability: float | None) -> None:
+        self.decodes += 1
+
+
+def build(settings: GrowingSettings, context: Context) -> Growing:
+    context.check_radius("most", settings.most)
+    return Growing(settings)
+
+
+add("threshold", "growing", f"{__name__}:build", GrowingSettings)

@@ -1,0 +1,213 @@
+"""Speeds on other machines, per episode and per control step; the motion of episodes; why the two speeds differ."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from studies_synthetic import episode, prepare, still_episode, threshold_settings, threshold_study
+from typer.testing import CliRunner
+
+from kerv_cli.cli.app import app
+from kerv_cli.engine.cost import Profile, predicted, sequence_of_record
+from kerv_cli.lab.execute import execute
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.report.measures import MACRO, MICRO
+from kerv_cli.report.motion import differences, motion
+from kerv_cli.report.reprice import Machine, machine_columns, open_machines, repriced_summary, repriced_table
+from kerv_cli.report.tables import StudyData, load_study
+
+PROFILE = Profile(
+    31,
+    {
+        "encode": ((1,), (0.005,)),
+        "prefill": ((31, 46), (0.008, 0.0095)),
+        "verify": ((1, 16), (0.002, 0.005)),
+        "feed": ((4, 31), (0.0005, 0.002)),
+        "draft": ((2, 14), (0.001, 0.013)),
+        "tree": ((2, 5), (0.002, 0.008)),
+    },
+    tokens=16,
+)
+ABOUT = {"target": "vla-150m", "dtype": "bfloat16", "device_name": "GPU", "kerv_version": "0"}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results")
+    cells = threshold_study(["reach-v3", "push-v3"], radii=(9,))
+    store = StudyStore(folder, "threshold")
+    store.write_plan(threshold_settings(), cells)
+    execute(cells, prepare, store)
+    return folder
+
+
+@pytest.fixture
+def data(results: Path) -> StudyData:
+    return load_study(StudyStore(results, "threshold"))
+
+
+def profile_file(results: Path, name: str = "there", without: str = "", **changes: Any) -> None:
+    profile = PROFILE.as_dict() | changes
+    profile["phases"] = {kind: costs for kind, costs in profile["phases"].items() if kind != without}
+    folder = results / "bench"
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps({**ABOUT, "profile": profile}))
+
+
+def test_an_episode_costs_its_decodes_at_the_profiles_costs(data: StudyData) -> None:
+    """Ratios of means over episodes and over times per step, of the very records that the cells were made of."""
+    table = repriced_table(data, [Machine("there", PROFILE)]).set_index("label")
+    seconds: dict[str, list[float]] = {}
+    steps: dict[str, list[int]] = {}
+    for cell in data.plan.cells:
+        for seed in cell.seeds:
+            record = episode(cell, seed)
+            priced = [predicted(sequence_of_record(decode), PROFILE) for decode in record.decodes]
+            seconds.setdefault(cell.label, []).append(sum(priced))
+            steps.setdefault(cell.label, []).append(record.steps)
+    for label in ("naive_sd", "spec_vla r=9"):
+        row = table.loc[label]
+        mean = {name: np.mean(values) for name, values in seconds.items()}
+        per_step = {name: np.mean(np.divide(values, steps[name])) for name, values in seconds.items()}
+        assert row["time_per_episode_ms"] == pytest.approx(1000 * mean[label])
+        assert row["episode_speedup"] == pytest.approx(mean["ar"] / mean[label])
+        assert row["speedup"] == pytest.approx(per_step["ar"] / per_step[label])
+        assert row["episode_speedup_low"] < row["episode_speedup"] < row["episode_speedup_high"]
+        assert row["measured_speedup"] != row["speedup"]
+    first = data.episodes[data.episodes["label"] == "ar"].iloc[0]
+    assert table.loc["ar", "latency_p95_ms"] == pytest.approx(1000 * (0.005 + 0.008 + 15 * 0.002 + 0.001))
+    assert first["decodes"] == len(first["decode_seconds"])
+
+
+def test_the_headline_takes_the_measured_speed_where_there_is_one(data: StudyData) -> None:
+    first = data.episodes.iloc[0]
+    here = {name: first[name] for name in ("device_name", "dtype", "threads")} | {"target": "mt10-vision"}
+    known = dataclasses.replace(PROFILE, about=here)
+    projection = dataclasses.replace(PROFILE, about={**ABOUT, "projected": True})
+    table = repriced_table(data, [Machine("here", known), Machine("gpu", projection)])
+    columns = machine_columns(table)
+    assert list(columns) == [
+        f"per episode, mt10-vision, {first['device_name']}",
+        "per episode, vla-150m, GPU, projected",
+    ]
+    measured, priced = (column["naive_sd"] for column in columns.values())
+    assert priced.startswith("≈ ")
+    row = table[table["label"] == "naive_sd"].iloc[0]
+    assert measured.startswith(f"{row['measured_episode_speedup']:.2f} (")
+    text = repriced_summary(table)
+    assert [name.rsplit(": ")[1] for name in text.columns[1:3]] == ["per episode", "per step"]
+
+
+def report(results: Path, *words: str) -> Any:
+    return CliRunner().invoke(app, ["report", "study=threshold", f"results={results}", *words])
+
+
+def test_a_report_prices_the_study_on_several_machines(results: Path) -> None:
+    profile_file(results)
+    profile_file(results, "elsewhere")
+    document = json.loads((results / "bench/elsewhere.json").read_text())
+    (results / "bench/elsewhere.json").write_text(json.dumps({**document, "device_name": "CPU"}))
+    done = report(results, "on=there,elsewhere")
+    assert done.exit_code == 0, done.output
+    assert "vla-150m, GPU: per episode" in done.stdout
+    table = pd.read_csv(results / "report/tables/threshold_on.csv")
+    assert sorted(set(table["on"])) == ["elsewhere", "there"]
+    page = (results / "studies/threshold/report.html").read_text()
+    assert "On other machines" in page
+    assert "same tokens in the same control steps" in page
+    assert "≈ " in page
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (
+            {"without": "draft"},
+            "no cost of 'draft', which setting 'naive_sd' needs: measure it with 'kerv bench target=",
+        ),
+        ({"tokens": 7}, "chunks of 7 tokens, setting 'ar' decodes 16: measure them with 'kerv bench target=vla-150m"),
+        ({"format": 1}, "is of an older kerv (format 1, here 2): measure it again with 'kerv bench target=vla-150m"),
+        ({"format": 9}, "is of a newer kerv"),
+        ({"prompt": "many"}, "holds no latency profile"),
+    ],
+)
+def test_a_profile_that_cannot_price_the_study_is_refused(results: Path, changes: Any, says: str) -> None:
+    profile_file(results, "odd", **changes)
+    done = report(results, "on=odd")
+    assert done.exit_code == 2
+    assert says in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_what_is_not_there_is_refused(results: Path) -> None:
+    profile_file(results)
+    done = report(results, "on=nowhere")
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert "on=nowhere: no such profile, make one with 'kerv bench target=TARGET" in done.stderr
+    every = CliRunner().invoke(app, ["report", f"results={results}", "on=there"])
+    assert every.exit_code == 2
+    assert "name the study" in every.stderr
+
+
+def test_shipped_profiles_can_price_what_ships(tmp_path: Path) -> None:
+    from kerv_cli.base.places import shipped_dir
+    from kerv_cli.engine.cost import FORMAT, KINDS, missing, read_profile
+
+    shipped = sorted((shipped_dir().parent / "bench").glob("*.json"))
+    for path in shipped:
+        profile = read_profile(path, FORMAT)
+        assert missing(KINDS, profile) == []
+        assert {"target", "dtype", "device_name"} <= set(profile.about)
+    assert [machine.name for machine in open_machines(tmp_path, [path.stem for path in shipped])] == [
+        path.stem for path in shipped
+    ]
+
+
+def test_the_hands_way_jerk_and_switches_of_an_episode() -> None:
+    record = still_episode("reach-v3", 0, True, [])
+    hz = record.space.control_hz
+    t = np.arange(6) / hz
+    path = np.stack([t**3, 0 * t, 0 * t], 1).astype(np.float32)
+    actions = np.zeros((5, 4), np.float32)
+    actions[:, 3] = [-1, -0.99, 1, 0.9, -1]
+    moved = dataclasses.replace(record, path=path, actions=actions)
+    assert moved.path_length == pytest.approx(t[-1] ** 3)
+    assert moved.jerk == pytest.approx(6.0, rel=1e-2)  # of t³
+    assert moved.gripper_switches == 2
+    assert math.isnan(dataclasses.replace(moved, path=path[:3]).jerk)
+
+
+def test_motion_is_paired_over_what_both_solved(data: StudyData) -> None:
+    episodes = data.episodes.assign(success=True, path_length=1.0, jerk=2.0, gripper_switches=0)
+    method, ar = (episodes[episodes["label"] == label].copy() for label in ("naive_sd", "ar"))
+    method.loc[method.index[0], ["success", "path_length"]] = [False, 99.0]
+    method.loc[method.index[1:], "path_length"] = 1.5
+    for averaging in (MICRO, MACRO):
+        found = motion(method, ar, averaging)
+        assert (found["path_m"], found["path_m_ratio"], found["jerk_ratio"]) == pytest.approx((1.5, 1.5, 1.0))
+        assert found["path_m_ratio_low"] == pytest.approx(1.5)
+        assert math.isnan(found["gripper_switches_ratio"])  # nothing to divide by
+    older = method.assign(path_length=None, jerk=None, gripper_switches=None)
+    assert math.isnan(motion(older, ar, MICRO)["path_m"])
+    assert math.isnan(motion(older, ar, MICRO)["path_m_ratio"])
+    assert motion(older, ar, MICRO)["steps_to_success"] > 0
+
+
+def test_the_report_says_why_the_speeds_differ() -> None:
+    ar = {"label": "ar", "baseline": "ar", "steps": 600, "episodes": 10, "repeats": 1, "successes": 10}
+    speeds = {"speedup": 7.0, "speedup_low": 6.9, "speedup_high": 7.1}
+    speeds |= {"episode_speedup": 2.7, "episode_speedup_low": 2.2, "episode_speedup_high": 3.4}
+    longer = {**ar, **speeds, "label": "early", "steps": 1500, "successes": 7}
+    nan = dict.fromkeys(speeds, math.nan)
+    assert differences([{**ar, **nan}, longer]) == [
+        "early: 2.70 per episode, 7.00 per step: 150 control steps an episode instead of 60, "
+        "more failures, which run to the horizon (3 instead of 0)"
+    ]
+    assert differences([{**ar, **nan}, {**longer, "episode_speedup_high": 6.95}]) == []
