@@ -28,10 +28,11 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
     Args:
         settings: dataclass of the settings; NoSettings: it takes none.
         keys: the settings that people use, for the help.
-        traits: examples: command lines that work, for the help. names: help of words that are no overrides.
-            lists: settings whose lists need no brackets. typed: word on the command line -> the setting it sets, where
-            the two differ. writes: whether it stores results, so that a folder that cannot be written is refused first (default: true). each: the command
-            whose settings all other words go to. completes: what makes completions of names.
+        traits: examples: command lines that work, for the help. names: help of words that are no overrides. lists:
+            settings whose lists need no brackets. typed: word on the command line -> the setting it sets, where the two
+            differ. writes: whether it stores results, so that a folder that cannot be written is refused first
+            (default: true). each: the command whose settings all other words go to. completes: what makes completions
+            of names.
     """
 
     def declared(run: F) -> F:
