@@ -31,6 +31,7 @@ OWN = (
     "kerv_cli.methods.spec_vla",
     "kerv_cli.methods.eagle",
     "kerv_cli.methods.early",
+    "kerv_cli.methods.scout",
     "kerv_cli.methods.kinematics",
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
@@ -40,6 +41,7 @@ OWN = (
     "kerv_cli.methods.heisd",
     "kerv_cli.methods.jacobi",
     "kerv_cli.methods.merged",
+    "kerv_cli.methods.certified",
     "kerv_cli.lab.executors.registration",
 )
 """Modules that register kerv's own parts when they are imported, as plugins do; none imports anything heavy. Messages

@@ -30,13 +30,15 @@ DESCRIPTIONS = {
     "target": "target.json",
     "drafter": "drafter.json",
     "early": "early.json",
+    "scout": "scout.json",
+    "certificate": "certificate.json",
     "datastore": "manifest.json",
     "calibration": "calibration.json",
     "risk": "risk.json",
     "score": "score.json",
 }
 """Kind of artifact -> the file that describes it."""
-TRAINED = ("target", "drafter", "early")
+TRAINED = ("target", "drafter", "early", "scout")
 KINDS = (SWEEP, ROLLOUT, *DESCRIPTIONS)
 LAST = "last"
 """Stands for the newest run where one is named."""

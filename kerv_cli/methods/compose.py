@@ -19,6 +19,7 @@ from kerv_cli.methods.parallel import ParallelPass
 _BATCHED = {
     ("none", "none", "none"): "ar",
     ("early", "none", "always"): "early_unverified",
+    ("scout", "none", "always"): "scout_unverified",
     ("none", "none", "parallel"): "parallel",
 }
 """Kinds of prefill_draft, proposer and skip -> the method that is made of them."""

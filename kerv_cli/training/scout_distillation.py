@@ -1,4 +1,4 @@
-"""Training a scout on the frozen target's greedy decodes and on the positions that it estimates (docs/methods.md §5.2).
+"""Training a scout on the frozen target's greedy decodes and on the positions that it estimates (docs/methods.md §5.1).
 
 Nothing privileged is read: neither the expert's actions nor the simulator's positions, only what the target says of an
 observation. The first `scene_steps` train the stem and its positions alone.
@@ -12,13 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.settings import DrafterSettings, TrainSettings
+from kerv_cli.base.settings import TrainSettings
+from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.network import Scout
+from kerv_cli.methods.scout.proposer import ScoutArtifact, check_sees
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.distillation import greedy
 from kerv_cli.training.early_distillation import BATCH, EarlyObservations, measure, observations
 from kerv_cli.training.imitation import position_loss, soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
+from kerv_cli.training.observations import split
+from kerv_cli.training.recorded import greedy
+from kerv_cli.training.runs import DrafterRun, Progress
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 
@@ -32,7 +36,7 @@ class ScoutSamples(EarlyObservations):
 
 @torch.inference_mode()
 def teach_scout(
-    target: CompactTarget, dataset: DemoDataset, settings: DrafterSettings, on_progress: Callable[[int, int], None]
+    target: CompactTarget, dataset: DemoDataset, settings: ScoutSettings, on_progress: Callable[[int, int], None]
 ) -> ScoutSamples:
     """The target's decodes and positions for about `settings.samples` observations, spread evenly over all episodes.
 
@@ -58,9 +62,13 @@ class ScoutDistillation:
     """Loss and validation of one run. The target's tokens are the labels; neighbouring bins share probability."""
 
     def __init__(self, scout: Scout, training: ScoutSamples, held_out: ScoutSamples, train: TrainSettings) -> None:
+        self.module: nn.Module = scout
         self.scout, self.training, self.held_out, self.train = scout, training, held_out, train
         self.device = scout.centre.device
         self.labels = soft_labels(scout.drafter.actions.tokens, train.label_sigma).to(self.device)
+
+    def __len__(self) -> int:
+        return len(self.training)
 
     def outputs(self, scout: Scout, samples: ScoutSamples, indices: Tensor) -> tuple[Tensor, Tensor]:
         """Logits (B, N, V) and positions (B, K, 3) for the samples at `indices` (B,)."""
@@ -91,3 +99,17 @@ class ScoutDistillation:
         names = [place.name.replace(" ", "_") for place in module.observation.places]
         metrics |= {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
         return {"score": metrics["accepted_r9"] + metrics["accepted_strict"], **metrics}
+
+
+class ScoutRun(DrafterRun):
+    """`kerv train drafter drafter=scout`; errors as `DrafterRun`, and a target that does not see."""
+
+    artifact = ScoutArtifact()
+
+    def lesson(self, progress: Progress) -> ScoutDistillation:
+        """The target's tokens and positions."""
+        settings, train = self.settings.drafter, self.settings.train
+        target = check_sees(self.target)
+        training, held_out = split(teach_scout(target, self.dataset, settings, progress), train.held_out)
+        torch.manual_seed(train.seed)
+        return ScoutDistillation(Scout.beside(settings, target).to(self.device), training, held_out, train)

@@ -1,4 +1,4 @@
-"""The scout: a drafter with eyes of its own (docs/methods.md §5.2, ours). Settings and registration."""
+"""The scout: a drafter with eyes of its own (docs/methods.md §5.1, ours). Settings and registration."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ from dataclasses import dataclass
 
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import PREFILL, add
-from kerv_cli.base.settings import DrafterSettings
+from kerv_cli.methods.early import EarlySettings
 
 
 @dataclass
-class ScoutSettings(DrafterSettings):
-    """Shapes of a scout: its stem, then the early drafter's network."""
+class ScoutSettings(EarlySettings):
+    """Shapes of a scout: its stem, then the early drafter's network (§5.1)."""
 
     kind: str = "scout"
-    layers: int = number(2, 0, 1024)
-    width: int = number(384, 1, 65_536)
-    rank: int = number(32, 1, 65_536)
-    history: int = number(0, 0, 1024)
-    channels: int = number(8, 1, 4096)  # of the stem's first stage
-    keypoints: int = number(16, 1, 4096)  # image points
-    grid: int = number(4, 1, 512)  # cells per side
-    cell_width: int = number(48, 1, 4096)
-    cell_features: int = number(8, 1, 4096)  # of each cell that the network reads; of all cells it reads the mean
-    word_width: int = number(32, 1, 4096)
+    channels: int = number(8, 1, 4096, help="of the stem's first stage")
+    keypoints: int = number(16, 1, 4096, help="image points of a view")
+    grid: int = number(4, 1, 512, help="cells per side of a view")
+    cell_width: int = number(48, 1, 4096, help="numbers of a cell")
+    cell_features: int = number(8, 1, 4096, help="of these, those that the network reads of each cell, beside the mean")
+    word_width: int = number(32, 1, 4096, help="numbers of a word")
+
+
+add("artifact", "scout", "kerv_cli.methods.scout.proposer:ScoutArtifact")
+add("drafter", "scout", "kerv_cli.training.scout_distillation:ScoutRun", ScoutSettings)
+_build = "kerv_cli.methods.scout.proposer:ScoutProposer.build"
+add("proposer", "scout", _build, needs=("scout",), colour=0x7BC8A4, when=PREFILL, chains=True)

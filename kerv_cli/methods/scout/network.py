@@ -1,4 +1,4 @@
-"""The scout's network: a stem and positions of its own, then the early drafter's network (docs/methods.md §5.2).
+"""The scout's network: a stem and positions of its own, then the early drafter's network (docs/methods.md §5.1).
 
 It reads the image, the hand and the instruction, and nothing that the target computes: so a chunk that is executed
 unverified costs no encoding of the target's, and what goes wrong in one view need not go wrong in the other.
