@@ -36,6 +36,8 @@ OWN = (
     "kerv_cli.methods.streak",
     "kerv_cli.methods.risk",
     "kerv_cli.methods.unverified",
+    "kerv_cli.methods.sp_vla",
+    "kerv_cli.methods.watch",
     "kerv_cli.methods.retrieval",
     "kerv_cli.methods.heisd",
     "kerv_cli.methods.jacobi",

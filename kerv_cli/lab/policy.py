@@ -23,7 +23,7 @@ from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import check as check_method
-from kerv_cli.methods.compose import check_batch, compose, needs
+from kerv_cli.methods.compose import check_batch, check_unwatched, compose, needs
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
@@ -104,6 +104,8 @@ def check(settings: RolloutSettings) -> None:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     check_method(method, settings.chunk, target.chunk, target.parallel)
     check_batch(method, settings.method, settings.rollout.batch)
+    if settings.rollout.clock != WAITS:
+        check_unwatched(method, f"rollout.clock={settings.rollout.clock}", "a look has no latency there")
     timing.check_method(settings, spec, target)
     kinds = needs(method)
     artifacts.check(kinds)
@@ -146,6 +148,11 @@ class Sampled:
     def cameras(self) -> tuple[str, ...]:
         """Those of the decoder."""
         return self.decoder.cameras
+
+    @property
+    def watcher(self) -> Decoder | None:
+        """That of the decoder."""
+        return self.decoder.watcher
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Begins an episode of both decoders."""

@@ -96,7 +96,7 @@ class Watched:
 
     def __init__(self, decoder: ActionDecoder, on_step: Callable[[int], None]) -> None:
         self.decoder, self.on_step, self.steps = decoder, on_step, 0
-        self.decode = decoder.decode
+        self.decode, self.watcher = decoder.decode, getattr(decoder, "watcher", None)
 
     @property
     def cameras(self) -> tuple[str, ...]:

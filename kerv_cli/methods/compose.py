@@ -99,6 +99,18 @@ def check_batch(parts: Mapping[str, Any], method: str, batch: int) -> None:
         )
 
 
+def check_unwatched(method: Mapping[str, Any], where: str, why: str) -> None:
+    """Refuses a method that looks at the world while a chunk is executed, where that is impossible. where, why: for the
+    message.
+
+    Raises:
+        UsageError: it is one.
+    """
+    name = method["skip"].kind
+    if part_of("skip", name).traits.get("watches"):
+        raise UsageError(f"skip={name} with {where}: {why}")
+
+
 def is_parallel(target: Any) -> bool:
     """Whether a target decodes all tokens at once; see `targets.protocol.ParallelTarget`."""
     return bool(getattr(target, "parallel", False))

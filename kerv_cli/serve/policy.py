@@ -11,7 +11,7 @@ from kerv_cli.base.settings import ServeSettings
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.compose import check, compose, needs
+from kerv_cli.methods.compose import check, check_unwatched, compose, needs
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
 
 WARM_UP = 4  # decodes
@@ -30,6 +30,7 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
     artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
     description, method = artifacts.description, settings.parts()
     check(method, settings.chunk, description.chunk)
+    check_unwatched(method, "kerv serve", "a client executes chunks without a look between their steps")
     artifacts.check(needs(method))
     decoder = compose(method, artifacts.target, artifacts.load, settings.task_name, settings.chunk)
     interface = Interface(
