@@ -179,3 +179,11 @@ def test_sampled_decodes_are_watched_too(policies: Path) -> None:
     words = ["skip.source=hold", "skip.tolerance=0", "deviation_every=1", "world.horizon=8", "record=0"]
     decoder: Any = policies_of.decoder_for(chosen(policies, *words), "reach-v3")
     assert decoder.watcher is decoder.decoder
+
+
+def test_looks_are_warmed_up_with_the_decodes(policies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[int] = []
+    look = Decoder.look
+    monkeypatch.setattr(Decoder, "look", lambda self, seen, step: (steps.append(step), look(self, seen, step))[1])
+    policies_of.decoder_for(chosen(policies, "skip.source=hold", "skip.every=2"), "reach-v3")
+    assert steps == policies_of.WARM_UP_DECODES * [2]
