@@ -29,8 +29,10 @@ from kerv_cli.methods.kinematics import CompensateSettings, KinematicThresholdSe
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.retrieval import RetrievalProposerSettings
 from kerv_cli.methods.risk import RiskSkipSettings
+from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
 from kerv_cli.methods.streak import StreakSkipSettings
+from kerv_cli.methods.watch import WatchSettings
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {
@@ -117,6 +119,8 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "skip": RiskSkipSettings(score="odds", epsilon=0.15, delta=0.1, audit=0.05, opening=1),
     },
     "parallel": {"skip": NoSettings("parallel")},
+    "sp_vla": {"skip": SpeedSkipSettings(v_min=0.3, v_max=1000, buffer=6, share=0.5, penalty=1e-4)},
+    "watch": {"skip": WatchSettings(source="early", every=1, tolerance=0.1)},
     "one_pass_strict": {"prefill_draft": NoSettings("early"), "proposer": JacobiProposerSettings(depth=0)},
 }
 
@@ -301,6 +305,9 @@ def test_an_expert_needs_nothing_else() -> None:
         ("method=early_unverified", ("early",)),
         ("method=retrieval_unverified", ("datastore",)),
         ("method=spec_vla_paper", ("drafter",)),
+        ("method=sp_vla", ()),
+        ("method=watch", ("early",)),
+        ("method=watch skip.source=kalman", ("calibration",)),
     ],
 )
 def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides: str, wanted: tuple[str, ...]) -> None:

@@ -24,9 +24,9 @@ class MethodCeiling:
 
 
 def ceilings(profile: Profile, tokens: int) -> list[MethodCeiling]:
-    """The ceilings of the methods in conf/method at N = `tokens`; AR, the expert and methods that execute every draft
-    unverified have none."""
-    names = [name for name in groups()["method"] if name not in (EXPERT, "ar")]
+    """The ceilings of the methods in conf/method at N = `tokens`; the expert and methods that verify nothing have
+    none."""
+    names = [name for name in groups()["method"] if name != EXPERT]
     candidates = (_ceiling(name, _settings(name), profile, tokens) for name in names)
     return [ceiling for ceiling in candidates if ceiling is not None]
 
@@ -43,6 +43,8 @@ def _ceiling(name: str, settings: RolloutSettings, profile: Profile, tokens: int
     if settings.skip.kind == "parallel":
         speedup = autoregressive / (encode + profile.seconds("prefill", profile.prompt + tokens))
         return MethodCeiling(name, "one forward", speedup, speedup)
+    if settings.prefill_draft.kind == settings.proposer.kind == "none":
+        return None
     if settings.prefill_draft.kind != "none":
         least = encode + profile.seconds("prefill", profile.prompt + tokens - 1)
         return MethodCeiling(name, "in the prefill", autoregressive / least, autoregressive / least)

@@ -14,10 +14,10 @@ from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.acceptance import Acceptance, Strict
 from kerv_cli.engine.chunk import Chunk, Clock, Rejection, Situation, steps_of
 from kerv_cli.engine.history import ActionHistory
-from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
+from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold, Watches
 from kerv_cli.engine.proposer import Asks, Proposer
 from kerv_cli.engine.protocol import Target
-from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
+from kerv_cli.engine.record import PARALLEL, DecodeRecord, Look, Round
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import EMPTY, TokenTree, visible_in_prefill
 from kerv_cli.engine.unread import Unread
@@ -78,6 +78,13 @@ class Decoder:
         nodes = max((p.nodes for p in (draft, self.parts.proposer) if p is not None), default=0)
         self.cache = target.new_cache(1, target.max_prompt + size + max(nodes, size) + 1)
         self.situation = Situation("", ActionHistory(target.actions.dofs))
+        self.watch = self.parts.skip if isinstance(self.parts.skip, Watches) else None
+        self.plan = np.zeros((0, target.actions.dofs), np.float32)  # actions of the last decode, environment units
+
+    @property
+    def watcher(self) -> Decoder | None:
+        """Itself, where its method looks at the world while a chunk is executed."""
+        return None if self.watch is None else self
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -110,6 +117,17 @@ class Decoder:
     def decode(self, observation: Observation) -> DecodeRecord:
         """The chunk's actions and the record of its decode."""
         clock = Clock(self.target.device)
+        chunk = self.decode_prompt(self._encoding(observation, clock), clock, observation)
+        actions, predicted = self.actions_of(chunk)
+        self.plan = actions
+        self.threshold.update(chunk.variability)
+        if self.parts.rectifier is not None:
+            self.parts.rectifier.next_decode()
+        seconds = clock.stop()
+        return record_of(chunk, actions, seconds, clock.phases, predicted)
+
+    def _encoding(self, observation: Observation, clock: Clock) -> Callable[[], Tensor]:
+        """What encodes the observation's prompt, when it is first read."""
 
         def encode() -> Tensor:
             clock.lap("propose")  # whoever asks first drafts from it
@@ -117,13 +135,22 @@ class Decoder:
             clock.lap("vision")
             return prompt
 
-        chunk = self.decode_prompt(encode, clock, observation)
-        actions, predicted = self.actions_of(chunk)
-        self.threshold.update(chunk.variability)
-        if self.parts.rectifier is not None:
-            self.parts.rectifier.next_decode()
-        seconds = clock.stop()
-        return record_of(chunk, actions, seconds, clock.phases, predicted)
+        return encode
+
+    def looks_at(self, step: int) -> bool:
+        """Whether the method looks before control step `step` ≥ 1 of its last chunk."""
+        return self.watch is not None and step % self.watch.every == 0
+
+    @torch.inference_mode()
+    def look(self, observation: Observation, step: int) -> Look:
+        """Whether the last chunk is executed on from its control step `step`, as its method sees the world now."""
+        assert self.watch is not None
+        clock, space = Clock(self.target.device), self.target.actions
+        prompt = self._encoding(observation, clock)
+        chunk = Chunk(prompt, self.steps, space, self.cache, self.situation, observation=observation)
+        keeps = self.watch.keeps(chunk, space.encode(self.plan[step]).tolist())
+        clock.lap("propose")
+        return Look(keeps, clock.stop(), clock.phases)
 
     def actions_of(self, chunk: Chunk) -> tuple[np.ndarray, int]:
         """The chunk's actions (steps, D) float32 in environment units, and how many of their numbers were predicted."""

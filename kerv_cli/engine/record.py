@@ -100,6 +100,16 @@ class Delay:
 
 
 @dataclass(frozen=True)
+class Look:
+    """A look at the world while a chunk is executed. keeps: whether the rest of the chunk is. seconds, phases: of
+    inference, as in `DecodeRecord`."""
+
+    keeps: bool
+    seconds: float
+    phases: dict[str, float]
+
+
+@dataclass(frozen=True)
 class DecodeRecord:
     """One call of the decoder: from an observation to the actions to execute."""
 
@@ -119,6 +129,16 @@ class DecodeRecord:
     trust: Trust | None = None  # of a gate with a score
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
     delay: Delay | None = None  # None: the world waited
+    looks: int = 0  # at the world while the chunk was executed; their time is in `seconds` and `phases`
+    abandoned: int = 0  # control steps of the chunk that were given up after the last of them
+
+    def with_look(self, look: Look, left: int) -> DecodeRecord:
+        """After a look, before which `left` control steps of the chunk were not yet executed."""
+        phases = {name: seconds + look.phases.get(name, 0.0) for name, seconds in self.phases.items()}
+        abandoned = 0 if look.keeps else left
+        return replace(
+            self, seconds=self.seconds + look.seconds, phases=phases, looks=self.looks + 1, abandoned=abandoned
+        )
 
     @property
     def delay_steps(self) -> int | None:

@@ -18,7 +18,7 @@ from kerv_cli.engine.decoder import Decoder, deviation
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab import clock
 from kerv_cli.lab.clock import RealClock
-from kerv_cli.lab.episode import ActionDecoder
+from kerv_cli.lab.episode import ActionDecoder, Watcher
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.methods.artifacts import Artifacts
@@ -96,6 +96,8 @@ def check(settings: RolloutSettings) -> None:
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
     method.check(target, settings.rollout.batch)
+    if settings.rollout.clock != WAITS:
+        method.check_unwatched(f"rollout.clock={settings.rollout.clock}", "a look has no latency there")
     clock.check(settings, spec, target)
     artifacts.check(method.needs)
     method.check_levels(tasks, artifacts.load)
@@ -134,6 +136,11 @@ class Sampled:
     def cameras(self) -> tuple[str, ...]:
         """Those of the decoder."""
         return self.decoder.cameras
+
+    @property
+    def watcher(self) -> Decoder | None:
+        """That of the decoder."""
+        return self.decoder.watcher
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Begins an episode of both decoders."""
@@ -234,7 +241,10 @@ def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: in
     """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
     so that parts that need a history or a path run too. pixels: size of the images."""
     still = still_observation(decoder, spec, pixels)
+    watcher: Watcher | None = getattr(decoder, "watcher", None)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
     for i in range(WARM_UP_DECODES):
-        for action in decoder.decode(still).actions:
+        for step, action in enumerate(decoder.decode(still).actions):
+            if step and watcher is not None and watcher.looks_at(step):
+                watcher.look(still, step)
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))

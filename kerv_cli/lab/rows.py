@@ -87,7 +87,8 @@ _OF_DELAY = ("observed", "carried", "held", "dropped", "predicted")  # fields of
 _MEASURES = ("variability", "similarity", "metric", "deviation")
 _MOTION = ("path_length", "jerk", "gripper_switches")
 _OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds", *_MOTION)  # of EpisodeRecord
-_OF_DECODE = ("mode", "forwards", "seconds", "compensated", "skipped", *_MEASURES)  # fields of DecodeRecord
+_COUNTS = ("compensated", "looks", "abandoned")
+_OF_DECODE = ("mode", "forwards", "seconds", "skipped", *_COUNTS, *_MEASURES)  # fields of DecodeRecord
 
 DECODE_SCHEMA = pa.schema(
     [
@@ -104,6 +105,8 @@ DECODE_SCHEMA = pa.schema(
         ("rounds", pa.list_(_ROUND)),
         ("compensated", pa.int64()),
         ("skipped", pa.bool_()),
+        ("looks", pa.int64()),  # at the world while it was executed
+        ("abandoned", pa.int64()),  # control steps that were given up after the last look
         *[(name, pa.float64()) for name in _MEASURES],
         ("score", pa.float64()),  # of the draft; these: null without a gate, see decoding.record.Trust
         ("level", pa.float64()),

@@ -30,6 +30,7 @@ def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
     artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
     description, method = artifacts.description, Method.of(settings)
     method.check(description)
+    method.check_unwatched("kerv serve", "a client executes chunks without a look between their steps")
     artifacts.check(method.needs)
     decoder = method.decoder(artifacts.target, artifacts.load, settings.task_name)
     interface = Interface(
