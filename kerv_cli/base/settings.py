@@ -164,6 +164,8 @@ class PolicySettings:
     target: str = setting("mt10-vision", "the policy's weights")
     drafter: str | None = setting(None, "default: the one beside the target")
     early: str | None = setting(None, "the early drafter; default: the one beside the target")
+    scout: str | None = setting(None, "the drafter with eyes of its own; default: the one beside the target")
+    certificate: str | None = setting(None, "of success; default: the one beside the target")
     datastore: str | None = setting(None, "default: the one beside the target")
     calibration: str | None = setting(None, "default: the one beside the target")
     risk: str | None = setting(None, "what unverified drafts lose; default: the one beside the target")
@@ -561,6 +563,15 @@ class CalibrateRiskSettings(TaskSettings):
         for name in ("sources", "scores"):
             if not getattr(self, name):
                 raise UsageError(f"{prefix}{name}=[]: name at least one")
+
+
+@dataclass
+class CalibrateSuccessSettings(SweepSettings):
+    """`kerv calibrate success` (docs/methods.md §4.7): all words but these go to the study's settings."""
+
+    name: str | None = setting(None, "of the certificate; default: certificate/ beside the target")
+    margin: float = number(5.0, above=0, most=99.9, help="points of success that may be lost against AR")
+    delta: float = number(0.1, above=0, most=0.5, help="the certificate holds with probability 1 - delta")
 
 
 def choices_of(schema: type) -> dict[str, str]:

@@ -7,7 +7,7 @@ that come of it are ordinary ones.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from kerv_cli.base.errors import UsageError
@@ -44,7 +44,7 @@ class Certificate:
     success, with confidence 1 − delta.
 
     drafts: kind -> hash of the artifacts that drafted. method: kind -> settings of the other parts. chunk: H. world:
-    camera, horizon. dtype: number format. seeds: the selection seeds, as text.
+    camera and horizon. dtype: number format. seeds: the selection seeds, as text.
     """
 
     target: str
@@ -68,6 +68,33 @@ class Certificate:
         """Settings of the certified skip rule; those of `none` where nothing was certified, or verifying always was."""
         plain = {"kind": "none"} if self.chosen is None else self.candidates[self.chosen].skip
         return read(part_of("skip", plain["kind"]).settings, plain, "the certificate's rule")
+
+    def check_method(self, method: Mapping[str, Any], dtype: str) -> None:
+        """Refuses a method that decodes otherwise than what was certified. method: kind -> settings of its parts.
+
+        Raises:
+            UsageError: a part or the number format differs; names both values.
+        """
+        for kind, certified in self.method.items():
+            used = asdict(method[kind])
+            for key in sorted({*certified, *used}, key=lambda key: key != "kind"):
+                if certified.get(key) != used.get(key):
+                    raise UsageError(
+                        f"skip=certified with {kind}.{key}={used.get(key)}: the certificate is of "
+                        f"{certified.get(key)}; set that, or run 'kerv calibrate success' anew"
+                    )
+        if dtype != self.dtype:
+            raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
+
+    def check_world(self, world: Mapping[str, Any]) -> None:
+        """Refuses another camera or horizon; of a stressed world the certificate says nothing, and stress is asked for.
+
+        Raises:
+            UsageError: another one; names both values.
+        """
+        for key, certified in self.world.items():
+            if world.get(key) != certified:
+                raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
 
     def sentence(self) -> str:
         """What it says."""
@@ -104,10 +131,15 @@ class CertificateArtifact(Artifact[Certificate]):
         return description.drafts
 
 
+def covers(context: Context) -> bool:
+    """Whether the certificate covers the decoder's task."""
+    certificate: Certificate = context.artifact("certificate")
+    return context.task in certificate.tasks
+
+
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
     """prefill_draft=scoped: the source for the task at hand."""
-    inside = context.task in context.artifact("certificate").tasks
-    part = part_of("prefill_draft", settings.inside if inside else settings.outside)
+    part = part_of("prefill_draft", settings.inside if covers(context) else settings.outside)
     proposer: Proposer = part.built(part.settings(kind=part.name), context)
     return proposer
 
@@ -115,9 +147,11 @@ def scoped(settings: ScopedSettings, context: Context) -> Proposer:
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     """skip=certified: the certified rule, or a streak outside the certificate."""
     certificate: Certificate = context.artifact("certificate")
-    inside = context.task in certificate.tasks
-    rule = certificate.rule if inside else StreakSkipSettings(most=settings.most)
-    if inside and context.target.chunk != certificate.chunk:
-        raise UsageError(f"skip=certified: its certificate is of chunks of {certificate.chunk} steps")
+    rule: Any = StreakSkipSettings(most=settings.most)
+    if covers(context):
+        rule, chunk = certificate.rule, context.chunk or context.target.chunk
+        certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
+        if chunk != certificate.chunk:
+            raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
     skip: Skip | None = part_of("skip", rule.kind).built(rule, context)
     return skip
