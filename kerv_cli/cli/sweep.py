@@ -76,7 +76,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
     if plan:
         _print_plan(covered, store, first.runtime.workers, as_json)
         return
-    outcome = _run(resolved, covered, store, words)
+    outcome = run_covered(resolved, covered, store, words)
     _tell(outcome, resolved, covered.cells, store, words, as_json)
     if resolved.rerun != "never":
         _warn(disagreements(outcome.done, Stock(store, others=False)))
@@ -136,7 +136,7 @@ def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool
     typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
 
 
-def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
+def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
     """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab.execute import execute
