@@ -29,7 +29,6 @@ from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, stor
 from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.reuse import Stock, cover
-from kerv_cli.lab.run_file import interrupted_since
 from kerv_cli.lab.store import STUDIES, StudyStore
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.report import report as write_report
@@ -128,7 +127,7 @@ def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
     check_writable(first.results)
     cells = planned_cells(resolved)
     store = StudyStore(first.results, resolved.study.name)
-    begun = interrupted_since(store.root, ["sweep", *typed])
+    begun = store.interrupted_since(["sweep", *typed])
     outcome = run_covered(resolved, cover(cells, Stock(store), resolved.rerun, begun), store, typed)
     if outcome.failed:
         failure = outcome.failed[0]

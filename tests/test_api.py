@@ -14,7 +14,6 @@ import pytest
 
 import kerv_cli as kerv
 from kerv_cli.api import as_words
-from kerv_cli.lab.run_file import invocations
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
@@ -61,8 +60,8 @@ def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run: kerv.Study, m
     assert episode["steps"] == 6
     assert len(run.to_pandas()) == len(run.to_pandas("tasks")) == 1
     assert run.folder.parent == mine["results"] / "rollouts"
-    (command,) = invocations(run.folder)
-    assert command.arguments[:3] == ("rollout", "seed=100003", "method=ar")
+    (command,) = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))["commands"]
+    assert command["arguments"][:3] == ["rollout", "seed=100003", "method=ar"]
 
 
 def test_a_grid_has_a_setting_per_value(mine: dict[str, Any]) -> None:
