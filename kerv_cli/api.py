@@ -23,12 +23,10 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import ServeSettings
 from kerv_cli.cli.rollout import planned_cells, run_cells
-from kerv_cli.cli.sweep import run_covered
+from kerv_cli.cli.sweep import covered_cells, run_covered
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, store_of
-from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
-from kerv_cli.lab.reuse import Stock, cover
 from kerv_cli.lab.store import STUDIES, StudyStore
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.report import report as write_report
@@ -122,17 +120,11 @@ def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
     """
     typed = as_words(f"study={study}", *words, **settings)
     resolved = resolve(typed)
-    first = next(iter(resolved.settings.values()))
-    check_executor(first.runtime)
-    check_writable(first.results)
-    cells = planned_cells(resolved)
-    store = StudyStore(first.results, resolved.study.name)
-    begun = store.interrupted_since(["sweep", *typed])
-    outcome = run_covered(resolved, cover(cells, Stock(store), resolved.rerun, begun), store, typed)
-    if outcome.failed:
-        failure = outcome.failed[0]
-        where = f"{failure.cell.label} on {failure.cell.task}"
-        raise KervError(f"{len(outcome.failed)} of {len(cells)} cells failed, {where}: {failure.reason}")
+    store, covered = covered_cells(resolved, typed)
+    failed = run_covered(resolved, covered, store, typed).failed
+    if failed:
+        cell, reason = failed[0].cell, failed[0].reason
+        raise KervError(f"{len(failed)} of {len(covered.cells)} cells failed, {cell.label} on {cell.task}: {reason}")
     return Study(store)
 
 
