@@ -9,7 +9,7 @@ CODE := kerv_cli tests scripts
 test test-cpus: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test test-cpus demo torture lint format pages lock clean
+.PHONY: help setup test test-cpus demo torture lint format pages docs lock clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -50,6 +50,10 @@ format: setup ## rewrite the code in the project's style
 
 pages: setup ## fill the figures of README.md, results/README.md and results/LOG.md from results/tables
 	@$(BIN)/python scripts/figures.py README.md results/README.md results/LOG.md
+
+docs: setup ## build the pages as a site in build/site; a link that leads nowhere is an error
+	@$(BIN)/python -c 'import material' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@$(BIN)/mkdocs build --quiet
 
 lock: setup ## write requirements/*.txt from what is installed
 	@scripts/lock.sh $(BIN)/python

@@ -52,6 +52,7 @@ def test_the_wheel_carries_the_package_and_nothing_else(wheel: zipfile.ZipFile) 
     names = {name for name in wheel.namelist() if ".dist-info/" not in name and not name.startswith("kerv_cli/conf/")}
     assert names >= {path.relative_to(ROOT).as_posix() for path in (ROOT / "kerv_cli").rglob("*.py")}
     assert {name.split("/")[0] for name in names} == {"kerv_cli"}
+    assert {"kerv_cli/__init__.pyi", "kerv_cli/py.typed"} <= names, "types of the library"
 
 
 def test_the_command_names_a_function_that_the_wheel_holds(wheel: zipfile.ZipFile) -> None:
@@ -78,7 +79,7 @@ def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel: zipfile
     site = tmp_path / "site"
     wheel.extractall(site)
     sizes = [entry.file_size for entry in wheel.infolist() if entry.filename.startswith("kerv_cli/pretrained/")]
-    assert 10e6 < sum(sizes) < 20e6, "README and pyproject.toml state its size"
+    assert 10e6 < sum(sizes) < 20e6, "docs/install.md and pyproject.toml state its size"
     work = tmp_path / "work"
     work.mkdir()
     command = ["rollout", "method=one_pass", "task=drawer-open", "episodes=1", "world.horizon=8", "record=0"]

@@ -51,37 +51,43 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         _list_studies(as_json)
         return
     from kerv_cli.base.config import to_yaml
-    from kerv_cli.cli.rollout import planned_cells
-    from kerv_cli.lab.executors import check_executor
-    from kerv_cli.lab.resolve import idle_overrides, resolve
+    from kerv_cli.lab.resolve import resolve
 
     resolved = resolve(words)
-    first = next(iter(resolved.settings.values()))
     if cfg:
         typer.echo(to_yaml(resolved.study), nl=False)
         for label, settings in resolved.settings.items():
             typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
         return
-    print_notes(idle_overrides(resolved))
-    check_executor(first.runtime)
-    check_writable(first.results)
-    cells = planned_cells(resolved)
+    store, covered = covered_cells(resolved, words)
+    if plan:
+        _print_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
+        return
+    outcome = run_covered(resolved, covered, store, words)
+    _tell(outcome, resolved, covered.cells, store, words, as_json)
+    if outcome.failed:
+        raise typer.Exit(1)
+
+
+def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore, Covered]:
+    """The study's store, and its cells as those on disk and those to run, after everything that can be refused without
+    running was. Says what has no effect and which cells disagree. words: of the command."""
+    from kerv_cli.cli.rollout import planned_cells
+    from kerv_cli.lab.executors import check_executor
+    from kerv_cli.lab.resolve import idle_overrides
     from kerv_cli.lab.reuse import Stock, cover, disagreements
     from kerv_cli.lab.store import StudyStore
 
+    print_notes(idle_overrides(resolved))
+    first = next(iter(resolved.settings.values()))
+    check_executor(first.runtime)
+    check_writable(first.results)
+    cells = planned_cells(resolved)
     store = StudyStore(first.results, resolved.study.name)
     stock = Stock(store)
     covered = cover(cells, stock, resolved.rerun, store.interrupted_since(["sweep", *words]))
     _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
-    if plan:
-        _print_plan(covered, store, first.runtime.workers, as_json)
-        return
-    outcome = _run(resolved, covered, store, words)
-    _tell(outcome, resolved, covered.cells, store, words, as_json)
-    if resolved.rerun != "never":
-        _warn(disagreements(outcome.done, Stock(store, others=False)))
-    if outcome.failed:
-        raise typer.Exit(1)
+    return store, covered
 
 
 def _list_studies(as_json: bool) -> None:
@@ -136,11 +142,11 @@ def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool
     typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
 
 
-def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
-    """Runs what is not complete yet. Raises Interrupted: Ctrl-C."""
+def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
+    """Runs what is not complete yet; says what differs from what it was before. Raises Interrupted: Ctrl-C."""
     from kerv_cli.cli.progress import ProgressDisplay
     from kerv_cli.lab.execute import execute
-    from kerv_cli.lab.reuse import take_over
+    from kerv_cli.lab.reuse import Stock, disagreements, take_over
     from kerv_cli.lab.run import CellRunner, reference_decode
     from kerv_cli.report.viewing import save_recording
 
@@ -166,6 +172,8 @@ def _run(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: li
             ) from None
     if not outcome.failed:
         store.note_finished()
+    if resolved.rerun != "never":
+        _warn(disagreements(outcome.done, Stock(store, others=False)))
     return outcome
 
 

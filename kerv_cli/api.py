@@ -1,0 +1,228 @@
+"""The commands as Python functions: `import kerv_cli as kerv`, then `kerv.rollout(method="one_pass", task="reach")`.
+
+Settings are those of the commands: words as they are typed (`"threshold.r=5"`) and keywords, in which a list is a list,
+a mapping sets what lies below its key (`threshold={"r": 5}`) and None is null. Progress and warnings go to standard
+error, as a command's do. What kerv raises deliberately is a KervError, whose message is one line.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command, where numpy is not loaded yet: times compare
+
+import numpy as np
+import pandas as pd
+
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import KervError, UnknownName, UsageError
+from kerv_cli.base.places import check_writable, results_dir
+from kerv_cli.base.settings import ServeSettings
+from kerv_cli.cli.rollout import planned_cells, run_cells
+from kerv_cli.cli.sweep import covered_cells, run_covered
+from kerv_cli.engine.decoder import Decoder
+from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, store_of
+from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
+from kerv_cli.lab.store import STUDIES, StudyStore
+from kerv_cli.report.measures import MICRO
+from kerv_cli.report.report import report as write_report
+from kerv_cli.report.tables import load_study as load_data
+from kerv_cli.report.tables import per_task_table, rows_of, study_table
+from kerv_cli.serve.policy import served
+from kerv_cli.serve.session import EXECUTED, RESET, Interface, Session
+
+TABLES = ("settings", "tasks", "episodes")
+
+
+@dataclass(frozen=True)
+class Study:
+    """The complete episodes of a sweep or a rollout, read from disk whenever they are asked for."""
+
+    store: StudyStore
+
+    @property
+    def name(self) -> str:
+        """By which `load_study` and the commands know it."""
+        return self.store.name
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies."""
+        return self.store.root
+
+    def to_pandas(self, table: str = "settings") -> pd.DataFrame:
+        """One of its tables; their columns: docs/methods.md, sections 7 and 8.
+
+        Args:
+            table: settings: a row per setting, over all tasks. tasks: a row per task and setting. episodes: a row per
+                setting, task, seed and repeat: success, steps, forwards, seconds of inference, tokens, ….
+
+        Raises:
+            UsageError: no such table, or no complete episode. CheckpointError: a cell is damaged.
+        """
+        if table not in TABLES:
+            raise UnknownName("table", table, TABLES)
+        data = load_data(self.store)
+        if table == "episodes":
+            return data.episodes
+        if table == "tasks":
+            return per_task_table(data)
+        whole = study_table(data)
+        return whole[whole["averaging"] == MICRO].reset_index(drop=True)
+
+    def episodes(self) -> list[dict[str, Any]]:
+        """The rows of the table of episodes; errors as `to_pandas`."""
+        return rows_of(self.to_pandas("episodes"))
+
+    def report(self) -> list[Path]:
+        """Writes a sweep's tables, plots and page, as `kerv report` -> their files.
+
+        Raises:
+            UsageError: it is a rollout. KervError: as `kerv report`.
+        """
+        if self.store.family != STUDIES:
+            raise UsageError(f"{self.name} is a rollout: kerv reports sweeps")
+        return write_report(self.folder.parent.parent, self.name).files
+
+
+def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
+    """Runs episodes of one method, as `kerv rollout`; goes on with the same rollout where one was interrupted.
+
+    Args:
+        words, settings: of `kerv rollout`, e.g. `rollout("threshold.r=5", method="spec_vla", task="reach")`.
+        grid: texts with commas are grids, as with `-m`: `method="ar,one_pass"`.
+
+    Raises:
+        UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
+        Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
+    """
+    typed = as_words(*words, **settings)
+    resolved = resolve_rollout(typed, grid)
+    results = next(iter(resolved.settings.values())).results
+    check_writable(results)
+    arguments = ["rollout", *(["-m"] if grid else []), *typed]
+    return Study(run_cells(resolved, planned_cells(resolved), results, arguments))
+
+
+def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
+    """Runs what a study lacks, as `kerv sweep`: every setting on every task with the same seeds, in turn.
+
+    Args:
+        study: a name in conf/study, or the path of such a file.
+        words, settings: of `kerv sweep`; they hold for each of the study's settings.
+
+    Raises:
+        UsageError, CheckpointError, Interrupted: as `rollout`. KervError: cells failed; the others are kept.
+    """
+    typed = as_words(f"study={study}", *words, **settings)
+    resolved = resolve(typed)
+    store, covered = covered_cells(resolved, typed)
+    failed = run_covered(resolved, covered, store, typed).failed
+    if failed:
+        cell, reason = failed[0].cell, failed[0].reason
+        raise KervError(f"{len(failed)} of {len(covered.cells)} cells failed, {cell.label} on {cell.task}: {reason}")
+    return Study(store)
+
+
+def load_study(name: str, results: str | Path = "results") -> Study:
+    """A sweep or rollout of a results folder.
+
+    Args:
+        name: as `kerv runs show` takes it: its name, a unique part of it, `last`, or a study's file.
+
+    Raises:
+        UsageError: none or several have that name, or it has no episodes.
+    """
+    return Study(store_of(find_run(results_dir(str(results)), study_name(name))))
+
+
+def runs(results: str | Path = "results", **filters: str) -> pd.DataFrame:
+    """What a results folder holds, as `kerv runs list`: a row per sweep, rollout, training, …, the newest first.
+
+    Args:
+        filters: kind, method, task (patterns such as `drawer*` too), state and since (ISO 8601, UTC).
+
+    Raises:
+        UsageError: no such filter or kind.
+    """
+    there = matching(find_runs(results_dir(str(results))), filters)
+    return pd.DataFrame([asdict(run) for run in there], columns=[column.name for column in fields(RunEntry)])
+
+
+class Policy:
+    """A policy with a method, in this process. It answers what `kerv serve` answers (docs/serving.md).
+
+    info: its inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names and limits of
+    the D actions, control_hz, chunk (H control steps). last: the last answer whole, with `policy_timing`
+    (milliseconds) and `decode` (forwards, tokens, mode).
+    """
+
+    def __init__(self, interface: Interface, decoder: Decoder) -> None:
+        self.info: dict[str, Any] = interface.metadata(decoder.steps)
+        self.last: dict[str, Any] = {}
+        self._session = Session(interface, decoder)
+        self._begins = True
+
+    def reset(self) -> None:
+        """The next observation begins an episode: histories are forgotten."""
+        self._begins = True
+
+    def act(self, observation: Mapping[str, Any], executed: int | None = None) -> np.ndarray:
+        """The actions (h, D) to execute from here, float64, environment units; h ≤ H.
+
+        Args:
+            observation: `observation/<camera>`: (size, size, 3) uint8, for several views side by side
+                (size, size × views, 3); `observation/image` where there is one camera. `observation/state`: the numbers
+                that `info` names, or the whole state; positions in metres. `prompt`: the instruction.
+            executed: control steps of the last answer that were executed; None: all of them.
+
+        Raises:
+            UsageError: something is missing, of another shape or type, or not finite; the message names it.
+        """
+        extra = {} if executed is None else {EXECUTED: executed}
+        self.last = self._session.answer({**observation, **extra, RESET: self._begins})
+        self._begins = False
+        actions: np.ndarray = self.last["actions"]
+        return actions
+
+
+def load_policy(
+    target: str = "mt10-vision", *words: str, method: str = "one_pass", task: str = "", **settings: Any
+) -> Policy:
+    """A policy that answers observations, warmed up.
+
+    Args:
+        target: name of a policy of the results folder or of a shipped one, or the path of its folder.
+        method: name in conf/method, or the path of such a file.
+        task: name of the task, for parts whose levels differ between tasks.
+        words, settings: of `kerv serve`, e.g. `gripper="signed"` or `results="results"`.
+
+    Raises:
+        UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or an artifact that the
+            method needs is missing or of another policy.
+    """
+    typed = as_words(*words, **{"policy.target": target, "method": method, "task_name": task}, **settings)
+    return Policy(*served(compose("serve", typed, ServeSettings)))
+
+
+def as_words(*words: str, **settings: Any) -> list[str]:
+    """Words and keywords as they are typed behind a command: `episodes=3`, `task=[reach,push]`, `threshold.r=5`."""
+    return [*words, *(word for key, value in settings.items() for word in _typed(key, value))]
+
+
+def _typed(key: str, value: Any) -> Iterator[str]:
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _typed(f"{key}.{name}", inner)
+    else:
+        yield f"{key}={_text(value)}"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(_text, value))}]"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,0 +1,151 @@
+"""kerv as a library: the same runs as the commands', errors as exceptions, and the notebook of the docs."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kerv_cli as kerv
+from kerv_cli.api import as_words
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
+
+
+@pytest.fixture(scope="module")
+def mine(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Settings of a short episode of an untrained policy, in a results folder of this module."""
+    target = policies / "artifacts" / "target" / "nano-state"
+    results = tmp_path_factory.mktemp("library") / "results"
+    return {**SHORT, "policy": {"target": target}, "results": results}
+
+
+@pytest.fixture(scope="module")
+def run(mine: dict[str, Any]) -> kerv.Study:
+    return kerv.rollout("seed=100003", method="ar", **mine)
+
+
+@pytest.fixture(scope="module")
+def study(mine: dict[str, Any]) -> kerv.Study:
+    path = mine["results"].parent / "both.yaml"
+    path.write_text("settings: {ar: method=ar, held: method=hold}\n", encoding="utf-8")
+    return kerv.sweep(path, **mine)
+
+
+def test_the_import_loads_nothing_and_names_what_the_stub_names() -> None:
+    code = "import sys, kerv_cli; print(sorted({'torch', 'numpy', 'pandas', 'mujoco', 'typer'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+    stub = ast.parse((ROOT / "kerv_cli/__init__.pyi").read_text(encoding="utf-8"))
+    assert [node.names[0].asname for node in stub.body if isinstance(node, ast.ImportFrom)] == kerv.__all__
+    assert all(getattr(kerv, name).__doc__ for name in kerv.__all__)
+    with pytest.raises(AttributeError, match="'kerv_cli' has no attribute 'rolout'"):
+        _ = kerv.rolout  # type: ignore[attr-defined]
+
+
+def test_settings_are_written_as_they_are_typed() -> None:
+    words = as_words("a=1", task=["reach", "push"], threshold={"r": 5}, world={"camera": {"size": 48}}, on=True, x=None)
+    assert words == ["a=1", "task=[reach,push]", "threshold.r=5", "world.camera.size=48", "on=true", "x=null"]
+
+
+def test_a_rollout_gives_its_episodes_and_is_the_commands_own(run: kerv.Study, mine: dict[str, Any]) -> None:
+    (episode,) = run.episodes()
+    assert (episode["task"], episode["seed"], episode["label"]) == ("reach-v3", 100003, "ar")
+    assert episode["steps"] == 6
+    assert len(run.to_pandas()) == len(run.to_pandas("tasks")) == 1
+    assert run.folder.parent == mine["results"] / "rollouts"
+    (command,) = json.loads((run.folder / "run.json").read_text(encoding="utf-8"))["commands"]
+    assert command["arguments"][:3] == ["rollout", "seed=100003", "method=ar"]
+
+
+def test_a_grid_has_a_setting_per_value(mine: dict[str, Any]) -> None:
+    both = kerv.rollout(grid=True, method="ar,hold", **mine)
+    assert list(both.to_pandas()["label"]) == ["ar", "hold"]
+
+
+def test_a_study_is_run_once_reported_and_loaded(
+    study: kerv.Study, mine: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = study.to_pandas()
+    assert list(table["label"]) == ["ar", "held"]
+    assert table["episodes"].tolist() == [1, 1]
+    again = kerv.sweep(mine["results"].parent / "both.yaml", **mine)
+    assert "2 cells are complete already" in capsys.readouterr().err
+    assert again.to_pandas().equals(table)
+    loaded = kerv.load_study("both", results=mine["results"])
+    assert loaded.folder == study.folder
+    files = {path.name for path in loaded.report()}
+    assert {"both.csv", "both_per_task.csv", "report.html"} <= files
+
+
+def test_runs_are_listed_and_narrowed(run: kerv.Study, study: kerv.Study, mine: dict[str, Any]) -> None:
+    there = kerv.runs(mine["results"])
+    assert {run.name, study.name} <= set(there["id"])
+    assert list(kerv.runs(mine["results"], kind="sweep")["id"]) == ["both"]
+    assert kerv.runs(mine["results"] / "none").empty
+
+
+def test_a_policy_answers_observations(mine: dict[str, Any]) -> None:
+    policy = kerv.load_policy(str(mine["policy"]["target"]), method="ar", results=mine["results"])
+    seen = {"observation/state": np.linspace(-0.1, 0.2, 39), "prompt": "reach the goal"}
+    actions = policy.act(seen)
+    assert actions.shape == (policy.info["chunk"], len(policy.info["actions"]))
+    assert policy.last["decode"]["forwards"] == actions.size
+    policy.act(seen, executed=1)
+    policy.reset()
+    assert np.array_equal(policy.act(seen), actions)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda mine: kerv.rollout(**{**mine, "task": "raech"}), "unknown task or suite 'raech': did you mean reach"),
+        (lambda mine: kerv.rollout(**mine, threshold={"q": 5}), "unknown key 'threshold.q'"),
+        (lambda mine: kerv.sweep("dmeo", **mine), "unknown study 'dmeo': did you mean demo"),
+        (lambda mine: kerv.load_study("other", results=mine["results"]), "other"),
+        (lambda mine: kerv.runs(mine["results"], colour="red"), "unknown filter 'colour'"),
+        (lambda mine: kerv.load_policy("absent", results=mine["results"]), "no target 'absent'"),
+    ],
+)
+def test_a_wrong_request_is_an_exception_of_one_line(call: Any, says: str, mine: dict[str, Any]) -> None:
+    with pytest.raises(kerv.KervError) as error:
+        call(mine)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_what_a_study_or_a_policy_cannot_do_is_said(run: kerv.Study, mine: dict[str, Any]) -> None:
+    with pytest.raises(kerv.KervError, match="unknown table 'cells'"):
+        run.to_pandas("cells")
+    with pytest.raises(kerv.KervError, match="is a rollout"):
+        run.report()
+    policy = kerv.load_policy(str(mine["policy"]["target"]), method="ar", results=mine["results"])
+    with pytest.raises(kerv.KervError, match="no observation/state"):
+        policy.act({"prompt": "reach the goal"})
+
+
+def test_cells_that_fail_are_an_exception(mine: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: Any) -> None:
+        raise RuntimeError("the world broke")
+
+    monkeypatch.setattr("kerv_cli.lab.run.Runner.episode", failing)
+    with pytest.raises(kerv.KervError, match=r"2 of 2 cells failed, .* on reach-v3: .*the world broke"):
+        kerv.sweep(mine["results"].parent / "both.yaml", "seed=100050", **mine)
+
+
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = json.loads((ROOT / "docs/notebook.ipynb").read_text(encoding="utf-8"))["cells"]
+    sources = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert sum(len(source.splitlines()) for source in sources) <= 25
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for source in sources:
+        exec(source, names)
+    assert names["study"].to_pandas()["success"].tolist() == [1, 1, 1]
+    assert names["actions"].shape[1] == 4
