@@ -25,9 +25,9 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.loss import auc, chunk_loss, target_tokens
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import run_episode
+from kerv_cli.methods.certified.betting import more_to_decide, p_value, wealth
 from kerv_cli.methods.risk import RiskSkipSettings
 from kerv_cli.methods.risk.alarm import Audit, Evidence, alarm_level, largest_evidence
-from kerv_cli.methods.certified.betting import more_to_decide, p_value, wealth
 from kerv_cli.methods.risk.gate import RiskSkip
 from kerv_cli.methods.risk.recording import RiskArtifact, RiskRecording, certify, episodes_needed
 from kerv_cli.methods.risk.scores import Draft

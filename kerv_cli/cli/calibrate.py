@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.base.errors import Interrupted
-from kerv_cli.base.settings import CalibrateRiskSettings, CalibrateSettings
+from kerv_cli.base.settings import CalibrateRiskSettings, CalibrateSettings, CalibrateSuccessSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, console, print_plan, print_table, progress_bar
+from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_plan, print_table, progress_bar
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -148,3 +148,49 @@ def risk(settings: CalibrateRiskSettings, plan: ShowPlan = False) -> None:
     columns = ("source", "score", "level", "trusted", "risk", "p", "holds in", "AUC", "episodes")
     print_table(columns, coverage_table(recording, settings.epsilon, settings.delta), title)
     typer.echo(f"{run.folder}\n{run.folder / PLOT}")
+
+
+OWN = ("name", "margin", "delta")
+"""Settings of `kerv calibrate success`; all others are the study's."""
+
+
+@command(
+    "calibrate success",
+    CalibrateSuccessSettings,
+    keys="study margin delta name task episodes policy.target prefill_draft runtime.workers results",
+    examples=("kerv calibrate success", "kerv calibrate success margin=3 episodes=50 --plan"),
+    each="rollout",
+)
+def success(words: list[str], plan: ShowPlan = False, as_json: AsJson = False) -> None:
+    """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
+    What is there is reused; more episodes are added to it."""
+    from kerv_cli.base.config import compose
+    from kerv_cli.cli.sweep import covered_cells, print_sweep_plan, run_covered
+    from kerv_cli.lab.resolve import resolve
+    from kerv_cli.report.certificate import certify, place_of, verdicts, write
+
+    own = [word for word in words if word.split("=")[0] in OWN]
+    theirs = [word for word in words if word not in own]
+    if not any(word.startswith("study=") for word in theirs):
+        theirs = ["study=certify", *theirs]
+    folder = [word for word in theirs if word.startswith("results=")]
+    settings = compose("calibrate_success", [*own, *folder], CalibrateSuccessSettings)
+    resolved = resolve(theirs)
+    place = place_of(resolved, settings.name)
+    store, covered = covered_cells(resolved, theirs)
+    if plan:
+        print_sweep_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
+        return
+    outcome = run_covered(resolved, covered, store, theirs)
+    if outcome.failed:
+        raise typer.Exit(1)
+    certificate = certify(resolved, store, covered.cells, settings.margin, settings.delta)
+    path = write(place, certificate)
+    rows = verdicts(certificate)
+    if as_json:
+        print_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
+        return
+    columns = ("setting", "success", "AR", "lost / won", "p", "pairs needed")
+    title = f"not more than {settings.margin:g} points below AR? tested in this order, each at {settings.delta:g}"
+    print_table(columns, [[row[column] for column in columns] for row in rows], title)
+    typer.echo(f"{certificate.sentence()}\n{path}")

@@ -61,7 +61,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         return
     store, covered = covered_cells(resolved, words)
     if plan:
-        _print_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
+        print_sweep_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
         return
     outcome = run_covered(resolved, covered, store, words)
     _tell(outcome, resolved, covered.cells, store, words, as_json)
@@ -117,7 +117,8 @@ def _warn(lines: Iterable[str]) -> None:
         typer.echo(f"kerv: warning: {line}", err=True)
 
 
-def _print_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
+def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
+    """Prints which cells would be run, why, and how long that takes."""
     from kerv_cli.lab.plan import seeds_text
     from kerv_cli.lab.reuse import estimate
 

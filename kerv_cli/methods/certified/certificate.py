@@ -36,6 +36,7 @@ class Candidate:
     lost: int
     won: int
     p: float | None
+    needed: int = 0  # pairs more that would show it at these rates; 0: none, −1: never
 
 
 @dataclass(frozen=True)

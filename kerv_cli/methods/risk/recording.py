@@ -23,9 +23,9 @@ from kerv_cli.base.files import sha256_of, write_folder, write_json
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import steps_of
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
+from kerv_cli.methods.certified.betting import p_value
 from kerv_cli.methods.risk import RiskSkipSettings, hash_of_recording
 from kerv_cli.methods.risk.alarm import alarm_level
-from kerv_cli.methods.certified.betting import p_value
 
 GRID = 40  # candidate levels: quantiles of the scores
 DECODES, FEATURES = "decodes.parquet", "features.npy"

@@ -1,0 +1,168 @@
+"""Issues the certificate of success from a study's paired episodes (docs/methods.md §4.7, ours)."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import write_json
+from kerv_cli.base.provenance import provenance
+from kerv_cli.base.registry import METHOD_KINDS
+from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.lab.identity import ENGINE
+from kerv_cli.lab.plan import Cell, seeds_text
+from kerv_cli.lab.policy import artifacts_of
+from kerv_cli.lab.resolve import ResolvedStudy
+from kerv_cli.lab.store import StudyStore
+from kerv_cli.methods.certified.betting import more_to_decide, p_value
+from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
+from kerv_cli.methods.compose import Method
+from kerv_cli.report.tables import load_study, rows_of
+from kerv_cli.worlds import resolve_tasks, spec_of
+
+POINTS = 100.0
+Outcomes = Mapping[tuple[str, int], bool]  # (task, seed) -> success
+
+
+def place_of(resolved: ResolvedStudy, name: str | None) -> Path:
+    """The certificate's folder.
+
+    Raises:
+        UsageError: settings that differ in more than how they trust, or seeds that are not for selection.
+    """
+    baseline, *candidates = _settings(resolved)
+    if not candidates:
+        raise UsageError(f"study '{resolved.study.name}' has nothing but its baseline to certify")
+    first, tasks = candidates[0], resolve_tasks(baseline.task)
+    for label, other in list(resolved.settings.items()):
+        differing = [kind for kind in METHOD_KINDS if kind != "skip" and getattr(other, kind) != getattr(first, kind)]
+        if label != resolved.study.baseline and differing:
+            raise UsageError(
+                f"setting '{label}' differs in {differing[0]}: a certificate is of settings that differ in skip="
+            )
+    seeds = range(first.seed, first.seed + first.episodes)
+    spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
+    artifacts = artifacts_of(first)
+    return CertificateArtifact().place(first.results, name or first.policy.certificate, artifacts.folder)
+
+
+def certify(
+    resolved: ResolvedStudy, store: StudyStore, cells: Sequence[Cell], margin: float, delta: float
+) -> Certificate:
+    """Tests the study's settings in their order, each at delta, up to the first that is not shown to lose at most
+    `margin` points (fixed-sequence testing: the probability that any certified one loses more is delta at most)."""
+    baseline, first = _settings(resolved)[:2]
+    outcomes = _outcomes(store, cells)
+    ar = outcomes[resolved.study.baseline]
+    candidates: list[Candidate] = []
+    chosen, testing = None, True
+    for label, settings in resolved.settings.items():
+        if label == resolved.study.baseline:
+            continue
+        pairs = sorted(ar.keys() & outcomes[label].keys())
+        both = np.array([(ar[pair], outcomes[label][pair]) for pair in pairs], dtype=float)
+        p = p_value(_values(both), _bound(margin), delta) if testing else None
+        candidates.append(
+            Candidate(
+                label=label,
+                skip=dataclasses.asdict(settings.skip),
+                pairs=len(pairs),
+                ar=int(both[:, 0].sum()),
+                successes=int(both[:, 1].sum()),
+                lost=int((both[:, 0] > both[:, 1]).sum()),
+                won=int((both[:, 0] < both[:, 1]).sum()),
+                p=p,
+                needed=_needed(both, margin, delta) if p is not None and p > delta else 0,
+            )
+        )
+        testing = p is not None and p <= delta
+        chosen = len(candidates) - 1 if testing else chosen
+    artifacts = artifacts_of(first)
+    hashes = artifacts.check(Method.of(first).needs)
+    tasks = resolve_tasks(baseline.task)
+    return Certificate(
+        target=hashes.pop("target"),
+        actions=artifacts.description.actions,
+        chunk=first.chunk or artifacts.description.chunk,
+        environment=spec_of(tasks[0]).name,
+        tasks=list(tasks),
+        drafts=hashes,
+        method={kind: dataclasses.asdict(getattr(first, kind)) for kind in METHOD_KINDS if kind not in _VARIED},
+        world={"camera": dataclasses.asdict(first.world.camera), "horizon": first.world.horizon},
+        dtype=first.runtime.dtype,
+        margin=margin,
+        delta=delta,
+        seeds=seeds_text(seed for cell in cells for seed in cell.seeds),
+        candidates=candidates,
+        chosen=chosen,
+        provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
+    )
+
+
+_VARIED = ("prefill_draft", "skip")  # what drafts is named by its artifacts' hashes
+
+
+def write(place: Path, certificate: Certificate) -> Path:
+    """Writes the certificate -> its file."""
+    path = CertificateArtifact().json(place)
+    write_json(path, {**dataclasses.asdict(certificate), "actions": certificate.actions.as_dict()})
+    return path
+
+
+def verdicts(certificate: Certificate) -> list[dict[str, str]]:
+    """A row per candidate, as text."""
+    return [
+        {
+            "setting": one.label,
+            "success": f"{one.successes}/{one.pairs}",
+            "AR": f"{one.ar}/{one.pairs}",
+            "lost / won": f"{one.lost} / {one.won}",
+            "p": "not tested"
+            if one.p is None
+            else f"{one.p:.3g}" + (" certified" if one.p <= certificate.delta else ""),
+            "pairs needed": ""
+            if not one.needed
+            else f"about {one.needed} more"
+            if one.needed > 0
+            else "not at these rates",
+        }
+        for one in certificate.candidates
+    ]
+
+
+def _bound(margin: float) -> float:
+    return (1 + margin / POINTS) / 2
+
+
+def _values(both: np.ndarray) -> np.ndarray:
+    """(n, 2) success of AR and of the rule -> v (n,) = (1 + AR − rule) / 2, in an order that knows no task."""
+    values = (1 + both[:, 0] - both[:, 1]) / 2
+    seed = int.from_bytes(hashlib.sha256(str(len(values)).encode()).digest()[:4], "big")
+    return np.random.default_rng(seed).permutation(values)
+
+
+def _needed(both: np.ndarray, margin: float, delta: float) -> int:
+    """Pairs that are missing at these rates; −1: never."""
+    more = more_to_decide(_values(both), _bound(margin), delta)
+    return int(more) if math.isfinite(more) else -1
+
+
+def _settings(resolved: ResolvedStudy) -> list[RolloutSettings]:
+    """The baseline's settings, then the candidates' in their order."""
+    others = [settings for label, settings in resolved.settings.items() if label != resolved.study.baseline]
+    return [resolved.settings[resolved.study.baseline], *others]
+
+
+def _outcomes(store: StudyStore, cells: Iterable[Cell]) -> dict[str, dict[tuple[str, int], bool]]:
+    """Setting -> successes of its episodes."""
+    episodes = load_study(store, list(cells)).episodes
+    return {
+        str(label): {(row["task"], row["seed"]): bool(row["success"]) for row in rows_of(rows)}
+        for label, rows in episodes.groupby("label", sort=False)
+    }
