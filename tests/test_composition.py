@@ -14,6 +14,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
 from kerv_cli.lab.policy import check as check_rollout
+from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
 from kerv_cli.methods.heisd import (
@@ -98,6 +99,17 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "prefill_draft": NoSettings("early"),
         "acceptance": RELAXED,
         "skip": NoSettings("always"),
+    },
+    "scout_unverified": {
+        "prefill_draft": NoSettings("scout"),
+        "acceptance": RELAXED,
+        "skip": NoSettings("always"),
+    },
+    "one_pass_certified": {
+        "prefill_draft": ScopedSettings(),
+        "proposer": DrafterProposerSettings(),
+        "acceptance": RELAXED,
+        "skip": CertifiedSkipSettings(),
     },
     "retrieval_unverified": {
         "prefill_draft": RetrievalProposerSettings(),
@@ -303,6 +315,9 @@ def test_an_expert_needs_nothing_else() -> None:
         ("method=one_pass_skip skip.s_min=0.99", ("early", "datastore")),
         ("method=one_pass_strict", ("early",)),
         ("method=early_unverified", ("early",)),
+        ("method=scout_unverified", ("scout",)),
+        ("method=one_pass_certified", ("certificate", "scout", "early", "drafter")),
+        ("method=one_pass_certified prefill_draft.outside=hold", ("certificate", "scout", "drafter")),
         ("method=retrieval_unverified", ("datastore",)),
         ("method=spec_vla_paper", ("drafter",)),
         ("method=sp_vla", ()),

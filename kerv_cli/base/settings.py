@@ -569,6 +569,8 @@ class CalibrateRiskSettings(TaskSettings):
 class CalibrateSuccessSettings(SweepSettings):
     """`kerv calibrate success` (docs/methods.md §4.7): all words but these go to the study's settings."""
 
+    groups: ClassVar = {"study": "certify"}
+
     name: str | None = setting(None, "of the certificate; default: certificate/ beside the target")
     margin: float = number(5.0, above=0, most=99.9, help="points of success that may be lost against AR")
     delta: float = number(0.1, above=0, most=0.5, help="the certificate holds with probability 1 - delta")

@@ -157,7 +157,7 @@ OWN = ("name", "margin", "delta")
 @command(
     "calibrate success",
     CalibrateSuccessSettings,
-    keys="study margin delta name task episodes policy.target prefill_draft runtime.workers results",
+    keys="study margin delta name task episodes policy.target runtime.workers results",
     examples=("kerv calibrate success", "kerv calibrate success margin=3 episodes=50 --plan"),
     each="rollout",
 )

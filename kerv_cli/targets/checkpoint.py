@@ -149,7 +149,7 @@ def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The inverse of `compact`: matrices with a scale as float32, the rest as it is."""
     full = {}
     for name, tensor in tensors.items():
-        if not name.endswith(SCALE):
+        if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module's own may be called so
             scale = tensors.get(name + SCALE)
             full[name] = tensor if scale is None else (tensor.float().flatten(1) * scale.float()).view(tensor.shape)
     return full

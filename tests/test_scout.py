@@ -1,0 +1,240 @@
+"""The scout and the certificate of success: drafts without the target's encoder, and what a certificate covers."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.base.spaces import Observation
+from kerv_cli.cli.app import app
+from kerv_cli.engine.batched import BatchDecoder
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.methods.artifacts import Request
+from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
+from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.early.drafter import EarlyDrafter
+from kerv_cli.methods.scout import ScoutSettings
+from kerv_cli.methods.scout.network import Scout
+from kerv_cli.methods.scout.proposer import ScoutArtifact, ScoutProposer, check_sees
+from kerv_cli.methods.streak import StreakSkipSettings
+from kerv_cli.methods.streak.skip import StreakSkip
+from kerv_cli.methods.unverified import AlwaysSkip
+from kerv_cli.report.certificate import _needed, _values
+from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.worlds.demos.recording import DemoConfig, record
+
+SMALL = ScoutSettings(width=24, rank=4, keypoints=4, cell_width=8, cell_features=2, word_width=4)
+TASK = "drawer-close-v3"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
+    """The nano policies' results folder with a few real demonstrations."""
+    import shutil
+
+    folder = tmp_path_factory.mktemp("scout")
+    shutil.copytree(policies, folder, dirs_exist_ok=True)
+    record(DemoConfig((TASK,), 4, camera=CameraConfig(), frame_stride=8, workers=1), folder / "artifacts/demos/few")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def target(policies: Path) -> CompactTarget:
+    return load_target(policies / "artifacts/target/nano-vision")[0]
+
+
+@pytest.fixture
+def scout(target: CompactTarget) -> Scout:
+    torch.manual_seed(0)
+    scout = Scout.beside(SMALL, target).eval().requires_grad_(False)
+    for parameter in scout.parameters():
+        parameter.data += 0.05 * torch.randn_like(parameter)
+    return scout
+
+
+def observed(target: CompactTarget, seed: int) -> Observation:
+    random = np.random.default_rng(seed)
+    size = target.settings.image_size
+    images = {name: random.integers(0, 256, (size, size, 3), dtype=np.uint8) for name in target.cameras}
+    state = random.normal(size=target.observation.state)
+    return Observation(state[: len(target.observation.proprioception)], state, "close the drawer", images)
+
+
+def decoder(target: CompactTarget, proposer: ScoutProposer, **parts: Any) -> Decoder:
+    made = Decoder(target, Parts(prefill_draft=proposer, **parts))
+    made.reset(TASK, 1, np.zeros(3))
+    return made
+
+
+def test_an_unverified_decode_never_runs_the_targets_encoder(
+    target: CompactTarget, scout: Scout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    proposer = ScoutProposer(scout, target)
+    unverified = decoder(target, proposer, skip=AlwaysSkip(proposer))
+    seen = [observed(target, i) for i in range(3)]
+    monkeypatch.setattr(type(target), "encode_batch", lambda self, inputs: pytest.fail("encoded"))
+    records = [unverified.decode(one) for one in seen]
+    assert all(record.forwards == 0 and record.phases["vision"] == 0 for record in records)
+    assert len({record.actions.tobytes() for record in records}) == 3  # it looks
+    batch = BatchDecoder(unverified)
+    lanes = [batch.lane() for _ in seen]
+    for lane in lanes:
+        lane.reset(TASK, 1, np.zeros(3))
+    for one, together in zip(records, batch.decode(lanes, seen), strict=True):
+        assert (one.actions == together.actions).all()
+
+
+def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, scout: Scout) -> None:
+    plain, drafted = Decoder(target), decoder(target, ScoutProposer(scout, target))
+    plain.reset(TASK, 1, np.zeros(3))
+    for seed in range(4):
+        one = observed(target, seed)
+        record = drafted.decode(one)
+        assert (record.actions == plain.decode(one).actions).all()
+        assert record.phases["vision"] > 0  # encoded once, when the prefill asked
+
+
+def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: Scout) -> None:
+    inputs = target.inputs(observed(target, 0))
+    past = torch.zeros(1, 0, 4), torch.zeros(1, 0)
+    with torch.inference_mode():
+        plain, places = scout(inputs, *past)
+        pack(scout)
+        assert isinstance(scout.drafter, EarlyDrafter)
+        assert scout.drafter.packed is not None
+        packed, again = scout(inputs, *past)
+    assert torch.allclose(packed, plain, rtol=1e-3, atol=1e-3)
+    assert torch.allclose(again, places, atol=1e-4)
+
+
+def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path) -> None:
+    words = ["train", "drafter", "drafter=scout", "demos=few", "policy.target=nano-vision", "policy.scout=mine"]
+    words += ["drafter.width=24", "drafter.rank=4", "train.batch=8", "train.steps=4", "train.scene_steps=2"]
+    done = CliRunner().invoke(app, [*words, "train.held_out=0.34", "train.validate_every=4", f"results={results}"])
+    assert done.exit_code == 0, done.output
+    assert "object_error_cm" in done.stdout
+    target, description = load_target(results / "artifacts/target/nano-vision")
+    files, folder = ScoutArtifact(), results / "artifacts/scout/mine"
+    assert files.load(folder, Request(description, target)).settings.width == 24
+    state, other = load_target(results / "artifacts/target/nano-state")
+    with pytest.raises(CheckpointError, match="was trained for target"):
+        files.checked(folder, other)
+    with pytest.raises(CheckpointError, match="looks through the camera"):
+        check_sees(state)
+    rollout = ["rollout", "method=scout_unverified", f"task={TASK}", "episodes=1", "record=0", "world.horizon=12"]
+    rollout += ["policy.target=nano-vision", f"results={results}"]
+    assert CliRunner().invoke(app, [*rollout, "policy.scout=mine"]).exit_code == 0
+    missing = CliRunner().invoke(app, rollout)
+    assert missing.exit_code == 1
+    assert "no scout in" in missing.stderr
+    assert "kerv train drafter drafter=scout" in missing.stderr
+
+
+# --- the certificate
+
+
+def certificate(target: CompactTarget, chosen: int | None, **changes: Any) -> Certificate:
+    rules = [StreakSkipSettings(most=8, opening=1), NoSettings("always")]
+    candidates = [
+        Candidate(f"rule {i}", dataclasses.asdict(rule), 100, 95, 95, 1, 1, 0.01) for i, rule in enumerate(rules)
+    ]
+    plain = RolloutSettings().parts()
+    method = {kind: dataclasses.asdict(part) for kind, part in plain.items() if kind not in ("prefill_draft", "skip")}
+    fields: dict[str, Any] = {
+        "target": target.sha256,
+        "actions": target.actions,
+        "chunk": target.chunk,
+        "environment": "metaworld",
+        "tasks": [TASK],
+        "drafts": {"scout": "a"},
+        "method": method,
+        "world": {"camera": {"size": 96}, "horizon": 500},
+        "dtype": "float32",
+        "margin": 5.0,
+        "delta": 0.1,
+        "seeds": "50500-50519",
+        "candidates": candidates,
+        "chosen": chosen,
+    }
+    return Certificate(**{**fields, **changes})
+
+
+def context(target: CompactTarget, artifacts: dict[str, Any], task: str, **method: Any) -> Context:
+    settings = RolloutSettings(**method).parts()
+    return Context(target, artifacts.__getitem__, task, {}, settings, 0)
+
+
+def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTarget, scout: Scout) -> None:
+    artifacts: dict[str, Any] = {"certificate": certificate(target, 1), "scout": scout}
+    drafts = ScopedSettings(outside="hold")
+    for task, source, rule in ((TASK, "scout", AlwaysSkip), ("reach-v3", "hold", StreakSkip)):
+        where = context(target, artifacts, task)
+        where.built["prefill_draft"] = scoped(drafts, where)
+        assert where.built["prefill_draft"].name == source
+        assert isinstance(certified(CertifiedSkipSettings(most=4), where), rule)
+    assert "rule 1: not more than 5 points below AR on these 1 instructions" in artifacts["certificate"].sentence()
+    nothing = {**artifacts, "certificate": certificate(target, None)}
+    assert certified(CertifiedSkipSettings(), context(target, nothing, TASK)) is None  # verified always
+    first = {**artifacts, "certificate": certificate(target, 0)}
+    where = context(target, first, TASK)
+    where.built["prefill_draft"] = scoped(drafts, where)
+    skip = certified(CertifiedSkipSettings(), where)
+    assert isinstance(skip, StreakSkip)
+    assert (skip.settings.most, skip.settings.opening) == (8, 1)
+
+
+def test_a_certificate_of_another_method_chunk_format_or_world_is_refused(target: CompactTarget) -> None:
+    def deploy(issued: Certificate, **method: Any) -> None:
+        certified(CertifiedSkipSettings(), context(target, {"certificate": issued}, TASK, **method))
+
+    issued = certificate(target, 0)
+    with pytest.raises(UsageError, match=r"acceptance.kind=relaxed: the certificate is of strict"):
+        deploy(issued, acceptance=NoSettings("relaxed"))
+    with pytest.raises(UsageError, match=r"runtime.dtype=float32: the certificate is of bfloat16"):
+        deploy(certificate(target, 0, dtype="bfloat16"))
+    with pytest.raises(UsageError, match=r"chunk=4: the certificate is of 8"):
+        deploy(certificate(target, 0, chunk=8))
+    issued.check_world({"camera": {"size": 96}, "horizon": 500, "stress": {"kind": "push"}})
+    with pytest.raises(UsageError, match=r"world.horizon=120: the certificate is of 500"):
+        issued.check_world({"camera": {"size": 96}, "horizon": 120})
+
+
+def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Path) -> None:
+    study = results / "tiny.yaml"
+    study.write_text(
+        "common: method=early_unverified prefill_draft=hold proposer=none threshold.r=9 "
+        f"task={TASK} seed=50500 episodes=2 record=0 world.horizon=8 policy.target=nano-vision\n"
+        "block: 2\nsettings:\n  ar: method=ar prefill_draft=none\n  half: skip=streak skip.most=1\n  all: skip=always\n"
+    )
+    words = ["calibrate", "success", f"study={study}", f"results={results}", "margin=99", "delta=0.5"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    path = results / "artifacts/target/nano-vision"  # beside the target
+    assert "0/2" in done.stdout
+    written = next(results.rglob("certificate.json"))
+    assert written.is_file(), path
+    few = CliRunner().invoke(app, [*words[:-2], "margin=1", "name=few", "--json"])
+    assert few.exit_code == 0, few.output
+    assert "nothing is certified" in few.stdout
+    wrong = CliRunner().invoke(app, [*words, "seed=100000"])
+    assert wrong.exit_code == 2, wrong.output
+
+
+def test_pairs_that_are_missing_are_counted() -> None:
+    same = np.array([(1.0, 1.0)] * 30)
+    assert 0 < _needed(same, 5.0, 0.1) < 200
+    assert _needed(np.array([(1.0, 1.0), (1.0, 0.0)] * 20), 5.0, 0.1) == -1
+    assert sorted(_values(np.array([(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)]))) == [0.0, 0.5, 1.0]
