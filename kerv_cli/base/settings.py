@@ -244,7 +244,7 @@ class ServeSettings(MethodSettings):
 class StudySettings:
     """`conf/study/*.yaml`: which settings are compared."""
 
-    name: str = setting("threshold", "of its folder in <results>/studies")
+    name: str = setting("", "of its folder in <results>/studies; empty: that of its file")
     title: str = setting("", "of its tables and plots")
     baseline: str = setting("ar", "label of the setting that the others are compared with")
     common: str = setting("", "overrides of every setting, e.g. task=MT10 episodes=20; the command line's outrank them")

@@ -50,6 +50,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         names = {_key(o).removeprefix("study.") for o in mine if o.startswith("study.")}
         changes = {name: getattr(sweep.study, name) for name in names & set(StudySettings.__dataclass_fields__)}
         sweep.study = dataclasses.replace(by_path, **changes)
+    sweep.study.name = sweep.study.name or next(o.split("=", 1)[1] for o in mine if o.startswith("study="))
     keys = {_key(o) for o in theirs}
     common = [o for o in split_words(sweep.study.common) if _key(o) not in keys] + theirs
     points = _points(sweep.study)
