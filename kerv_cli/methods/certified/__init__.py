@@ -1,0 +1,1 @@
+"""Certificates of success: what they are tested by."""
