@@ -150,6 +150,8 @@ def test_the_gate_is_not_run_again(gated: tuple[Path, str]) -> None:
         ("rollout", "method=one_pass_risk", "task=reach"),
         ("rollout", "method=one_pass", "skip=risk", "task=reach"),
         ("runs", "rerun", "gate"),
+        ("calibrate", "risk", "policy.target=few"),
+        ("train", "score", "policy.target=few"),
     )
     for words in gone:
         refused = kerv(*words, results)

@@ -23,12 +23,14 @@ _GATE = (
     "was nowhere shown to be slower per episode, and a certificate of success replaces its level (docs/methods.md §4.6)"
 )
 GONE = {
+    ("calibrate", "risk"): _GATE,
     ("method", "one_pass_risk"): _GATE,
     ("skip", "risk"): _GATE,
     ("study", "risk_h8"): _GATE,
     ("study", "scores"): _GATE,
+    ("train command", "score"): _GATE,
 }
-"""Kind and name of what an older kerv had -> what replaces it."""
+"""Kind and name of what an older kerv had -> what replaces it; of a command its name and the next word."""
 
 
 class UnknownName(UsageError):
