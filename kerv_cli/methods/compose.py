@@ -153,7 +153,7 @@ class Method:
             UsageError: as `check`. CheckpointError: an artifact is missing or belongs to another target.
         """
         self.check(target)
-        context = Context(target, artifact, task)
+        context = Context(target, artifact, task, method=self.settings, chunk=self.chunk)
         for kind, part in self.parts.items():
             context.built[kind] = part.built(self.settings[kind], context)
         return Decoder(target, Parts(**context.built), self.chunk)

@@ -3,7 +3,7 @@ part, or None for the absence of one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,12 +13,14 @@ from kerv_cli.base.errors import UsageError
 @dataclass(frozen=True)
 class Context:
     """The surroundings of a part. artifact: kind -> the loaded artifact. task: full name, or empty. built: the method's
-    parts so far, by kind."""
+    parts so far, by kind. method: the settings of all its parts, by kind. chunk: H, 0: the target's."""
 
     target: Any  # a Target; some parts want a ReadableTarget
     artifact: Callable[[str], Any]
     task: str = ""
     built: dict[str, Any] = field(default_factory=dict)
+    method: Mapping[str, Any] = field(default_factory=dict)
+    chunk: int = 0
 
     @property
     def calibration(self) -> Any:
