@@ -29,8 +29,6 @@ from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
 from kerv_cli.methods.retrieval import QdrantSearchSettings
 from kerv_cli.methods.retrieval.datastore import Datastore
-from kerv_cli.methods.risk.recording import RiskManifest, save_risk
-from kerv_cli.methods.risk.scores import LearnedScore, ScoreArtifact
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
@@ -187,82 +185,48 @@ def test_a_provenance_that_says_nothing_of_tasks_is_no_warning(results: Path, se
 
 OTHER = "f" * 64
 
-
-def renamed_source(results: Path, kind: str, source: str) -> None:
-    """The artifact `kind` as if it had been made from another `source`, nothing else changed."""
-    path = results / "artifacts" / kind / "nano-state" / FILES[kind]
-    described = json.loads(path.read_text())
-    if source == "target" and isinstance(described["target"], dict):
-        described["target"]["sha256"] = OTHER
-    elif source == "target":
-        described["target"] = OTHER
-    else:
-        described["made_from"] = {source: OTHER}
-    path.write_text(json.dumps(described))
-
-
 FILES = {
     "drafter": "drafter.json",
     "early": "early.json",
     "datastore": "manifest.json",
     "calibration": "calibration.json",
-    "risk": "risk.json",
-    "score": "score.json",
 }
 
 
 @pytest.fixture(scope="module")
 def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As `whole`, with an early drafter, a recorded risk and a learned score of it."""
+    """As `whole`, with an early drafter."""
     results = Path(shutil.copytree(whole, tmp_path_factory.mktemp("complete") / "results"))
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
     drafter = EarlyDrafter.beside(EarlySettings(width=16, layers=1), target)
     made_for, own = MadeFor.of(described), {"settings": asdict(drafter.settings)}
-    early = EarlyArtifact().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
-    store = Artifacts(str(results), PolicySettings(target="nano-state")).check(["datastore"])["datastore"]
-    model, read = LearnedScore(["odds"], 4), {"early": early, "datastore": store}
-    drafts = {"source": "early", "source_sha256": early, "made_from": read}
-    folder = results / "artifacts/score/nano-state"
-    score = ScoreArtifact().save(folder, model, made_for, {}, inputs=["odds"], features=4, **drafts)
-    rows = [{"source": "early", "task": "reach-v3", "seed": 50_000, "index": 0, "loss": 0.0, "score.odds": 0.0}]
-    manifest = RiskManifest(
-        made_for, {"early": early}, 0.1, {"reach-v3": [50_000]}, ["odds"], {}, made_from={**read, "score": score}
-    )
-    save_risk(results / "artifacts/risk/nano-state", manifest, rows)
+    EarlyArtifact().save(results / "artifacts/early/nano-state", drafter, made_for, {}, **own)
     return results
 
 
-@pytest.mark.parametrize(
-    ("kind", "source"),
-    [
-        *((kind, "target") for kind in FILES),
-        *(("score", source) for source in ("early", "datastore")),
-        *(("risk", source) for source in ("early", "datastore", "score")),
-    ],
-)
-def test_an_artifact_of_another_source_is_refused(complete: Path, tmp_path: Path, kind: str, source: str) -> None:
+MESSAGE = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build)"
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_what_was_made_for_another_target_is_refused(complete: Path, tmp_path: Path, kind: str) -> None:
     results = Path(shutil.copytree(complete, tmp_path / "results"))
     files = Artifacts(str(results), PolicySettings(target="nano-state"))
     assert set(files.check(FILES)) == {"target", *FILES}
-    renamed_source(results, kind, source)
-    message = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build)"
-    with pytest.raises(CheckpointError, match=message) as refused:
+    path = results / "artifacts" / kind / "nano-state" / FILES[kind]
+    described = json.loads(path.read_text())
+    described["target"] = {**described["target"], "sha256": OTHER} if isinstance(described["target"], dict) else OTHER
+    path.write_text(json.dumps(described))
+    with pytest.raises(CheckpointError, match=MESSAGE) as refused:
         files.check(FILES)
     assert "\n" not in str(refused.value)
-    if source != "target":
-        files.check([name for name in FILES if name != source])  # what is not in use does not matter
 
 
-def test_a_score_and_a_risk_of_before_name_the_early_drafter(complete: Path, tmp_path: Path) -> None:
-    results = Path(shutil.copytree(complete, tmp_path / "results"))
-    for kind, key in (("score", "source_sha256"), ("risk", "sources")):
-        path = results / "artifacts" / kind / "nano-state" / FILES[kind]
-        described = json.loads(path.read_text())
-        del described["made_from"]
-        path.write_text(json.dumps(described))
-        files = Artifacts(str(results), PolicySettings(target="nano-state"))
-        files.check([kind, "early", "datastore"])
-        described[key] = {"early": OTHER} if kind == "risk" else OTHER
-        path.write_text(json.dumps(described))
-        with pytest.raises(CheckpointError, match=f"for early drafter {OTHER[:12]}"):
-            files.check([kind, "early"])
+def test_what_was_made_from_another_artifact_is_refused_beside_this_one(
+    complete: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = Artifacts(str(complete), PolicySettings(target="nano-state"))
+    monkeypatch.setattr(EarlyArtifact, "sources", lambda self, description: {"datastore": OTHER})
+    with pytest.raises(CheckpointError, match=MESSAGE) as refused:
+        files.check(FILES)
+    assert "\n" not in str(refused.value)
+    files.check([kind for kind in FILES if kind != "datastore"])  # what is not in use does not matter

@@ -259,7 +259,7 @@ def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
     listed = {row["study"]: row for row in json.loads(kerv("sweep", "--json").stdout)}
     assert set(listed) == set(groups()["study"])
-    assert listed["stress"]["settings"] == 174
+    assert listed["stress"]["settings"] == 145
 
 
 def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path: Path) -> None:

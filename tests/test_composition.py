@@ -29,7 +29,6 @@ from kerv_cli.methods.jacobi import JacobiProposerSettings
 from kerv_cli.methods.kinematics import CompensateSettings, KinematicThresholdSettings, ScheduleThresholdSettings
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.retrieval import RetrievalProposerSettings
-from kerv_cli.methods.risk import RiskSkipSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
 from kerv_cli.methods.streak import StreakSkipSettings
@@ -123,12 +122,6 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "proposer": CHAIN,
         "acceptance": RELAXED,
         "skip": StreakSkipSettings(most=8, tolerance=0.05),
-    },
-    "one_pass_risk": {
-        "prefill_draft": NoSettings("early"),
-        "proposer": CHAIN,
-        "acceptance": RELAXED,
-        "skip": RiskSkipSettings(score="odds", epsilon=0.15, delta=0.1, audit=0.05, opening=1),
     },
     "parallel": {"skip": NoSettings("parallel")},
     "sp_vla": {"skip": SpeedSkipSettings(v_min=0.3, v_max=1000, buffer=6, share=0.5, penalty=1e-4)},

@@ -14,7 +14,6 @@ from kerv_cli.base.config import compose, conf_dir
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.settings import (
     BuildDatastoreSettings,
-    CalibrateRiskSettings,
     RolloutSettings,
     TrainDrafterSettings,
 )
@@ -25,7 +24,6 @@ COVERS = {"three": 3, "five": 5, "seven": 7}
 COMMANDS = {
     "train_drafter": TrainDrafterSettings,
     "build_datastore": BuildDatastoreSettings,
-    "calibrate_risk": CalibrateRiskSettings,
     "rollout": RolloutSettings,
 }
 
@@ -59,7 +57,7 @@ def test_thirty_five_of_fifty_tasks_are_in_one_study_and_the_others_in_the_other
 @pytest.mark.parametrize("cover", [*COVERS, "thirty_five", "half"])
 def test_a_preset_names_tasks_and_artifacts_alike_for_every_command(cover: str, command: str) -> None:
     settings = compose(command, [f"cover={cover}"], COMMANDS[command])
-    kinds = ("drafter", "early", "datastore", "risk", "score")
+    kinds = ("drafter", "early", "datastore")
     assert {settings.policy.named(kind) for kind in kinds} == {cover}
     if cover in COVERS:
         assert covers_tasks(cover, command) == covers_tasks(cover)
@@ -89,8 +87,6 @@ def test_the_documented_commands_make_what_the_study_names(results: Path, cover:
     kerv("train", "drafter", *part, *few, "drafter.samples=50")
     kerv("train", "drafter", "drafter=early", *part, *few, "drafter.samples=50")
     kerv("build", "datastore", *part, "stride=8")
-    small = ("episodes=2", "world.horizon=4", *(("task=[reach]",) if cover == "half" else ()))
-    kerv("calibrate", "risk", f"cover={cover}", policy, *small)
     store = json.loads((results / "artifacts/datastore" / cover / "manifest.json").read_text())
     assert set(store["tasks"]) == set(resolve_tasks(["MT10"]) if cover == "half" else covers_tasks("three"))
     early = json.loads((results / "artifacts/early" / cover / "early.json").read_text())

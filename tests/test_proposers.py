@@ -43,7 +43,7 @@ class KnownDraft:
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
     def drafted(self, features: torch.Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
-        return EarlyDraft(self.tokens, self.odds, torch.zeros(len(self.tokens), 255))
+        return EarlyDraft(self.tokens, self.odds)
 
 
 def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:

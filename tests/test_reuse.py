@@ -246,7 +246,7 @@ def test_columns_that_a_cell_lacks_are_empty_and_further_ones_stay(store: StudyS
     cells = threshold_study(["reach-v3"])
     swept(store, cells)
     folder = store.cells / cells[0].id
-    table = pq.read_table(folder / "episodes.parquet").drop_columns(["audits", "audit_loss"])
+    table = pq.read_table(folder / "episodes.parquet").drop_columns(["jerk", "held_steps"])
     table = table.append_column("of_a_newer_kerv", pa.array(range(table.num_rows)))
     pq.write_table(table, folder / "episodes.parquet")
     status = json.loads((folder / "status.json").read_text())
@@ -255,7 +255,7 @@ def test_columns_that_a_cell_lacks_are_empty_and_further_ones_stay(store: StudyS
     (folder / "status.json").write_text(json.dumps(status))
 
     episodes = load_study(store).episodes
-    assert episodes.loc[episodes["label"] == "ar", "audits"].isna().all()
+    assert episodes.loc[episodes["label"] == "ar", "jerk"].isna().all()
     assert episodes.loc[episodes["label"] == "ar", "of_a_newer_kerv"].tolist() == [0, 1, 2, 3]
     assert episodes.loc[episodes["label"] == "naive_sd", "of_a_newer_kerv"].isna().all()
     assert table_of(store)["successes"].notna().all()

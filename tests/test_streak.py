@@ -11,6 +11,7 @@ from examples.own_target import MockTarget
 from test_unverified import SHOWN, Near
 
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.loss import chunk_loss
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.spec_vla.rules import Relaxed
@@ -115,3 +116,17 @@ def test_another_sources_accepted_chain_does_not_count() -> None:
     record = decoder.decode(SHOWN)
     assert record.forwards == 1  # the right one was accepted whole
     assert modes(decoder, 2) == "vv"
+
+
+@torch.inference_mode()
+def test_the_loss_is_a_share_of_the_scale_and_one_where_a_strict_dof_flips() -> None:
+    target = MockTarget()
+    space, truth = target.actions, np.array(near(target).drafted)
+    strict = space.strict_tokens(len(truth))
+    off = np.where(strict, truth, np.where(truth + 4 < space.tokens, truth + 4, truth - 4))
+    expected = 4 * 2 / space.tokens * (~strict).mean()
+    assert chunk_loss(space, off, truth, 1.0) == pytest.approx(expected)
+    assert chunk_loss(space, off, truth, expected / 2) == 1.0
+    flipped = truth.copy()
+    flipped[np.flatnonzero(strict)[0]] ^= 1
+    assert chunk_loss(space, flipped, truth, 1.0) == 1.0

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from kerv_cli.base import registry
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import GONE, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml
 from kerv_cli.base.files import to_yaml as plain_yaml
 from kerv_cli.base.limits import check_settings, description
@@ -127,7 +127,8 @@ class Composer(Generic[T]):
         for word in overrides:
             key, equals, value = word.partition("=")
             if not equals or not key or key[0] == "~":  # nothing is taken away from settings
-                raise UsageError(f"'{word}' is not an override: write key=value, {self._hint(word)}")
+                hint = GONE.get((self.command, word)) or f"write key=value, {self._hint(word)}"
+                raise UsageError(f"'{word}' is not an override: {hint}")
             if key not in self.groups or value in self.groups[key]:
                 continue
             several = [name.strip() for name in value.split(",")]

@@ -18,15 +18,31 @@ class UsageError(KervError):
     exit_code = 2
 
 
+_GATE = (
+    "the calibrated gate is gone, commit 72e42ef is the last with it: method=one_pass_streak needs no calibration and "
+    "was nowhere shown to be slower per episode; 'kerv calibrate success' certifies success instead (docs/methods.md)"
+)
+GONE = {
+    ("calibrate", "risk"): _GATE,
+    ("method", "one_pass_risk"): _GATE,
+    ("skip", "risk"): _GATE,
+    ("study", "risk_h8"): _GATE,
+    ("study", "scores"): _GATE,
+    ("train command", "score"): _GATE,
+}
+"""Kind and name of what an older kerv had -> what replaces it; of a command its name and the next word."""
+
+
 class UnknownName(UsageError):
-    """A name that no registry knows; the message lists the nearest ones."""
+    """A name that no registry knows; the message lists the nearest ones, or says what replaces it."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
         known = list(known)
         self._arguments = (kind, name, known)
         near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
-        super().__init__(f"unknown {kind} '{name}': {hint}")
+        gone = GONE.get((kind.split(".")[0], name))
+        super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")
 
     def __reduce__(self) -> tuple[type[UnknownName], tuple[str, str, list[str]]]:
         return UnknownName, self._arguments  # pickled by these: worker processes hand it on

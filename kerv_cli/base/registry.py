@@ -35,7 +35,6 @@ OWN = (
     "kerv_cli.methods.kinematics",
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
-    "kerv_cli.methods.risk",
     "kerv_cli.methods.unverified",
     "kerv_cli.methods.sp_vla",
     "kerv_cli.methods.watch",
@@ -63,12 +62,10 @@ PREFILL, STATES = "prefill", "states"
 
 
 TRAITS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(
-        ("acceptance", "threshold", "rectifier", "datastore", "score", "artifact", "drafter", "column"), ()
-    ),
+    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "artifact", "drafter", "column"), ()),
     "proposer": ("when", "chains", "sides"),
     "boundary": ("chooses",),
-    "skip": ("takes_draft", "merges", "retrieves", "parallel", "watches"),
+    "skip": ("takes_draft", "merges", "parallel", "watches"),
     "predictor": ("fitted",),
     "target": ("weights", "importer", "images_alone"),
     "environment": ("names",),
@@ -97,7 +94,7 @@ def nothing(settings: Any) -> tuple[str, ...]:
 class Part:
     """One choice among the parts of a kind.
 
-    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, score, artifact, drafter,
+    kind: proposer, acceptance, threshold, rectifier, boundary, skip, datastore, predictor, artifact, drafter,
     target, environment, stress, executor, column or command. build: `module:function` or `module:Class.method`; its
     arguments are documented where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these

@@ -23,9 +23,6 @@ EVALUATION_SEED = 100_000
 MOST_STRESS = 4
 """The highest level of every kind of stress."""
 
-LOSS_SCALE = 0.1
-"""ε_a: mean abs difference of two chunks that counts as a whole loss, normalised action units."""
-
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
     """Makes the settings of the part `name`: the default of a group."""
@@ -152,6 +149,8 @@ class TaskSettings(RunSettings):
 
 
 MODEL, EXPERT = "model", "expert"
+_GONE_WITH_THE_GATE = ("risk", "score")
+"""Settings of a policy that commit 72e42ef still had (docs/methods.md §4.6); stored settings have them."""
 DERIVED_FROM = ("policy.kind",)
 """Keys of settings that others are derived from when a dataclass is made."""
 
@@ -168,8 +167,6 @@ class PolicySettings:
     certificate: str | None = setting(None, "of success; default: the one beside the target")
     datastore: str | None = setting(None, "default: the one beside the target")
     calibration: str | None = setting(None, "default: the one beside the target")
-    risk: str | None = setting(None, "what unverified drafts lose; default: the one beside the target")
-    score: str | None = setting(None, "the learned score; default: the one beside the target")
     others: dict[str, str] = setting({}, "artifacts of parts that are not kerv's: kind -> name")
 
     def named(self, kind: str) -> str | None:
@@ -392,21 +389,6 @@ class TrainDrafterSettings(RunSettings):
 
 
 @dataclass
-class TrainScoreSettings(RunSettings):
-    """`kerv train score`: the learned score, on what `kerv calibrate risk features=true` recorded."""
-
-    groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
-
-    policy: PolicySettings = setting(PolicySettings, POLICY)
-    inputs: list[str] = setting(["odds", "entropy", "familiarity", "steadiness"], "scores it reads beside the prompt")
-    steps: int = number(300, 1, 10**6, help="optimisation steps")
-    lr: float = number(3e-3, 0, 10, help="learning rate")
-    weight_decay: float = number(1.0, 0, 100, help="AdamW's")
-    held_out: float = number(0.25, above=0, most=0.9, help="share of the episodes that it is measured on")
-    seed: int = number(0, 0, 2**31 - 1, help="of initial weights and of the episodes held out")
-
-
-@dataclass
 class DoctorSettings(RunSettings):
     """`kerv doctor`. With a target or an environment it checks that alone."""
 
@@ -537,35 +519,6 @@ class CalibrateSettings(TaskSettings):
 
 
 @dataclass
-class CalibrateRiskSettings(TaskSettings):
-    """`kerv calibrate risk` (docs/methods.md §4.6): drafts, their scores and losses in closed loop, selection seeds."""
-
-    groups: ClassVar = {"policy": "vision", "world": "default", "cover": "all", "runtime": "cpu"}
-
-    policy: PolicySettings = setting(PolicySettings, POLICY)
-    name: str | None = setting(None, "default: risk/ beside the target")
-    episodes: int = number(20, 1, 100_000, help="episodes per task")
-    seed: int = number(50_100, 0, 2**31 - 1, help="first one, a selection seed")
-    sources: list[str] = setting(["early"], "what drafts; the first one's drafts are executed")
-    scores: list[str] = setting(["odds", "entropy", "familiarity", "steadiness"], "what is recorded of each draft")
-    unverified: float = number(0.8, 0, 1, help="share of the decodes whose draft is executed, else verified first")
-    scale: float = number(LOSS_SCALE, above=0, most=1e6, help="ε_a, normalised action units")
-    epsilon: float = number(0.15, above=0, most=0.99, help="risk of the levels in the printed table")
-    delta: float = number(0.1, above=0, most=0.5, help="the levels are certified at 1 - delta")
-    features: bool = setting(False, "keep the pooled prompts, for `kerv train score`")
-    acceptance: Any = part("acceptance", "relaxed", "of what is verified while recording")
-    threshold: Any = part("threshold", "fixed", "of what is verified while recording")
-    chunk: int = number(0, 0, 1024, help="H, control steps decoded at once; 0: the target's")
-    world: RolloutWorldSettings = setting(RolloutWorldSettings, "camera, length of an episode, stress")
-
-    def check_together(self, prefix: str) -> None:
-        """Raises UsageError without a source or a score."""
-        for name in ("sources", "scores"):
-            if not getattr(self, name):
-                raise UsageError(f"{prefix}{name}=[]: name at least one")
-
-
-@dataclass
 class CalibrateSuccessSettings(SweepSettings):
     """`kerv calibrate success` (docs/methods.md §4.7): all words but these go to the study's settings."""
 
@@ -599,7 +552,10 @@ def read_settings(schema: type[S], plain: Mapping[str, Any], tolerant: bool = Fa
     Raises:
         CheckpointError: not such settings. UnknownName: a part that is not registered here.
     """
-    settings = manifests.read(schema, dict(plain), "a stored setting", tolerant)
+    plain = dict(plain)
+    if isinstance(plain.get("policy"), Mapping):
+        plain["policy"] = {name: value for name, value in plain["policy"].items() if name not in _GONE_WITH_THE_GATE}
+    settings = manifests.read(schema, plain, "a stored setting", tolerant)
     for group in SETTINGS_GROUPS:
         value = getattr(settings, group, None)
         if not isinstance(value, Mapping):

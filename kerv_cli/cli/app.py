@@ -24,7 +24,7 @@ from kerv_cli.cli import bench, doctor, completion  # noqa: F401
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 FAMILIES = {
-    "train": "Train the target, a drafter or a score.",
+    "train": "Train the target or a drafter.",
     "build": "Build artifacts that need no training.",
     "runs": "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made.",
 }

@@ -1,5 +1,4 @@
-"""`kerv calibrate`: predictors, reference levels, boundary ranges and skip levels, from the demonstrations; `kerv
-calibrate risk`: what unverified drafts lose, from closed loop."""
+"""`kerv calibrate`: predictors, reference levels, boundary ranges and skip levels, from the demonstrations."""
 
 from __future__ import annotations
 
@@ -7,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.errors import Interrupted
-from kerv_cli.base.settings import CalibrateRiskSettings, CalibrateSettings, CalibrateSuccessSettings
+from kerv_cli.base.settings import CalibrateSettings, CalibrateSuccessSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_plan, print_table, progress_bar
 
@@ -18,8 +16,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from kerv_cli.methods.calibration import Calibration
-
-PLOT = "coverage.png"
 
 
 @command(
@@ -120,34 +116,6 @@ def _skip(calibration: Calibration) -> None:
     columns = ("task", "s_min", "low", "high", "would be skipped", f"error ≤ {epsilon:g}", "mean error", "entries")
     title = f"verify-skip, best neighbour in another episode, {confidence:.0%} with an error of at most {epsilon:g}"
     print_table(columns, rows, title)
-
-
-@command(
-    "calibrate risk",
-    CalibrateRiskSettings,
-    keys="policy.target task name episodes seed sources scores unverified epsilon features",
-    examples=("kerv calibrate risk", "kerv calibrate risk policy.target=mine episodes=50 features=true --plan"),
-)
-def risk(settings: CalibrateRiskSettings, plan: ShowPlan = False) -> None:
-    """Record in closed loop what unverified drafts lose, for skip=risk."""
-    from kerv_cli.report.risk import coverage_table, plot_coverage
-    from kerv_cli.training.risk_recording import RiskRun
-
-    run = RiskRun(settings)
-    if plan:
-        print_plan(run.plan())
-    try:
-        with progress_bar("episodes") as advance:
-            run.record(advance)
-    except KeyboardInterrupt:
-        raise Interrupted(
-            f"interrupted: finished episodes are kept in {run.folder}, the same command goes on there"
-        ) from None
-    recording = run.finish(lambda recording, folder: plot_coverage(recording, folder / PLOT))
-    title = f"levels with a risk of at most {settings.epsilon:g}, certified at 1 - {settings.delta:g}"
-    columns = ("source", "score", "level", "trusted", "risk", "p", "holds in", "AUC", "episodes")
-    print_table(columns, coverage_table(recording, settings.epsilon, settings.delta), title)
-    typer.echo(f"{run.folder}\n{run.folder / PLOT}")
 
 
 OWN = ("name", "margin", "delta")

@@ -1,4 +1,4 @@
-"""`kerv train target`, `kerv train drafter` and `kerv train score`."""
+"""`kerv train target` and `kerv train drafter`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.settings import TrainDrafterSettings, TrainScoreSettings, TrainTargetSettings
+from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_json, print_plan, progress_bar
 
@@ -44,24 +44,6 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
     from kerv_cli.training.runs import drafter_run
 
     run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")
-
-
-@command(
-    "train score",
-    TrainScoreSettings,
-    keys="policy.target policy.risk policy.score inputs steps lr weight_decay held_out seed results",
-    examples=("kerv train score", "kerv train score inputs=[odds,entropy] steps=600"),
-)
-def score(settings: TrainScoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Train a score that expects a draft's loss, on what 'kerv calibrate risk features=true' recorded."""
-    from kerv_cli.training.score_training import ScoreRun
-
-    run = ScoreRun(settings)
-    if plan:
-        print_plan(run.plan(), as_json)
-    with progress_bar("training the score") as advance:
-        metrics = run.train(advance)
-    print_figures("held-out episodes", metrics, run.folder, as_json)
 
 
 def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:

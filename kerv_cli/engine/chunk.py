@@ -16,7 +16,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.protocol import Cache
-from kerv_cli.engine.record import PARALLEL, PHASES, Round, Trust
+from kerv_cli.engine.record import PARALLEL, PHASES, Round
 
 Mode = Literal["retrieval", "drafter"]
 
@@ -137,7 +137,7 @@ class Chunk:
         self.forwards = 0
         self._differences: list[float] = []  # of judged tokens, |draft − target token| in normalised action units
         self.similarity: float | None = None  # cosine of the best stored chunk, where one was looked up
-        self.trust: Trust | None = None  # why it was verified or not, where a gate with a score decides
+        self.reason: str | None = None  # as in `DecodeRecord`
         self.closed: np.ndarray | None = None  # (steps, D) normalised actions, once a rectifier ended the chunk
 
     @property

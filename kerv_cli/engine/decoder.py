@@ -190,9 +190,6 @@ class Decoder:
             self.decode_alone(chunk, clock)
         while chunk.left:
             self.round(chunk, clock)
-        if parts.skip is not None:
-            parts.skip.completed(chunk)
-            clock.lap("accept")
         return chunk
 
     def prefill(self, chunk: Chunk, clock: Clock) -> None:
@@ -374,7 +371,7 @@ def record_of(
         skipped=any(played.mode == "skip" for played in chunk.rounds),
         similarity=chunk.similarity,
         metric=chunk.choice.metric if chunk.choice is not None else None,
-        trust=chunk.trust,
+        reason=chunk.reason,
     )
 
 

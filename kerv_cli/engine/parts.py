@@ -89,9 +89,6 @@ class Skip(ABC):
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
         """Told when the prefill of a chunk that was not taken has judged the in-prefill draft."""
 
-    def completed(self, chunk: Chunk) -> None:  # noqa: B027
-        """Told when a chunk that was not taken is complete."""
-
 
 @runtime_checkable
 class TakesMany(Protocol):

@@ -15,11 +15,8 @@ from kerv_cli.base.spaces import ActionSpace
 PARALLEL = "parallel"
 """Mode of a round, and of its decode, in which the target decoded all tokens at once."""
 
-TRUSTED, GATE, AUDIT, OPENING, ALARM = "trusted", "gate", "audit", "opening", "alarm"
-DOUBT, NO_DRAFT, STREAK = "doubt", "no draft", "streak"
-"""Reasons of `Trust`: executed unverified; verified because the score is too low, at random, at an episode's start,
-after an alarm, after a draft that was far off, because nothing was drafted, or because the verifications before do not
-allow more."""
+TRUSTED, STREAK = "trusted", "streak"
+"""Reasons of a decode: executed unverified; verified because the verifications before do not allow more."""
 
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
@@ -58,27 +55,6 @@ class Round:
     def without_bonus(self) -> Round:
         """This round without its bonus, for compensations that do not use the target token at the rejected position."""
         return replace(self, committed=self.accepted)
-
-
-@dataclass(frozen=True)
-class Trust:
-    """Why a draft was executed unverified or was verified (docs/methods.md §4.5, §4.6)."""
-
-    score: float  # of the draft, larger = safer; NaN for rules without a score
-    level: float  # from which on it is trusted
-    reason: str  # TRUSTED, GATE, AUDIT, …
-    loss: float | None = None  # ℓ in [0, 1], where it was verified
-    alarm: bool = False  # an alarm was on, or this decode's loss raised one
-
-    @property
-    def audited(self) -> bool:
-        """Whether the gate trusted the draft and it was verified all the same."""
-        return self.loss is not None and self.score >= self.level
-
-    @property
-    def sampled(self) -> bool:
-        """Whether it was verified at random: an unbiased sample of the risk of what is executed unverified."""
-        return self.loss is not None and self.reason == AUDIT
 
 
 @dataclass(frozen=True)
@@ -126,7 +102,7 @@ class DecodeRecord:
     variability: float | None = None  # K of this decode (§3.2), normalised action units
     similarity: float | None = None  # best retrieval similarity, where one was looked up
     metric: float | None = None  # fused hybrid-boundary metric F (§4.4)
-    trust: Trust | None = None  # of a gate with a score
+    reason: str | None = None  # why a skip rule executed the draft unverified or had it verified, where it says so
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
     delay: Delay | None = None  # None: the world waited
     looks: int = 0  # at the world while the chunk was executed; their time is in `seconds` and `phases`
@@ -150,16 +126,6 @@ class DecodeRecord:
         """Tokens handed over for execution without a target token on their accepted path: all of a skipped decode's and
         of a parallel one's, else what a prediction or a rejected draft filled."""
         return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
-
-    @property
-    def score(self) -> float | None:
-        """Of the draft, where a gate computed one."""
-        return self.trust.score if self.trust is not None and math.isfinite(self.trust.score) else None
-
-    @property
-    def loss(self) -> float | None:
-        """Of the draft, where a gate's draft was verified."""
-        return self.trust.loss if self.trust is not None else None
 
     @property
     def verifications(self) -> int:

@@ -37,7 +37,7 @@ DESCRIPTIONS = {
     "risk": "risk.json",
     "score": "score.json",
 }
-"""Kind of artifact -> the file that describes it."""
+"""Kind of artifact -> the file that describes it; risk and score are of an older kerv."""
 TRAINED = ("target", "drafter", "early", "scout")
 KINDS = (SWEEP, ROLLOUT, *DESCRIPTIONS)
 LAST = "last"
@@ -229,10 +229,6 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
     """By which others name the artifact: that of its weights or data, else of its description."""
     if value.get("kind") == "datastore":
         return content_of(value["key"], value["chunk"], value["target"], value["files"])
-    if value.get("kind") == "risk":
-        from kerv_cli.methods.risk import hash_of_recording
-
-        return hash_of_recording(path)
     return str(value.get("sha256") or (sha256_of(path) if value else ""))
 
 

@@ -43,10 +43,6 @@ EPISODE_SCHEMA = pa.schema(
         ("unverified_tokens", pa.int64()),  # executed without a target token on their accepted path
         ("executed_tokens", pa.int64()),  # numbers handed over for execution: steps times DoFs
         ("retrieval_decodes", pa.int64()),
-        ("audits", pa.int64()),  # drafts that a gate trusted and that were verified at random
-        ("audit_loss", pa.float64()),  # their summed loss
-        ("alarmed", pa.int64()),  # 1 where an alarm was raised
-        ("alarm_audits", pa.int64()),  # verified drafts that it trusted up to the first alarm
         ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
         ("deviation_count", pa.int64()),
         ("delay_decodes", pa.int64()),  # decodes during which the world went on
@@ -88,7 +84,7 @@ _MEASURES = ("variability", "similarity", "metric", "deviation")
 _MOTION = ("path_length", "jerk", "gripper_switches")
 _OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds", *_MOTION)  # of EpisodeRecord
 _COUNTS = ("compensated", "looks", "abandoned")
-_OF_DECODE = ("mode", "forwards", "seconds", "skipped", *_COUNTS, *_MEASURES)  # fields of DecodeRecord
+_OF_DECODE = ("mode", "forwards", "seconds", "skipped", "reason", *_COUNTS, *_MEASURES)  # fields of DecodeRecord
 
 DECODE_SCHEMA = pa.schema(
     [
@@ -108,17 +104,12 @@ DECODE_SCHEMA = pa.schema(
         ("looks", pa.int64()),  # at the world while it was executed
         ("abandoned", pa.int64()),  # control steps that were given up after the last look
         *[(name, pa.float64()) for name in _MEASURES],
-        ("score", pa.float64()),  # of the draft; these: null without a gate, see decoding.record.Trust
-        ("level", pa.float64()),
-        ("reason", pa.string()),
-        ("loss", pa.float64()),
-        ("alarm", pa.bool_()),
+        ("reason", pa.string()),  # of a skip rule: trusted, streak; null without one that says so
         ("delay_seconds", pa.float64()),  # these: null where the world waited
         ("delay_steps", pa.int64()),
         *[(name, pa.int64()) for name in _OF_DELAY],
     ]
 )
-_TRUST = ("score", "level", "reason", "loss", "alarm")
 _DECODE_TIMES = pa.schema([DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
@@ -161,7 +152,6 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         "unverified_tokens": sum(d.unverified for d in decodes),
         "executed_tokens": sum(int(d.actions.size) for d in decodes),
         "retrieval_decodes": sum(any(r.proposer == "retrieval" for r in d.rounds) for d in decodes),
-        **_audit(decodes),
         "deviation_sum": float(sum(deviations)),
         "deviation_count": len(deviations),
         **_delay_sums(record),
@@ -170,15 +160,6 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
         **asdict(at),
         "worker_pid": os.getpid(),
     }
-
-
-def _audit(decodes: Sequence[DecodeRecord]) -> dict[str, Any]:
-    """Columns of an episode's audits."""
-    gates = [d.trust for d in decodes if d.trust is not None]
-    sampled = [trust.loss or 0.0 for trust in gates if trust.sampled]
-    alarms = [trust.alarm for trust in gates if trust.audited]
-    first = next((count for count, alarm in enumerate(alarms, 1) if alarm), 0)
-    return {"audits": len(sampled), "audit_loss": sum(sampled), "alarmed": int(first > 0), "alarm_audits": first}
 
 
 def _delay_sums(record: EpisodeRecord) -> dict[str, float]:
@@ -213,7 +194,6 @@ def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
             "tokens": list(decode.tokens),
             "actions": np.asarray(decode.actions, dtype=np.float32).tolist(),
             "rounds": [_round_row(r) for r in decode.rounds],
-            **{name: getattr(decode.trust, name, None) for name in _TRUST},
             "delay_seconds": None if decode.delay is None else decode.delay.seconds,
             "delay_steps": decode.delay_steps,
             **{name: getattr(decode.delay, name, None) for name in _OF_DELAY},

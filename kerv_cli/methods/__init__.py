@@ -8,7 +8,7 @@ imports nothing heavy; the code lies beside it.
     retrieval, heisd            HeiSD: the datastore and its drafts; two sides of a boundary, verify-skip
     jacobi, parallel            PD-VLA's and OpenVLA-OFT's decoding
     early, merged               ours: a draft before the prefill (`one_pass`)
-    streak, risk, unverified    ours: what is executed without a verification
+    streak, unverified          ours: what is executed without a verification
 
 `compose.py` makes a decoder of a method's parts, `context.py` is what they are made from, `artifacts.py` finds, checks
 and loads their files. `calibration.py` is the file that KERV and HeiSD share.

@@ -68,7 +68,7 @@ class MadeFor:
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
     """Refuses an artifact that was made from others than the policy's. sources, used: kind -> hash of what it was made
     from, and of the policy's target and artifacts; a source of a kind that the policy does not use does not matter.
-    what: the beginning of the message, e.g. `the risk in FOLDER was recorded`. again: the remedy.
+    what: the beginning of the message, e.g. `the early drafter in FOLDER was trained`. again: the remedy.
 
     Raises:
         CheckpointError: the policy uses another artifact of the same kind as one of the sources.

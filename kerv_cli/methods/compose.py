@@ -111,9 +111,7 @@ class Method:
         """What executes drafts unverified has one source that drafts whole chunks before the prefill."""
         skip, draft = self.parts["skip"], self.parts["prefill_draft"]
         joined = bool(skip.traits.get("merges")) and draft.name == "merged"
-        retrieved = draft.name == "none" and self.names["proposer"] in ("hybrid", "retrieval")
-        retrieved = retrieved and bool(skip.traits.get("retrieves"))
-        if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined and not retrieved:
+        if skip.traits.get("takes_draft") and not draft.traits.get("chains") and not joined:
             raise UsageError(
                 f"skip={skip.name} with prefill_draft={draft.name}: it executes what one source drafts before "
                 "the prefill, e.g. prefill_draft=early"

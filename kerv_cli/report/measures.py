@@ -31,7 +31,6 @@ _RATIOS = {
     "compensation_rate": ("compensated_decodes", "decodes"),
     "retrieval_share": ("retrieval_decodes", "decodes"),
     "deviation": ("deviation_sum", "deviation_count"),
-    "audits_to_alarm": ("alarm_audits", "alarmed"),
     "felt_latency": ("delay_seconds", "delay_decodes"),
     "felt_latency_steps": ("delay_steps", "delay_decodes"),
     "held_share": ("held_steps", "steps"),
@@ -69,7 +68,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
         **_columns("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
         **_columns("AL", _averaged(episodes, macro, _acceptance_length)),
-        **_columns("realised_risk", _averaged(episodes, macro, _realised_risk)),
+        **(_columns("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
         **paired_columns(
             _counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(_counts(part)))
         ),
@@ -100,9 +99,9 @@ def _acceptance_length(episodes: pd.DataFrame) -> Estimate:
 
 
 def _realised_risk(episodes: pd.DataFrame) -> Estimate:
-    """Mean over episodes of the mean loss of their trusted decodes: what a certificate promises. An episode's audits
-    are a fair sample of its trusted decodes, and more where these are more: each counts 1 ÷ that number, so that
-    episodes count alike. The decode-weighted mean, audit_loss ÷ audits, favours long episodes."""
+    """Of episodes of the gate that kerv had (docs/methods.md §4.6): mean over episodes of the mean loss of trusted
+    decodes. An episode's audits are a fair sample of its trusted decodes, and more where these are more: each counts
+    1 ÷ that number, so that episodes count alike. audit_loss ÷ audits favours long episodes."""
     trusted = (episodes["skipped_decodes"] + episodes["audits"]).clip(lower=1)
     return _per_world(episodes, stats.share, episodes["audit_loss"] / trusted, episodes["audits"] / trusted)
 
@@ -190,14 +189,24 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
         "time_per_step_ms": float((episodes["seconds"] * per_step).mean()),
         "time_per_episode_ms": 1000.0 * float(episodes["seconds"].mean()),
         **_latencies(episodes["decode_seconds"]),
-        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].any() else math.nan,
         "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
     }
     values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
     sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
     values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
+    values |= _alarms(episodes) if "audits" in episodes else {}
     return values | {name: float(part.built(episodes)) for name, part in own_columns().items()}
+
+
+def _alarms(episodes: pd.DataFrame) -> dict[str, float]:
+    """Of episodes that have the columns of the gate that kerv had (docs/methods.md §4.6): the share with an alarm, and
+    the audits up to it."""
+    alarms = float(episodes["alarmed"].sum())
+    return {
+        "alarm_rate": float(episodes["alarmed"].mean()) if episodes["audits"].any() else math.nan,
+        "audits_to_alarm": float(episodes["alarm_audits"].sum()) / alarms if alarms else math.nan,
+    }
 
 
 def own_columns() -> Mapping[str, Part]:

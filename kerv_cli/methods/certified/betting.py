@@ -5,7 +5,7 @@ fair or worse, and none knows the value that it is laid on, so that the wealth e
 most, however often one looks (Ville). Values of groups that differ, e.g. tasks, have to come in random order: sorted
 ones refute their order.
 
-A certificate of risk takes an episode's mean loss and ε (docs/methods.md §4.6). One of success takes a pair's
+A certificate of success takes a pair's
 v = (1 + baseline − method) / 2 ∈ {0, ½, 1} and (1 + m) / 2: the hypothesis is that m or more of the success is lost.
 """
 

@@ -99,11 +99,6 @@ class EarlyDrafter(Packable):
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
-    @torch.inference_mode()
-    def distance(self, features: Tensor) -> float:
-        """Mean square of the standardised features (1, F): 1 on average over the training observations."""
-        return float(((features.float() - self.mean) * self.scale).square().mean())
-
     def forward(self, features: Tensor, history: Tensor, valid: Tensor) -> Tensor:
         """pooled prompts (B, F), history (B, h, D) normalised, valid (B, h) -> logits (B, N, V)."""
         if self.packed is not None and len(features) == 1:
@@ -118,19 +113,17 @@ class EarlyDrafter(Packable):
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
         """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
         radius: r in bins, see `choose`."""
-        numbers, logits = self.on_device(features, history, radius)
-        return EarlyDraft.of(read(numbers)[0], logits)
+        return EarlyDraft.of(read(self.on_device(features, history, radius))[0])
 
     @torch.inference_mode()
-    def on_device(self, features: Tensor, history: np.ndarray, radius: int) -> tuple[Tensor, Tensor]:
-        """The draft of `drafted` without a wait for the device: N tokens and the odds (N + 1,) float64, logits
-        (N, V)."""
+    def on_device(self, features: Tensor, history: np.ndarray, radius: int) -> Tensor:
+        """The draft of `drafted` without a wait for the device: N tokens and the odds, (N + 1,) float64."""
         weight = self.head.weight
         inputs = padded(history, self.settings.history, self.actions.dofs)
         actions, valid = (upload(x, weight.device).to(weight.dtype)[None] for x in inputs)
         logits = self(features.to(weight.dtype), actions, valid)
         tokens, odds = choose_with_odds(logits, radius, self.strict)
-        return torch.cat([tokens[0].double(), odds.double()]), logits[0]
+        return torch.cat([tokens[0].double(), odds.double()])
 
     @torch.inference_mode()
     def tokens_of(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> list[list[int]]:
@@ -184,23 +177,15 @@ class PackedEarly(Packed):
 
 @dataclass(frozen=True)
 class EarlyDraft:
-    """A draft. tokens: N of them. odds: the drafter's estimate that all are accepted, see `acceptance_odds`. logits:
-    (N, V)."""
+    """A draft. tokens: N of them. odds: the drafter's estimate that all are accepted, see `choose_with_odds`."""
 
     tokens: list[int]
     odds: float
-    logits: Tensor
 
     @classmethod
-    def of(cls, numbers: np.ndarray, logits: Tensor) -> EarlyDraft:
+    def of(cls, numbers: np.ndarray) -> EarlyDraft:
         """numbers: as `EarlyDrafter.on_device`."""
-        return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]), logits)
-
-    @property
-    def entropy(self) -> float:
-        """Mean over the tokens of their distributions' entropy, nats."""
-        shares = self.logits.float().log_softmax(-1)
-        return float(-(shares.exp() * shares).sum(-1).mean())
+        return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]))
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
@@ -270,12 +255,11 @@ class EarlyProposer(ChainProposer):
         reads the vector hands it to `take`."""
         if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
             return None
-        numbers, self._logits = self.early.on_device(*self._inputs(chunk))
-        return numbers
+        return self.early.on_device(*self._inputs(chunk))
 
     def take(self, chunk: Chunk, numbers: np.ndarray) -> None:
         """Takes the vector of `on_device`, read by the host."""
-        self._drafted = chunk, EarlyDraft.of(numbers, self._logits)
+        self._drafted = chunk, EarlyDraft.of(numbers)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """The drafted chain."""
@@ -290,10 +274,6 @@ class EarlyProposer(ChainProposer):
             return tree, range(len(tree))
 
         return Unread(numbers[start : min(chunk.size, start + depth)].long(), numbers, assemble)
-
-    def distance(self, chunk: Chunk) -> float:
-        """How far the observation is from those that the drafter was trained on; see `EarlyDrafter.distance`."""
-        return self.early.distance(self.features(chunk))
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """The drafted tokens behind the committed ones."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.loss import chunk_loss, judged_tokens
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import DraftsChunks
-from kerv_cli.engine.record import STREAK, TRUSTED, Trust
+from kerv_cli.engine.record import STREAK, TRUSTED
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged.proposer import first_source
 from kerv_cli.methods.streak import StreakSkipSettings
@@ -40,7 +38,7 @@ class StreakSkip(Skip):
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
         trusted = self.left > 0 and len(self.chain) == chunk.size
-        chunk.trust = Trust(math.nan, math.nan, TRUSTED if trusted else STREAK)
+        chunk.reason = TRUSTED if trusted else STREAK
         if not trusted:
             return False
         self.left -= 1

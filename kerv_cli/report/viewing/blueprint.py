@@ -21,15 +21,13 @@ SIGNALS = {
     "variability": "K, kinematic variability",
     "metric": "F, boundary metric",
     "similarity": "similarity of the best neighbour",
-    "score": "score of the draft",
-    "loss": "loss of the draft, where verified",
     "deviation": "deviation from AR",
     "delay_steps": "latency that the world felt, control steps",
 }
 """Optional attributes of DecodeRecord -> titles of their views."""
 
 
-LIMITS = {"metric": "F*", "similarity": "s_min", "score": "level"}
+LIMITS = {"metric": "F*", "similarity": "s_min"}
 """Signal -> name of the limit that a decision compares it with."""
 
 COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")

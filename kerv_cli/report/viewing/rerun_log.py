@@ -8,7 +8,6 @@ the control step at which its actions begin.
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -81,16 +80,10 @@ def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapp
         StorageError: the disk is full or read-only, or the folder may not be written to.
     """
     with catch_and_log_exceptions(strict=True):  # rerun would turn exceptions into warnings and missing views
-        content = _encode(record, method, {**_levels(record), **(limits or {})})
+        content = _encode(record, method, limits or {})
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path
-
-
-def _levels(record: EpisodeRecord) -> dict[str, float]:
-    """The level that the scores of drafts are compared with, where the episode has a single finite one."""
-    levels = {d.trust.level for d in record.decodes if d.trust is not None and math.isfinite(d.trust.level)}
-    return {"score": levels.pop()} if len(levels) == 1 else {}
 
 
 def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from kerv_cli.engine.record import DecodeRecord, Round, Trust
+from kerv_cli.engine.record import DecodeRecord, Round
 
 
 @dataclass(frozen=True)
@@ -150,20 +149,10 @@ def decode_line(decode: DecodeRecord) -> str:
         parts.append(f"{decode.compensated} compensated")
     if decode.skipped:
         parts.append("verification skipped")
-    if decode.trust is not None:
-        parts.append(trust_words(decode.trust))
+    if decode.reason is not None:
+        parts.append(decode.reason)
     parts.append(f"{len(decode.actions)} step{'s' * (len(decode.actions) != 1)} · {1000 * decode.seconds:.1f} ms")
     return " · ".join(parts)
-
-
-def trust_words(trust: Trust) -> str:
-    """Why a draft was verified or not, in a few words."""
-    words = [trust.reason]
-    if math.isfinite(trust.score):
-        words.append(f"score {trust.score:.3g} against {trust.level:.3g}")
-    if trust.loss is not None:
-        words.append(f"loss {trust.loss:.2f}")
-    return ", ".join([*words, *(["ALARM"] * trust.alarm)])
 
 
 def acceptance(rounds: Sequence[Round]) -> tuple[float, float]:
