@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from PIL import Image
 
 from kerv_cli.base.files import atomic_path
 from kerv_cli.base.registry import parts
@@ -137,9 +138,12 @@ def _embedded(png: bytes) -> str:
 
 
 def figure_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as the bytes of a PNG or SVG file."""
-    buffer = io.BytesIO()
+    """A figure as the bytes of an SVG file, or of a PNG file with a palette: half the size, and no other picture."""
+    buffer, small = io.BytesIO(), io.BytesIO()
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
     with mpl.rc_context(STYLE):
         figure.savefig(buffer, format=kind, dpi=150, metadata=metadata)
-    return buffer.getvalue()
+    if kind == "svg":
+        return buffer.getvalue()
+    Image.open(buffer).convert("RGB").quantize(256).save(small, "PNG", optimize=True)
+    return small.getvalue()
