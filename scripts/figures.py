@@ -9,7 +9,8 @@
     <!-- /replay -->
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
-instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space.
+instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@PROFILE` is
+priced for another machine, from `<study>_on.csv`.
 """
 
 from __future__ import annotations
@@ -106,6 +107,8 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "worst": ("worst, ms", lambda row: _number(row, "latency_worst_ms", ".0f")),
     "rate": ("chunks per s at p95", _rate),
     "AL": ("AL", lambda row: _number(row, "AL", ".1f")),
+    "steps": ("control steps to success", lambda row: _number(row, "steps_to_success", ".0f")),
+    "path": ("path, against AR", _own(lambda row: _interval(row, "path_m_ratio", ".2f"))),
     "forwards": ("forwards per step", lambda row: _number(row, "forwards_per_step", ".2f")),
     "skipped": ("skipped", lambda row: _number(row, "skip_rate", ".0f", 100, " %")),
     "unverified": ("unverified", lambda row: _number(row, "unverified_share", ".0f", 100, " %")),
@@ -125,10 +128,18 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
 }
 
 
-def _column(name: str) -> tuple[str, Callable[[Row], str]]:
+def _column(name: str, study: str = "") -> tuple[str, Callable[[Row], str]]:
+    """Title and text. `NAME@PROFILE` is that column of `<study>_on.csv`, priced for another machine and marked so."""
+    name, _, machine = name.partition("@")
     if name not in COLUMNS:
         raise BadReference(f"no column {name}; known: {', '.join(COLUMNS)}")
-    return COLUMNS[name]
+    title, text = COLUMNS[name]
+    if not machine:
+        return title, text
+    priced = {row["label"]: row for row in table_of(f"{study}_on", False) if row["on"] == machine}
+    if not priced:
+        raise BadReference(f"{study}_on has no machine {machine}")
+    return f"{title}, ≈ {machine}", lambda row: f"≈ {text(priced[row['label']])}" if row["label"] in priced else ""
 
 
 def _named(label: str) -> str:
@@ -141,7 +152,7 @@ def markdown_table(study: str, options: list[str], names: list[str]) -> str:
     rows = [r for r in table_of(study, "macro" in options) if not only or _named(r["label"]) in only[0]]
     if not rows:
         raise BadReference(f"{study} has none of these settings")
-    columns = [_column(name) for name in names]
+    columns = [_column(name, study) for name in names]
     lines = [[title for title, _ in columns], ["---"] * len(columns)]
     lines += [[text(row) for _, text in columns] for row in rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
@@ -152,7 +163,7 @@ def figure(study: str, macro: bool, label: str, column: str) -> str:
     found = [row for row in table_of(study, macro) if _named(row["label"]) == label]
     if len(found) != 1:
         raise BadReference(f"{study} has {len(found)} settings {label}")
-    return _column(column)[1](found[0])
+    return _column(column, study)[1](found[0])
 
 
 def error_table(name: str) -> str:

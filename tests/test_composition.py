@@ -68,6 +68,12 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "threshold": K_LEVEL,
         "rectifier": CompensateSettings("compensate", "damped", 1, True, 1, 0, -1),
     },
+    "kerv_chunk": {
+        "proposer": CHAIN,
+        "acceptance": RELAXED,
+        "threshold": K_LEVEL,
+        "rectifier": CompensateSettings(predictor="draft", steps=4),
+    },
     "kerv_paper": {
         "proposer": DrafterProposerSettings(depth=5, top_k=8, nodes=50),
         "acceptance": RelaxedAcceptanceSettings(strict_dofs=False),
@@ -292,6 +298,7 @@ def test_an_expert_needs_nothing_else() -> None:
         ("method=kerv threshold.k_s=0.3", ("drafter", "calibration")),
         ("method=kerv threshold.k_s=0.3 rectifier.predictor=linear", ("drafter",)),
         ("method=kerv_paper", ("drafter", "calibration")),
+        ("method=kerv_chunk", ("drafter", "calibration")),
         ("method=heisd", ("drafter", "datastore", "calibration")),
         ("method=heisd_paper", ("drafter", "datastore", "calibration")),
         ("method=heisd boundary=always_retrieval skip=none", ("drafter", "datastore")),
