@@ -20,7 +20,7 @@ class UsageError(KervError):
 
 _GATE = (
     "the calibrated gate is gone, commit 72e42ef is the last with it: method=one_pass_streak needs no calibration and "
-    "was nowhere shown to be slower per episode, 'kerv calibrate success' certifies success instead (docs/methods.md §4.6)"
+    "was nowhere shown to be slower per episode; 'kerv calibrate success' certifies success instead (docs/methods.md)"
 )
 GONE = {
     ("calibrate", "risk"): _GATE,
