@@ -137,7 +137,8 @@ def test_what_the_gate_measured_is_listed_shown_and_reported_as_it_was(gated: tu
     (folder / "gate.yaml").write_text("settings: {ar: method=ar}")
     works("report", f"study={folder}/gate.yaml", results)
     now = pd.read_csv(folder / "results/report/tables/gate.csv")
-    pd.testing.assert_frame_equal(now[before.columns], before)
+    # a setting that a part has since, skip.opening of a streak, has its default where the column was empty
+    pd.testing.assert_frame_equal(now[before.columns].where(before.notna()), before, check_dtype=False)
     assert before.loc[before["label"] == "one_pass_risk", "realised_risk"].notna().all()
 
 

@@ -129,11 +129,11 @@ OWN = ("name", "margin", "delta")
     examples=("kerv calibrate success", "kerv calibrate success margin=3 episodes=50 --plan"),
     each="rollout",
 )
-def success(words: list[str], plan: ShowPlan = False, as_json: AsJson = False) -> None:
+def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
     What is there is reused; more episodes are added to it."""
     from kerv_cli.base.config import compose
-    from kerv_cli.cli.sweep import covered_cells, print_sweep_plan, run_covered
+    from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve
     from kerv_cli.report.certificate import certify, place_of, verdicts, write
 
@@ -144,6 +144,9 @@ def success(words: list[str], plan: ShowPlan = False, as_json: AsJson = False) -
     folder = [word for word in theirs if word.startswith("results=")]
     settings = compose("calibrate_success", [*own, *folder], CalibrateSuccessSettings)
     resolved = resolve(theirs)
+    if cfg:
+        print_settings(resolved)
+        return
     place = place_of(resolved, settings.name)
     store, covered = covered_cells(resolved, theirs)
     if plan:

@@ -50,14 +50,11 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
     if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in words):
         _list_studies(as_json)
         return
-    from kerv_cli.base.config import to_yaml
     from kerv_cli.lab.resolve import resolve
 
     resolved = resolve(words)
     if cfg:
-        typer.echo(to_yaml(resolved.study), nl=False)
-        for label, settings in resolved.settings.items():
-            typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
+        print_settings(resolved)
         return
     store, covered = covered_cells(resolved, words)
     if plan:
@@ -67,6 +64,15 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
     _tell(outcome, resolved, covered.cells, store, words, as_json)
     if outcome.failed:
         raise typer.Exit(1)
+
+
+def print_settings(resolved: ResolvedStudy) -> None:
+    """Prints the study and each of its settings as YAML, for --cfg."""
+    from kerv_cli.base.config import to_yaml
+
+    typer.echo(to_yaml(resolved.study), nl=False)
+    for label, settings in resolved.settings.items():
+        typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
 
 
 def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore, Covered]:
