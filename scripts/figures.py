@@ -9,8 +9,8 @@
     <!-- /replay -->
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
-instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@PROFILE` is
-priced for another machine, from `<study>_on.csv`.
+instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@PROFILE`
+is priced for another machine, from `<study>_on.csv`.
 """
 
 from __future__ import annotations
