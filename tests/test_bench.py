@@ -21,7 +21,7 @@ from kerv_cli.bench.model import layer_weights, open_model
 from kerv_cli.bench.phases import Dummy, Laps, Phase, costs_of, decoders, flipped
 from kerv_cli.bench.profile import profile_of, projected, shares
 from kerv_cli.cli.app import app
-from kerv_cli.engine.cost import HOST_PHASES, Profile, Work, prices, read_profile, work_of
+from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of
 
 NANO = BenchSettings(model="nano", dtype="float32")
 
@@ -30,11 +30,11 @@ Played = tuple[str, int, int, int, str]
 PREFILL: Played = ("prefill", 0, 0, 0, "none")
 
 
-def work(*rounds: Played, looked_up: bool = False, drafter: tuple[int, int] | None = None) -> Work:
+def work(*rounds: Played, looked_up: bool = False, drafter: tuple[int, int] | None = None, vision: float = 1.0) -> Work:
     """Of one decode of sixteen tokens."""
     names = ("mode", "start", "tree_size", "accepted", "proposer")
     columns = {name: np.array(column) for name, column in zip(names, zip(*rounds, strict=True), strict=True)}
-    times = dict(zip(HOST_PHASES, np.array([[0.5], [0.25], [0.0], [0.125]]), strict=True))
+    times = dict(zip(READ_PHASES, np.array([[vision], [0.5], [0.25], [0.0], [0.125]]), strict=True))
     return work_of(columns, np.array([len(rounds)]), times, np.array([looked_up]), 16, drafter)
 
 
@@ -67,6 +67,10 @@ def test_a_skipped_decode_has_no_forward() -> None:
     found = work(("skip", 0, 0, 16, "early"))
     assert len(found.nodes) == 0
     assert found.needs == ["encode", "early"]
+    blind = work(("skip", 0, 0, 16, "scout"), vision=0.0)  # the target never encoded
+    assert (blind.needs, blind.propose.tolist(), blind.host.tolist()) == ([], [0.5], [0.375])
+    profile = Profile(31, {"encode": ((1,), (9.0,))})
+    assert (float(prices(blind, profile)), float(prices(found, profile))) == (0.875, 9.875)
 
 
 def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk() -> None:

@@ -27,6 +27,8 @@ _LEVELS = 5
 _HOST = ("accept", "rectify", "other")
 HOST_PHASES = ("propose", *_HOST)
 """Phases of a recorded decode whose seconds do not depend on the target's size, where the drafter does not draft."""
+READ_PHASES = ("vision", *HOST_PHASES)
+"""Phases whose recorded seconds the model reads: of vision only whether there were any."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +108,9 @@ class Work:
     decode: (n,) which decode. prefill: (n,) bool. nodes, accepted: (n,) of the draft. levels: (n,) of the drafter's
     draft, 0 where it did not draft; tree: (n,) bool, more than a chain. feeds: (n,) bool, the drafter is fed behind it.
     host: (decodes,) seconds, as recorded, of acceptance and all else that does not depend on the target's size, but for
-    proposing. propose: the same of proposing, 0 where the drafter, which follows the target's shape, drafted. sources:
-    kind -> (decodes,) bool, whether there was such a draft besides.
+    proposing. encoded: (decodes,) bool, whether the target encoded the observation. propose: seconds of proposing, 0
+    where the drafter, which follows the target's shape, drafted. sources: kind -> (decodes,) bool, whether there was
+    such a draft besides.
     """
 
     decode: np.ndarray
@@ -118,6 +121,7 @@ class Work:
     tree: np.ndarray
     feeds: np.ndarray
     host: np.ndarray
+    encoded: np.ndarray
     propose: np.ndarray
     sources: Mapping[str, np.ndarray]
 
@@ -125,7 +129,7 @@ class Work:
     def needs(self) -> list[str]:
         """The kinds of costs that price it."""
         used = {
-            "encode": True,
+            "encode": self.encoded.any(),
             "prefill": self.prefill.any(),
             "verify": (~self.prefill).any(),
             "feed": self.feeds.any(),
@@ -149,7 +153,7 @@ def work_of(
     Args:
         rounds: of all decodes, one behind the other: mode, proposer, start, tree_size, accepted, (n,) each.
         counts: (decodes,) rounds of each.
-        phases: (decodes,) seconds of each of `HOST_PHASES`.
+        phases: (decodes,) seconds of each of `READ_PHASES`.
         looked_up: (decodes,) bool: something was retrieved.
         size: N.
         drafter: the proposer's `depth` and `top_k`; None: not known, a draft of many nodes is a tree.
@@ -178,6 +182,7 @@ def work_of(
         tree=tree[forward],
         feeds=(has_drafter[every] & ~last)[forward],
         host=np.asarray(host),
+        encoded=phases["vision"] != 0,
         propose=propose,
         sources=others,
     )
@@ -189,7 +194,7 @@ def sequence_of_record(decode: DecodeRecord) -> Work:
     return work_of(
         {name: np.array([getattr(played, name) for played in decode.rounds]) for name in names},
         np.array([len(decode.rounds)]),
-        {name: np.array([decode.phases.get(name, 0.0)]) for name in HOST_PHASES},
+        {name: np.array([decode.phases.get(name, 0.0)]) for name in READ_PHASES},
         np.array([decode.similarity is not None]),
         decode.size or len(decode.tokens),
     )
@@ -215,7 +220,7 @@ def prices(work: Work, profile: Profile) -> np.ndarray:
     if work.feeds.any():
         fed = work.accepted + np.where(work.prefill, profile.prompt, 1)
         seconds += np.where(work.feeds, profile.times("feed", fed), 0.0)
-    total = profile.seconds("encode", 1) + work.host + np.bincount(work.decode, seconds, len(work.host))
+    total = work.encoded * profile.seconds("encode", 1) + work.host + np.bincount(work.decode, seconds, len(work.host))
     used = {kind: drafts for kind, drafts in work.sources.items() if drafts.any()}
     if missing(list(used), profile):
         return np.asarray(total + work.propose)

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import as_path, shipped_dir
-from kerv_cli.engine.cost import FORMAT, HOST_PHASES, Profile, Work, missing, prices, read_profile, work_of
+from kerv_cli.engine.cost import FORMAT, READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
 from kerv_cli.lab.identity import batch_of
 from kerv_cli.lab.plan import Cell
 from kerv_cli.report.measures import MICRO, measure
@@ -27,7 +27,7 @@ ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
     "and target decoded the same tokens in the same control steps; success is the recorded policy's"
 )
-_COLUMNS = ("seed", "index", "rounds", "similarity", *(f"seconds.{phase}" for phase in HOST_PHASES))
+_COLUMNS = ("seed", "index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
 _SHIPPED = "-profile.json"
 _ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
 _SPEEDS = ("episode_speedup", "speedup")
@@ -182,7 +182,7 @@ def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:
         phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy())
         if f"seconds.{phase}" in table.column_names
         else np.zeros(len(counts))
-        for phase in HOST_PHASES
+        for phase in READ_PHASES
     }
     looked_up = np.zeros(len(counts), bool)
     if "similarity" in table.column_names:
