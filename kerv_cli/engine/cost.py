@@ -29,6 +29,7 @@ HOST_PHASES = ("propose", *_HOST)
 """Phases of a recorded decode whose seconds do not depend on the target's size, where the drafter does not draft."""
 READ_PHASES = ("vision", *HOST_PHASES)
 """Phases whose recorded seconds the model reads: of vision only whether there were any."""
+_UNSAID = (1.0, *[0.0] * len(HOST_PHASES))  # of a record that names no such phase: it encoded
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ def sequence_of_record(decode: DecodeRecord) -> Work:
     return work_of(
         {name: np.array([getattr(played, name) for played in decode.rounds]) for name in names},
         np.array([len(decode.rounds)]),
-        {name: np.array([decode.phases.get(name, 0.0)]) for name in READ_PHASES},
+        {name: np.array([decode.phases.get(name, unsaid)]) for name, unsaid in zip(READ_PHASES, _UNSAID, strict=True)},
         np.array([decode.similarity is not None]),
         decode.size or len(decode.tokens),
     )
