@@ -101,6 +101,8 @@ def check(settings: RolloutSettings) -> None:
     clock.check(settings, spec, target)
     artifacts.check(method.needs)
     method.check_levels(tasks, artifacts.load)
+    if "certificate" in method.needs:
+        artifacts.load("certificate").check_world(dataclasses.asdict(settings.world))
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
