@@ -112,6 +112,11 @@ class Part:
     colour: int | None = None
     traits: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def default(self) -> Any:
+        """Its settings where none are given."""
+        return self.settings(kind=self.name)
+
     def built(self, *arguments: Any, **keywords: Any) -> Any:
         """Imports and calls `build`."""
         return load(self.build)(*arguments, **keywords)

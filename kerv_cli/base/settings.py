@@ -26,7 +26,7 @@ MOST_STRESS = 4
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
     """Makes the settings of the part `name`: the default of a group."""
-    return lambda: find(kind, name).settings(kind=name)
+    return lambda: find(kind, name).default
 
 
 def part(kind: str, name: str = "none", help: str = "") -> Any:

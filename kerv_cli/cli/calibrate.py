@@ -131,7 +131,7 @@ OWN = ("name", "margin", "delta")
 )
 def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
-    What is there is reused; more episodes are added to it."""
+    Episodes that are there are reused; settle their number before you look."""
     from kerv_cli.base.config import compose
     from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve

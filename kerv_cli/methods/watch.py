@@ -46,7 +46,7 @@ class Watch(Skip):
     def build(cls, settings: WatchSettings, context: Context) -> Watch:
         """skip=watch."""
         part = find("proposer", settings.source)
-        return cls(part.built(part.settings(kind=part.name), context), settings.every, settings.tolerance)
+        return cls(part.built(part.default, context), settings.every, settings.tolerance)
 
     def take(self, chunk: Chunk) -> bool:
         """Never: the target decodes."""
@@ -63,7 +63,7 @@ class Watch(Skip):
 def _needs(settings: WatchSettings) -> tuple[str, ...]:
     """What the source reads."""
     part = find("proposer", settings.source)
-    return part.needs(part.settings(kind=part.name))
+    return part.needs(part.default)
 
 
 add("skip", "watch", "kerv_cli.methods.watch:Watch.build", WatchSettings, _needs, check_source, 0x5F7FA8, watches=True)

@@ -30,7 +30,7 @@ class ScopedSettings:
 def _needs(settings: Any) -> tuple[str, ...]:
     """The certificate, and what both sources read."""
     sources = (part_of("prefill_draft", name) for name in (settings.inside, settings.outside))
-    return "certificate", *(need for part in sources for need in part.needs(part.settings(kind=part.name)))
+    return "certificate", *(need for part in sources for need in part.needs(part.default))
 
 
 _CERTIFICATE = "kerv_cli.methods.certified.certificate:"

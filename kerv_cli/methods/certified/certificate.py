@@ -111,13 +111,9 @@ class Certificate:
 class CertificateArtifact(Artifact[Certificate]):
     """`certificate/` beside the target: certificate.json."""
 
-    kind, noun, made, again, schema = (
-        "certificate",
-        "certificate",
-        "issued",
-        "run 'kerv calibrate success'",
-        Certificate,
-    )
+    kind, noun, made = "certificate", "certificate", "issued"
+    again = "run 'kerv calibrate success'"
+    schema = Certificate
 
     def load(self, place: Any, request: Request) -> Certificate:
         """See `Artifact.load`."""
@@ -141,7 +137,7 @@ def covers(context: Context) -> bool:
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
     """prefill_draft=scoped: the source for the task at hand."""
     part = part_of("prefill_draft", settings.inside if covers(context) else settings.outside)
-    proposer: Proposer = part.built(part.settings(kind=part.name), context)
+    proposer: Proposer = part.built(part.default, context)
     return proposer
 
 

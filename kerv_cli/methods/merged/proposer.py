@@ -38,7 +38,7 @@ class MergedProposer(Stateless):
 
         def source(name: str) -> DraftsChunks:
             part = find("proposer", name)
-            source_settings: Any = part.settings(kind=name)
+            source_settings: Any = part.default
             if isinstance(source_settings, RetrievalProposerSettings):
                 source_settings = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
             proposer: DraftsChunks = part.built(source_settings, context)
