@@ -19,10 +19,10 @@ from test_decoding_lossless import assert_adds_up, random_prompt, random_target
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.draft import ROOT, Draft, TokenTree
 from kerv_cli.engine.parts import Fixed
-from kerv_cli.engine.proposer import Stateless
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
-from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.heisd.rules import ByGroup, ByProposer
 from kerv_cli.methods.spec_vla.rules import Relaxed
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -46,7 +46,7 @@ class Greedy:
         return self.known[prefix]
 
 
-class NearTrees(Stateless):
+class NearTrees(Proposer):
     """Seeded trees whose tokens lie near the target's, so that limits decide; the same ones for the same prefix.
 
     `retrieval` is the name that the hybrid rule judges by `sequence`; every other one is judged by `relaxed`.
@@ -76,9 +76,10 @@ class NearTrees(Stateless):
             paths.append((*behind, tokens[-1]))
         return TokenTree.build(tokens, parents)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         self.turn += 1
-        return self.tree(tuple(chunk.tokens), depth)
+        tree = self.tree(tuple(chunk.tokens), depth)
+        return Draft.of(tree.tokens, tree.parents)
 
 
 @dataclass

@@ -126,9 +126,9 @@ def test_decodes_of_all_sizes_show_what_each_part_costs() -> None:
 
 def test_a_dummy_drafts_a_chain_and_puts_what_has_no_room_at_the_root() -> None:
     chunk: Any = dataclasses.make_dataclass("Chunk", ["tokens"])([7])
-    tree = Dummy(5).propose(chunk, 3)
+    tree = Dummy(5).propose(chunk, 3).tree
     assert (tree.depths, tree.parents) == ((0, 1, 2, 0, 0), (-1, 0, 1, -1, -1))
-    assert Dummy(9, (4, 5, 6)).propose(chunk, 9).tokens == (5, 6)
+    assert Dummy(9, (4, 5, 6)).propose(chunk, 9).tree.tokens == (5, 6)
 
 
 def profile() -> Profile:

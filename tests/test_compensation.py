@@ -14,9 +14,9 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.history import ActionHistory
-from kerv_cli.engine.proposer import Stateless
-from kerv_cli.engine.tree import TokenTree
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.kinematics import CompensateSettings
 from kerv_cli.methods.kinematics.prediction import Compensation, Hold, Linear, assemble
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -113,7 +113,7 @@ def test_the_filter_rests_after_a_compensation() -> None:
     assert resting.resting == 0
 
 
-class Known(Stateless):
+class Known(Proposer):
     """An in-prefill draft of these tokens; nothing may follow the prefill."""
 
     name = "known"
@@ -126,8 +126,8 @@ class Known(Stateless):
 
     committed = begin  # type: ignore[assignment]
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        return TokenTree.chain(self.drafted)
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        return Draft.of(self.drafted)
 
 
 @pytest.mark.parametrize("use_target_token", [True, False])
@@ -207,7 +207,7 @@ def test_what_cannot_compensate_is_refused(values: dict[str, Any], error: type[E
 
 
 def test_an_in_prefill_draft_that_needs_states_is_refused() -> None:
-    class Late(Stateless):
+    class Late(Proposer):
         name = "late"
         needs_states = True
 

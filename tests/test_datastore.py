@@ -25,7 +25,7 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.tree import ROOT, TokenTree, merge
+from kerv_cli.engine.draft import ROOT, TokenTree, merge
 from kerv_cli.methods.retrieval import QdrantSearchSettings
 from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
@@ -592,10 +592,10 @@ def test_with_room_the_tree_holds_every_combination_of_groups(
 ) -> None:
     chunks, space = given_
     cuts = list(space.segments(start, min(chunks.shape[1], start + depth)))
-    tree = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth)
+    tree = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth).tree
     assert set(leaves(tree)) == (combinations(chunks, cuts) if cuts else set())
     assert len(set(zip(tree.parents, tree.tokens, strict=True))) == len(tree)  # no twins
-    own = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth, cross=0.0)
+    own = neighbour_tree(chunks, start, space, nodes=100_000, depth=depth, cross=0.0).tree
     assert set(leaves(own)) == set(leaves(merge(chunks[:, start : start + depth].tolist())))
 
 
@@ -606,7 +606,7 @@ def test_under_the_cap_every_path_is_made_of_whole_groups_of_the_neighbours(
 ) -> None:
     chunks, space = given_
     cuts = list(space.segments(start, chunks.shape[1]))
-    tree = neighbour_tree(chunks, start, space, nodes=nodes, cross=cross)
+    tree = neighbour_tree(chunks, start, space, nodes=nodes, cross=cross).tree
     assert len(tree) <= nodes
     whole = {last - start: n + 1 for n, (_, last, _) in enumerate(cuts)}
     for path in leaves(tree):
@@ -615,8 +615,8 @@ def test_under_the_cap_every_path_is_made_of_whole_groups_of_the_neighbours(
 
 def test_the_nearest_neighbours_chunk_comes_first() -> None:
     chunks = np.random.default_rng(0).integers(0, 255, (5, 16))
-    assert leaves(neighbour_tree(chunks, 1, SPACE, nodes=15)) == [tuple(chunks[0, 1:])]
-    more = leaves(neighbour_tree(chunks, 1, SPACE, nodes=30))
+    assert leaves(neighbour_tree(chunks, 1, SPACE, nodes=15).tree) == [tuple(chunks[0, 1:])]
+    more = leaves(neighbour_tree(chunks, 1, SPACE, nodes=30).tree)
     assert {tuple(chunks[0, 1:]), tuple(chunks[1, 1:])} <= set(more)
     assert len(neighbour_tree(chunks, 16, SPACE)) == 0
     assert len(neighbour_tree(chunks[:0], 0, SPACE)) == 0
@@ -672,7 +672,7 @@ def test_a_limited_tree_holds_the_most_probable_groups(
     m = drops[min(int(where * len(drops)), len(drops) - 1)]
     kept = [path for _, path in paths[:m]]
     prefixes = {path[:n] for path in kept for n in range(1, len(path) + 1)}
-    tree = neighbour_tree(chunks, start, space, len(prefixes), depth, cross)
+    tree = neighbour_tree(chunks, start, space, len(prefixes), depth, cross).tree
     assert {tuple(tree.tokens[i] for i in tree.path_to(n)) for n in range(len(tree))} == prefixes
 
 
@@ -681,7 +681,7 @@ def test_of_equally_probable_groups_the_better_neighbours_comes_first() -> None:
     went another way, gave the 8 before."""
     grippers = [8, 9, 8, 8, 8, 8]
     chunks = np.array([[i in (1, 2, 5)] * 3 + [gripper] for i, gripper in enumerate(grippers)], dtype=np.int64)
-    tree = neighbour_tree(chunks, 0, SPACE, cross=0.0)
+    tree = neighbour_tree(chunks, 0, SPACE, cross=0.0).tree
     assert [path[-1] for path in leaves(tree) if path[0] == 1] == [9, 8]
     assert list(tree.tokens) == [0, 0, 0, 8, 1, 1, 1, 9, 8]
     assert list(tree.parents) == [ROOT, 0, 1, 2, ROOT, 4, 5, 6, 6]
@@ -703,5 +703,5 @@ def test_the_most_probable_groups_are_kept_worked_out_by_hand(
     """The neighbours weigh 1, 1/2, 1/3, 1/4: 000 has 1.25 of 2.083 and only 8 behind it; 111 has 0.833, of which 9 has
     1/2 and 7 has 1/3."""
     chunks = np.array([[0, 0, 0, 8], [1, 1, 1, 9], [1, 1, 1, 7], [0, 0, 0, 8]], dtype=np.int64)
-    tree = neighbour_tree(chunks, 0, SPACE, nodes, cross=0.0)
+    tree = neighbour_tree(chunks, 0, SPACE, nodes, cross=0.0).tree
     assert (list(tree.tokens), list(tree.parents)) == (tokens, parents)

@@ -17,8 +17,9 @@ from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.draft import ROOT, Draft
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
-from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
@@ -73,23 +74,19 @@ def plain_greedy(target: Target, prompt: torch.Tensor) -> list[int]:
     return tokens
 
 
-class RandomTrees:
+class RandomTrees(Proposer):
     """Proposes random trees, seeded, with the true continuation hidden in some of them so that drafts are accepted."""
 
     name = "random"
-    needs_states = False
 
     def __init__(self, truth: list[int], seed: int, nodes: int, vocabulary: int = ACTIONS.tokens) -> None:
         self.truth, self.nodes, self.vocabulary = truth, nodes, vocabulary
         self.random = np.random.default_rng(seed)
 
-    def begin(self, chunk: Chunk) -> None:
-        pass
-
     def committed(self, chunk: Chunk, first: int, hidden: torch.Tensor, target_tokens: list[int]) -> None:
         assert hidden.shape[1] == len(chunk.tokens) - first - 1
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         ahead = self.truth[len(chunk.tokens) :]
         tokens: list[int] = []
         parents: list[int] = []
@@ -102,7 +99,7 @@ class RandomTrees:
             tokens.append(ahead[level] if right else int(self.random.integers(self.vocabulary)))
             parents.append(parent)
             depths.append(level)
-        return TokenTree.build(tokens, parents)
+        return Draft.of(tokens, parents)
 
 
 def decode(target: Target, proposer: object, prompt: torch.Tensor) -> Chunk:
@@ -191,8 +188,8 @@ def test_a_perfect_draft_commits_depth_plus_bonus_and_never_overshoots() -> None
     truth = plain_greedy(target, prompt)
 
     class Perfect(RandomTrees):
-        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-            return TokenTree.chain(self.truth[len(chunk.tokens) :][: min(5, depth)])
+        def propose(self, chunk: Chunk, depth: int) -> Draft:
+            return Draft.of(self.truth[len(chunk.tokens) :][: min(5, depth)])
 
     result = decode(target, Perfect(truth, 0, 5), prompt)
     assert result.tokens == truth
@@ -231,8 +228,8 @@ def test_a_perfect_draft_in_the_prefill_takes_one_forward() -> None:
     truth = plain_greedy(target, prompt)
 
     class Whole(RandomTrees):
-        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-            return TokenTree.chain(self.truth[:depth])
+        def propose(self, chunk: Chunk, depth: int) -> Draft:
+            return Draft.of(self.truth[:depth])
 
     result = Decoder(target, Parts(prefill_draft=Whole(truth, 0, 16))).decode_prompt(prompt)
     assert result.tokens == truth

@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_decoding_lossless import random_prompt, random_target
 
-from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.engine.draft import ROOT, TokenTree
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DraftState, draft_tree, observe
 from kerv_cli.targets.compact.target import CompactTarget
@@ -24,9 +24,7 @@ def drafted(seed: int, depth: int, top_k: int, nodes: int) -> tuple[Drafter, Com
     state = DraftState(drafter.new_cache(1, prompt.shape[1] + 64), torch.empty(0))
     following = torch.cat([prompt[:, 1:], target.embed(torch.tensor([[7]]))], 1)
     observe(drafter, state, following, hidden, 0)
-    found = draft_tree(drafter, target, state, depth, top_k, nodes)
-    tree = found if isinstance(found, TokenTree) else found.assemble(found.numbers.numpy())[0]
-    return drafter, target, state, tree
+    return drafter, target, state, draft_tree(drafter, target, state, depth, top_k, nodes).tree
 
 
 def along(drafter: Drafter, target: CompactTarget, state: DraftState, tokens: list[int]) -> torch.Tensor:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.tree import ROOT, TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.engine.draft import ROOT, Draft
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact import kernels
@@ -72,9 +72,9 @@ def both_targets(
     return plain, packed
 
 
-def random_tree(random: np.random.Generator, nodes: int) -> TokenTree:
+def random_tree(random: np.random.Generator, nodes: int) -> Draft:
     parents = [int(random.integers(ROOT, i)) for i in range(nodes)]
-    return TokenTree.build(random.integers(0, ACTIONS.tokens, nodes).tolist(), parents)
+    return Draft.of(random.integers(0, ACTIONS.tokens, nodes).tolist(), parents)
 
 
 def close(a: torch.Tensor, b: torch.Tensor) -> bool:
@@ -104,16 +104,16 @@ def test_the_packed_trunk_is_the_trunk(
             cache = trunk.new_cache(1, prompt + nodes + 3)
             seen = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
             drafted = x[:, prompt : prompt + 1 + nodes]
-            positions = torch.tensor([prompt, *(prompt + 1 + d for d in tree.depths)])
-            seen.append(trunk(drafted, positions, cache, visible_in_verification(tree)))
-            path = tree.path_to(nodes - 1) if nodes else []
+            positions = tree.positions(prompt, 1, x.device)
+            seen.append(trunk(drafted, positions, cache, tree.visible(1)))
+            path = tree.tree.path_to(nodes - 1) if nodes else []
             cache.compact(prompt, torch.tensor([prompt, *(prompt + 1 + i for i in path)]))
             for i in range(2):
                 at = prompt + 1 + len(path) + i
                 seen.append(trunk(x[:, -1 - i][:, None], torch.tensor([at]), cache))
-            whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
+            whole = tree.positions(0, prompt, x.device)
             cache.length = 0
-            seen.append(trunk(x[:, : prompt + nodes], whole, cache, visible_in_prefill(tree, prompt)))
+            seen.append(trunk(x[:, : prompt + nodes], whole, cache, tree.visible(prompt)))
             seen.append(trunk(x[:, :prompt], torch.arange(prompt)))
             outputs.append(seen)
     assert all(close(a, b) for a, b in zip(*outputs, strict=True))

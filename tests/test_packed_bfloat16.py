@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kerv_cli.engine.tree import TokenTree, visible_in_prefill, visible_in_verification
+from kerv_cli.engine.draft import Draft
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.trunk import Trunk
@@ -33,25 +33,25 @@ def trunks() -> tuple[Trunk, Trunk]:
     return exact, packed
 
 
-def run(trunk: Trunk, x: torch.Tensor, tree: TokenTree) -> list[torch.Tensor]:
+def run(trunk: Trunk, x: torch.Tensor, tree: Draft) -> list[torch.Tensor]:
     """A prefill, a tree, its commit, two single tokens, a batch of two; then the tree in the prefill."""
     prompt, x = 20, x.to(trunk.norm.weight.dtype)
     cache = trunk.new_cache(1, 64)
     found = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
-    positions = torch.tensor([prompt, *(prompt + 1 + d for d in tree.depths)])
+    positions = tree.positions(prompt, 1, x.device)
     drafted = x[:, prompt : prompt + 1 + len(tree)]
-    found.append(trunk(drafted, positions, cache, visible_in_verification(tree)))
+    found.append(trunk(drafted, positions, cache, tree.visible(1)))
     cache.compact(prompt, torch.tensor([prompt, prompt + 2, prompt + 4]))
     found += [trunk(x[:, -i][:, None], torch.tensor([prompt + i]), cache) for i in (3, 4)]
     cache.length = 0
-    whole = torch.tensor([*range(prompt), *(prompt + d for d in tree.depths)])
-    found.append(trunk(x[:, : prompt + len(tree)], whole, cache, visible_in_prefill(tree, prompt)))
+    whole = tree.positions(0, prompt, x.device)
+    found.append(trunk(x[:, : prompt + len(tree)], whole, cache, tree.visible(prompt)))
     found.append(trunk(x[:, :10].view(2, 5, -1), torch.arange(5)))
     return found
 
 
 def test_the_packed_trunk_is_the_trunk(trunks: tuple[Trunk, Trunk]) -> None:
-    tree = TokenTree.build(range(6), [-1, -1, 0, 1, 3, 2])
+    tree = Draft.of(range(6), [-1, -1, 0, 1, 3, 2])
     x = torch.randn(1, 32, 128)
     with torch.inference_mode():
         for exact, packed in zip(*(run(trunk, x.bfloat16(), tree) for trunk in trunks), strict=True):

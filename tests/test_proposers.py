@@ -14,9 +14,9 @@ from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.history import ActionHistory
-from kerv_cli.engine.proposer import Stateless
-from kerv_cli.engine.tree import TokenTree
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.early.drafter import EarlyDraft, EarlyProposer
@@ -262,12 +262,12 @@ def test_the_cache_has_room_for_the_largest_tree_a_proposer_names(before: bool) 
     prompt = random_prompt(target, 1)
     truth = plain_greedy(target, prompt)
 
-    class Wide(Stateless):
+    class Wide(Proposer):
         name, nodes = "wide", 200
 
-        def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+        def propose(self, chunk: Chunk, depth: int) -> Draft:
             right = truth[len(chunk.tokens)]
-            return TokenTree.build([*[(right + 1) % 255] * 199, right], [-1] * 200)
+            return Draft.of([*[(right + 1) % 255] * 199, right], [-1] * 200)
 
     parts = Parts(prefill_draft=Wide()) if before else Parts(proposer=Wide())
     result = Decoder(target, parts).decode_prompt(prompt)

@@ -16,8 +16,8 @@ from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.engine.acceptance import Acceptance, Strict, accept_by_distance, accept_by_group
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.proposer import Stateless
-from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.engine.draft import ROOT, Draft, TokenTree
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -100,7 +100,7 @@ def test_no_limits_on_single_dofs_is_acceptance_by_distance(tree: TokenTree, dat
 
 def judge(tokens: list[int], start: int = 0, wanted: int = 100) -> int:
     """Accepted length of a chain whose target tokens are all `wanted`."""
-    tree = TokenTree.chain(tokens)
+    tree = TokenTree.build(tokens)
     found = accept_by_group(
         tree, [wanted] * (len(tokens) + 1), start, LIMITS, group_limit=30, bounds=POSITION_GRIPPER.bounds
     )
@@ -152,8 +152,8 @@ def test_the_settings_become_the_rule() -> None:
     chosen = rule("sequence", group_limit=20, token_limit=9)
     assert chosen.limits(3) == (9, 9, 9, 0)
     assert rule("sequence", SEVEN, token_limit=9).limits(3) == (9, 9, 9, 9, 9, 9, 0)
-    assert chosen.judge(TokenTree.chain([107, 107, 106, 100]), [100] * 5, 0, 3).path == (0, 1, 2, 3)
-    assert chosen.judge(TokenTree.chain([107, 107, 107, 100]), [100] * 5, 0, 3).path == ()
+    assert chosen.judge(TokenTree.build([107, 107, 106, 100]), [100] * 5, 0, 3).path == (0, 1, 2, 3)
+    assert chosen.judge(TokenTree.build([107, 107, 107, 100]), [100] * 5, 0, 3).path == ()
     assert rule("relaxed", strict_dofs=False).limits(3) == (3, 3, 3, 3)
     assert rule("relaxed").limits(3) == (3, 3, 3, 0)
     assert rule("relaxed", SEVEN).limits(3) == (3, 3, 3, 3, 3, 3, 0)
@@ -170,7 +170,7 @@ def test_every_strict_dof_must_match_wherever_it_stands() -> None:
 def test_hybrid_judges_retrieved_drafts_by_group_and_all_others_by_distance() -> None:
     chosen = rule("hybrid", group_limit=20, token_limit=9, strict_dofs=False)
     retrieved, drafted = chosen.of_drafts_from("retrieval"), chosen.of_drafts_from("drafter")
-    tree = TokenTree.chain([107, 107, 107, 100])
+    tree = TokenTree.build([107, 107, 107, 100])
     assert (retrieved.limits(8), retrieved.judge(tree, [100] * 5, 0, 8).path) == ((9, 9, 9, 0), ())
     assert (drafted.limits(8), drafted.judge(tree, [100] * 5, 0, 8).path) == ((8, 8, 8, 8), (0, 1, 2, 3))
     for kind in ("strict", "relaxed", "sequence"):
@@ -197,7 +197,7 @@ def test_segments_cut_a_stretch_of_the_chunk_at_the_groups(space: ActionSpace, s
     assert [strict for _, _, strict in cut] == [name[g[0] % dofs] == len(space.groups) - 1 for g in expected]
 
 
-class Shifted(Stateless):
+class Shifted(Proposer):
     """Drafts AR's own chunk, shifted by a few bins, so that whole groups are accepted and rejected."""
 
     name = "shifted"
@@ -205,9 +205,9 @@ class Shifted(Stateless):
     def __init__(self, truth: list[int], seed: int) -> None:
         self.truth, self.rng = truth, np.random.default_rng(seed)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         ahead = np.array(self.truth[len(chunk.tokens) :][:depth])
-        return TokenTree.chain([int(t) for t in np.clip(ahead + self.rng.integers(-1, 2, len(ahead)), 0, 254)])
+        return Draft.of([int(t) for t in np.clip(ahead + self.rng.integers(-1, 2, len(ahead)), 0, 254)])
 
 
 def test_in_the_loop_paths_end_with_groups_and_a_begun_group_has_one_verdict() -> None:

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.engine.acceptance import accept_by_distance
 from kerv_cli.engine.attention import attention_mask
-from kerv_cli.engine.tree import ROOT, TokenTree, merge, visible_in_prefill, visible_in_verification
-from kerv_cli.engine.unread import ancestors
+from kerv_cli.engine.draft import ROOT, Draft, TokenTree, ancestors_of, ancestors_on_device, merge
 from kerv_cli.methods.merged.proposer import rows_of
 from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.trunk import Trunk
@@ -24,6 +23,12 @@ def trees(draw: st.DrawFn, most: int = 12, vocabulary: int = 12) -> TokenTree:
     n = draw(st.integers(0, most))
     parents = [draw(st.integers(-1, i - 1)) for i in range(n)]
     return TokenTree.build([draw(st.integers(0, vocabulary - 1)) for _ in range(n)], parents)
+
+
+def visible(tree: TokenTree, before: int) -> np.ndarray:
+    """Who sees whom; a chain behind causal tokens, of which a draft says nothing, is causal."""
+    seen = Draft.of(tree.tokens, tree.parents).visible(before)
+    return np.tri(before + len(tree), dtype=bool) if seen is None else np.asarray(seen)
 
 
 def reachable(tree: TokenTree) -> np.ndarray:
@@ -39,19 +44,19 @@ def reachable(tree: TokenTree) -> np.ndarray:
 
 @given(trees())
 def test_ancestors_are_the_transitive_closure_of_parents(tree: TokenTree) -> None:
-    assert (tree.ancestors() == reachable(tree)).all()
-    assert tree.depths == tuple(int(row.sum()) - 1 for row in tree.ancestors())
+    assert (ancestors_of(tree.parents) == reachable(tree)).all()
+    assert tree.depths == tuple(int(row.sum()) - 1 for row in ancestors_of(tree.parents))
 
 
 @given(trees(), st.integers(0, 6))
 def test_a_node_sees_what_stands_before_its_ancestors_and_itself(tree: TokenTree, prompt: int) -> None:
-    seen, n = visible_in_prefill(tree, prompt), len(tree)
+    seen, n = visible(tree, prompt), len(tree)
     assert (seen.dtype, seen.shape) == (np.dtype(bool), (prompt + n, prompt + n))
     assert (seen[:prompt, :prompt] == np.tri(prompt, dtype=bool)).all()
     assert not seen[:prompt, prompt:].any()
     assert seen[prompt:, :prompt].all()
     assert (seen[prompt:, prompt:] == reachable(tree)).all()
-    verified = visible_in_verification(tree)
+    verified = visible(tree, 1)
     assert verified.shape == (1 + n, 1 + n)
     assert verified[:, 0].all()
     assert not verified[0, 1:].any()
@@ -66,7 +71,7 @@ def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(
     cache = Cache(1, 1, 1, 40, 1, like, fixed)
     cache.length = cached
     n = len(tree)
-    mask = attention_mask(visible_in_prefill(tree, before), before + n, cache, like)
+    mask = attention_mask(visible(tree, before), before + n, cache, like)
     if mask is None:
         assert before + n == 1
         assert not fixed
@@ -156,8 +161,9 @@ def test_tree_forward_equals_forwarding_every_path_alone() -> None:
     with torch.inference_mode():
         cache = trunk.new_cache(1, 16)
         trunk(prefix, torch.arange(5), cache)
-        positions = torch.tensor([5, *(6 + d for d in tree.depths)])
-        together = trunk(torch.cat([root, nodes], 1), positions, cache, visible_in_verification(tree))
+        positions = Draft.of(tree.tokens, tree.parents).positions(5, 1, prefix.device)
+        assert positions.tolist() == [5, *(6 + d for d in tree.depths)]
+        together = trunk(torch.cat([root, nodes], 1), positions, cache, visible(tree, 1))
         for node in range(4):
             alone = torch.cat([prefix, root, nodes[:, tree.path_to(node)]], 1)
             expected = trunk(alone, torch.arange(alone.shape[1]))[0, -1]
@@ -179,5 +185,5 @@ def test_a_merged_trees_nodes_have_their_chains_rows(data: st.DataObject, keep: 
 def test_ancestors_of_tensors_are_those_of_the_tree(data: st.DataObject, n: int) -> None:
     parents = [data.draw(st.integers(ROOT, i - 1)) for i in range(n)]
     tree = TokenTree.build([0] * n, parents)
-    found = ancestors(torch.tensor(parents), max(tree.depths) + 1)
-    assert (found.numpy() == tree.ancestors()).all()
+    found = ancestors_on_device(torch.tensor(parents), max(tree.depths) + 1)
+    assert (found.numpy() == ancestors_of(parents)).all()

@@ -17,10 +17,10 @@ from kerv_cli.bench.machine import Machine, measure_machine
 from kerv_cli.bench.model import Model, Sizes, blank
 from kerv_cli.engine.chunk import Chunk, Clock
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.draft import ROOT, Draft
 from kerv_cli.engine.parts import Fixed
-from kerv_cli.engine.proposer import Stateless
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.record import Round
-from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.lab.policy import decoder_for
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.spec_vla.rules import Relaxed
@@ -92,7 +92,7 @@ class Laps(Clock):
         return seconds
 
 
-class Dummy(Stateless):
+class Dummy(Proposer):
     """Drafts so many nodes: a chain, and where that has no room for them further children of the root. tokens: of the
     chain, by their index in the chunk; None: any."""
 
@@ -101,11 +101,11 @@ class Dummy(Stateless):
     def __init__(self, nodes: int, tokens: Sequence[int] | None = None) -> None:
         self.nodes, self.tokens = nodes, tokens
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         """As `Proposer.propose`."""
         first, chain = len(chunk.tokens), min(self.nodes, depth)
         tokens = range(self.nodes) if self.tokens is None else self.tokens[first : first + self.nodes]
-        return TokenTree.build(tokens, [*range(-1, chain - 1), *[ROOT] * (len(tokens) - chain)])
+        return Draft.of(tokens, [*range(-1, chain - 1), *[ROOT] * (len(tokens) - chain)])
 
 
 def decoders(model: Model) -> list[Decoder]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.tree import ROOT, TokenTree
+from kerv_cli.engine.draft import ROOT, TokenTree
 
 Bounds = Sequence[tuple[int, int]]
 """Per DoF: the first DoF of its kinematic group, and one past the last (`ActionSpace.bounds`)."""

@@ -13,14 +13,13 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.acceptance import Acceptance, Strict
 from kerv_cli.engine.chunk import Chunk, Clock, Rejection, Situation, steps_of
+from kerv_cli.engine.draft import EMPTY, Draft, TokenTree
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold, Watches
-from kerv_cli.engine.proposer import Asks, Proposer
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Look, Round
 from kerv_cli.engine.transfer import read, upload
-from kerv_cli.engine.tree import EMPTY, TokenTree, visible_in_prefill
-from kerv_cli.engine.unread import Unread
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class Verified:
-    """A forward's draft and target tokens, on the host. tree: of n nodes. rows: (n,) the forwarded row of each.
+    """What a forward verified, on the host. tree: of n nodes. rows: (n,) the row of each among those forwarded.
     target_tokens: 1 + n, as `accept_by_distance` takes them."""
 
     tree: TokenTree
@@ -195,18 +194,16 @@ class Decoder:
     def prefill(self, chunk: Chunk, clock: Clock) -> None:
         """The first forward: the prompt and, where there is an in-prefill draft, the draft behind it, to verify it."""
         target, parts = self.target, self.parts
-        draft: TokenTree | Unread = EMPTY
+        draft = EMPTY
         if parts.prefill_draft is not None and chunk.size > 1:
             # one token less than the chunk has, as in a round: the bonus is its last token
             draft = parts.prefill_draft.propose(chunk, chunk.size - 1)
             clock.lap("propose")
-        if parts.proposer is not None and chunk.size > 1 and isinstance(parts.proposer, Asks):
-            parts.proposer.ask(chunk)
-        x = prompt = chunk.prompt
-        length = chunk.prompt_length
+        if parts.proposer is not None and chunk.size > 1:
+            parts.proposer.prepare(chunk)
+        x, length = chunk.prompt, chunk.prompt_length
         if len(draft):
-            tokens = draft.tokens if isinstance(draft, Unread) else upload(draft.tokens, prompt.device)
-            x = torch.cat([prompt, target.embed(tokens[None])], 1)
+            x = torch.cat([x, target.embed(draft.tokens_on(x.device)[None])], 1)
         chunk.cache.length = 0
         hidden = self.forward(x, draft, 0, length, chunk)
         chunk.hidden = hidden
@@ -225,8 +222,7 @@ class Decoder:
 
     def round(self, chunk: Chunk, clock: Clock) -> None:
         """One round: propose, verify, accept, commit, rectify. Without a draft the forward decodes one token."""
-        draft: TokenTree | Unread = EMPTY
-        proposer = self.parts.proposer
+        draft, proposer = EMPTY, self.parts.proposer
         if proposer is not None and chunk.left > 1:
             # one token less than the chunk lacks: the bonus is its last token whether or not everything is accepted
             draft = proposer.propose(chunk, chunk.left - 1)
@@ -258,48 +254,37 @@ class Decoder:
         numbers = torch.cat(tokens[1:]).tolist()
         clock.lap("verify")
         for token in numbers:
-            self.accept(chunk, EMPTY, [token], None)
+            self.accept(chunk, EMPTY.tree, [token], None)
         clock.lap("accept")
 
-    def verify(self, chunk: Chunk, draft: TokenTree | Unread) -> tuple[Tensor, Verified]:
+    def verify(self, chunk: Chunk, draft: Draft) -> tuple[Tensor, Verified]:
         """Forwards the last committed token and the draft's n rows -> hidden (1, 1 + n, E), and the draft with its
         target tokens on the host."""
-        device, last = self.target.device, chunk.tokens[-1]
+        tokens = upload(chunk.tokens[-1:], self.target.device)
+        if len(draft):
+            tokens = torch.cat([tokens, draft.tokens_on(tokens.device)])
         at = chunk.prompt_length + len(chunk.tokens) - 1
-        if isinstance(draft, Unread):
-            tokens = torch.cat([torch.full_like(draft.tokens[:1], last), draft.tokens])
-        else:
-            tokens = upload([last, *draft.tokens], device)
         hidden = self.forward(self.target.embed(tokens[None]), draft, at, 1, chunk)
         return hidden, self.read(chunk, draft, self.target.head(hidden)[0].argmax(-1))
 
-    def forward(self, x: Tensor, draft: TokenTree | Unread, start: int, before: int, chunk: Chunk) -> Tensor:
+    def forward(self, x: Tensor, draft: Draft, start: int, before: int, chunk: Chunk) -> Tensor:
         """x (1, before + n, E): tokens from position `start` on, and a draft behind them -> hidden states."""
-        stop, device, seen = start + before, x.device, None
-        if isinstance(draft, Unread):
-            positions, seen = draft.positions(start, before), draft.seen(before)
-        elif draft.is_chain:
-            positions = torch.arange(start, stop + len(draft), device=device)
-        else:
-            positions = upload([*range(start, stop), *(stop + depth for depth in draft.depths)], device)
-            seen = visible_in_prefill(draft, before)
-        return self.target.forward(x, positions, chunk.cache, seen)
+        return self.target.forward(x, draft.positions(start, before, x.device), chunk.cache, draft.visible(before))
 
-    def read(self, chunk: Chunk, draft: TokenTree | Unread, argmax: Tensor) -> Verified:
+    def read(self, chunk: Chunk, draft: Draft, argmax: Tensor) -> Verified:
         """argmax (1 + n,) behind the last token before the draft and behind each of its rows -> the tree and its target
         tokens. A round waits for the device nowhere else."""
+        remote = draft.remote
         reads, chunk.reads = chunk.reads, []
-        if isinstance(draft, TokenTree) and not reads:
-            return Verified(draft, range(len(draft)), argmax.tolist())
-        drafts = [draft.numbers] if isinstance(draft, Unread) else []
-        targets, *vectors = read(argmax, *drafts, *(tensor for tensor, _ in reads))
-        for (_, receive), vector in zip(reads, vectors[len(drafts) :], strict=True):
+        targets, *vectors = read(argmax, *remote, *(tensor for tensor, _ in reads))
+        for (_, receive), vector in zip(reads, vectors[len(remote) :], strict=True):
             receive(vector)
         tokens = targets.astype(np.int64).tolist()
-        if isinstance(draft, TokenTree):
-            return Verified(draft, range(len(draft)), tokens)
-        tree, rows = draft.assemble(vectors[0])
-        return Verified(tree, rows, [tokens[0], *(tokens[1 + row] for row in rows)])
+        if draft.choose is not None:
+            tree, rows = draft.choose()
+            return Verified(tree, rows, [tokens[0], *(tokens[1 + row] for row in rows)])
+        numbers = (vector.astype(np.int64).tolist() for vector in vectors[: len(remote)])
+        return Verified(TokenTree.build(*numbers) if remote else draft.tree, range(len(draft)), tokens)
 
     def keep(self, chunk: Chunk, hidden: Tensor, start: int, before: int, rows: list[int]) -> Tensor:
         """Commits the cache's entries of a forward that began at slot `start`: `before` tokens and the draft's `rows`

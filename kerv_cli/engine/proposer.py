@@ -1,53 +1,36 @@
-"""What drafts: the protocols of proposers, and the bases of those that need little (docs/extending.md)."""
+"""What drafts: the base of proposers, and that of those that draft whole chunks (docs/extending.md)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.tree import EMPTY, TokenTree
-from kerv_cli.engine.unread import Unread
+from kerv_cli.engine.draft import EMPTY, Draft
 
 
-class DraftsChunks(Protocol):
-    """A source of merged drafts: drafts whole chunks without the target's hidden states."""
+class Proposer:
+    """Drafts a tree behind the committed tokens.
 
-    @property
-    def name(self) -> str:
-        """Its name in the record, e.g. `early`."""
+    name: in the record, e.g. `drafter`. needs_states: whether it reads the target's hidden states, so that it cannot
+    draft before the prefill. nodes: most rows of its drafts, for which the cache has room; 0: as many as the chunk has
+    tokens.
+    """
 
-    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
-        it has no draft."""
+    name = ""
+    needs_states = False
+    nodes = 0
 
-    def is_sure(self, chunk: Chunk) -> bool:
-        """Whether it expects its first chain to be accepted whole."""
-
-
-class Proposer(Protocol):
-    """Drafts a tree behind the committed tokens."""
-
-    @property
-    def name(self) -> str:
-        """Its name in the record, e.g. `drafter`."""
-
-    @property
-    def needs_states(self) -> bool:
-        """Whether it reads the target's hidden states, so that it cannot draft before the prefill."""
-
-    @property
-    def nodes(self) -> int:
-        """Most nodes of its trees, for which the cache has room; 0: as many as the chunk has tokens."""
+    def prepare(self, chunk: Chunk) -> None:
+        """Called before the prefill; adds the vectors that it needs on the host to `chunk.reads`."""
 
     def begin(self, chunk: Chunk) -> None:
         """Called once per chunk, when the prompt is encoded and the first tokens are committed."""
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
-        """A tree of depth ≤ `depth`; an empty one where it has no draft. One that lies on the device is read together
-        with the target's tokens."""
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """A draft of at most `depth` levels; an empty one where it has none."""
+        raise NotImplementedError
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Tokens were committed behind chunk index `first`, the last token before them; hidden (1, T, E) are the
@@ -55,40 +38,19 @@ class Proposer(Protocol):
         behind rejected nodes included."""
 
 
-@runtime_checkable
-class Asks(Protocol):
-    """A proposer that needs numbers of the encoded prompt on the host."""
+class ChainProposer(Proposer):
+    """Drafts whole chunks without the target's hidden states: a source of merged drafts and of unverified chunks."""
 
-    def ask(self, chunk: Chunk) -> None:
-        """Called before the prefill: adds to `chunk.reads` the vectors to be read with its tokens."""
-
-
-class Stateless:
-    """Base of proposers that need no hidden states and keep no state between rounds."""
-
-    name = ""
-    needs_states = False
-    nodes = 0
-
-    def begin(self, chunk: Chunk) -> None:
-        """Nothing to prepare."""
-
-    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Nothing to remember."""
-
-    def is_sure(self, chunk: Chunk) -> bool:
-        """Never."""
-        return False
-
-
-class ChainProposer(Stateless):
-    """A proposer whose draft is one chain of the chunk's remaining tokens."""
-
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
-        """The first chain as a tree; empty where there is none."""
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """The first chain; an empty draft where there is none."""
         chains = self.chains(chunk, depth)
-        return TokenTree.chain(chains[0]) if chains else EMPTY
+        return Draft.of(chains[0]) if chains else EMPTY
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """At most one chain of at most `depth` tokens."""
+        """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
+        it has no draft."""
         raise NotImplementedError
+
+    def is_sure(self, chunk: Chunk) -> bool:
+        """Whether it expects its first chain to be accepted whole."""
+        return False

@@ -10,7 +10,7 @@ from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
-    from kerv_cli.engine.proposer import DraftsChunks
+    from kerv_cli.engine.proposer import ChainProposer
     from kerv_cli.engine.protocol import Cache
     from kerv_cli.methods.context import Context
 
@@ -19,7 +19,7 @@ class AlwaysSkip(Skip):
     """Executes every draft unverified: what a method costs and loses without verification (§6). Where the source has no
     whole chunk yet, the target decodes."""
 
-    def __init__(self, source: DraftsChunks) -> None:
+    def __init__(self, source: ChainProposer) -> None:
         self.source = source
 
     @classmethod

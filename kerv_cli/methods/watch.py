@@ -13,7 +13,7 @@ from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
-    from kerv_cli.engine.proposer import DraftsChunks
+    from kerv_cli.engine.proposer import ChainProposer
     from kerv_cli.methods.context import Context
 
 FARTHEST = 2.0
@@ -39,7 +39,7 @@ def check_source(settings: WatchSettings) -> None:
 class Watch(Skip):
     """Leaves every chunk to the target, and keeps it for as long as the source's own action is near the planned one."""
 
-    def __init__(self, source: DraftsChunks, every: int, tolerance: float) -> None:
+    def __init__(self, source: ChainProposer, every: int, tolerance: float) -> None:
         self.source, self.every, self.tolerance = source, every, tolerance
 
     @classmethod

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from kerv_cli.base.findings import Failed, Finding, run
 from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.protocol import Target
-from kerv_cli.engine.tree import TokenTree, visible_in_prefill, visible_in_verification
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
 """Largest difference of logits relative to their spread, by number format: products are summed in other orders."""
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
-TREE = TokenTree.build([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
+TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
 """The shape of a draft tree; its tokens are drawn anew for every check."""
 
 
@@ -180,16 +180,16 @@ class Trial:
         """Forwards the token at `start` and a tree behind it -> the tree's tokens (1, n), hidden (1, 1 + n, E). before:
         tokens that were forwarded."""
         drafted, at = self.drafted(), self.prompt.shape[1] + before
-        positions = torch.tensor([at, *(at + 1 + depth for depth in TREE.depths)], device=self.prompt.device)
+        positions = TREE.positions(at, 1, self.prompt.device)
         x = self.target.embed(torch.cat([self.tokens[:, start : start + 1], drafted], 1))
-        return drafted, self.target.forward(x, positions, cache, visible_in_verification(TREE))
+        return drafted, self.target.forward(x, positions, cache, TREE.visible(1))
 
     def tree(self) -> str:
         """Every node of a tree equals the last token of its own path, forwarded alone."""
         cache, _ = self.cached([1, 1])
         drafted, hidden = self.grown(cache, 2, 2)
         for node in range(len(TREE)):
-            tokens = torch.cat([self.tokens[:, :3], drafted[:, TREE.path_to(node)]], 1)
+            tokens = torch.cat([self.tokens[:, :3], drafted[:, TREE.tree.path_to(node)]], 1)
             self.same(
                 hidden[:, node + 1], self.plain(tokens)[:, -1], f"node {node} of a tree sees others than its ancestors"
             )
@@ -199,7 +199,7 @@ class Trial:
         """Decoding goes on behind a committed path."""
         cache, _ = self.cached([1, 1])
         drafted, _ = self.grown(cache, 2, 2)
-        path = TREE.path_to(6)
+        path = TREE.tree.path_to(6)
         start = self.prompt.shape[1] + 2
         slots = torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device)
         cache.compact(start, slots)
@@ -214,12 +214,12 @@ class Trial:
     def prefill_draft(self) -> str:
         """Prompt and a tree in one forward, as methods that draft before the prefill do."""
         length, drafted = self.prompt.shape[1], self.drafted()
-        visible = visible_in_prefill(TREE, length)
-        positions = torch.tensor([*range(length), *(length + d for d in TREE.depths)], device=self.prompt.device)
+        visible = TREE.visible(length)
+        positions = TREE.positions(0, length, self.prompt.device)
         x = torch.cat([self.prompt, self.target.embed(drafted)], 1)
         hidden = self.target.forward(x, positions, self.target.new_cache(1, self.capacity), visible)
         for node in (1, 3, 6):
-            expected = self.plain(drafted[:, TREE.path_to(node)])[:, -1]
+            expected = self.plain(drafted[:, TREE.tree.path_to(node)])[:, -1]
             self.same(hidden[:, length + node], expected, f"node {node} of a tree in the prefill")
         return self.says()
 

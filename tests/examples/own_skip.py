@@ -9,12 +9,12 @@ from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
-    from kerv_cli.engine.proposer import DraftsChunks
+    from kerv_cli.engine.proposer import ChainProposer
     from kerv_cli.methods.context import Context
 
 
 class EverySecond(Skip):
-    def __init__(self, source: DraftsChunks) -> None:
+    def __init__(self, source: ChainProposer) -> None:
         self.source, self.trusts = source, False
 
     def begin(self, task: str, seed: int) -> None:

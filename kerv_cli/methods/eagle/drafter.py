@@ -18,11 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.draft import HOST, ROOT, Draft
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Cache as AnyCache
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
-from kerv_cli.engine.tree import ROOT, TokenTree
-from kerv_cli.engine.unread import Unread
 from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle import DrafterSettings
@@ -101,15 +101,13 @@ def observe(drafter: DraftsStates, state: DraftState, following: Tensor, hidden:
     state.hidden = drafter(following, hidden, positions, state.cache)[0, -1]
 
 
-def draft_tree(
-    drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int
-) -> TokenTree | Unread:
+def draft_tree(drafter: DraftsStates, target: Target, state: DraftState, depth: int, top_k: int, nodes: int) -> Draft:
     """EAGLE-2's dynamic tree: expand the top-k nodes of a level by cumulative log-probability, then keep the best
     `nodes` of all. A child is never more probable than its parent, so the best nodes form a tree. It stays on the
-    device, nothing here waits for it; on a CPU, where there is nothing to wait for, a tree is ranked on the host.
+    device, nothing here waits for it.
     """
     if top_k == 1:
-        return Unread.chain(draft_chain(drafter, target, state, min(depth, nodes)))
+        return Draft(draft_chain(drafter, target, state, min(depth, nodes)))
     device = state.hidden.device
     scores = torch.log_softmax(target.head(state.hidden).float(), -1)
     values, tokens = scores.topk(min(top_k, nodes))
@@ -124,7 +122,7 @@ def draft_tree(
     for reached in range(1, depth):
         following = target.embed(tokens[None])
         position = torch.full((width,), first + reached - 1, device=device)
-        hidden = drafter(following, hidden, position, state.cache, seen.numpy() if device.type == "cpu" else seen)
+        hidden = drafter(following, hidden, position, state.cache, seen.numpy() if device == HOST else seen)
         logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
         child_values, child_tokens = (best.flatten() for best in logp.topk(top_k, -1))
         values, flat = child_values.topk(top_k)
@@ -137,11 +135,7 @@ def draft_tree(
         hidden = hidden[:, rows]
         seen = torch.cat([seen[rows], itself[:top_k, :top_k]], 1)
     state.cache.length = base
-    children = torch.cat(every), torch.cat(parents), torch.cat(cumulative)
-    if device.type == "cpu":
-        every_token, every_parent, every_score = (numbers.tolist() for numbers in children)
-        return _best_of(every_token, every_parent, every_score, nodes)
-    return _keep_best(*children, nodes, depth)
+    return _best(torch.cat(every), torch.cat(parents), torch.cat(cumulative), nodes, depth)
 
 
 def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth: int) -> Tensor:
@@ -159,22 +153,15 @@ def draft_chain(drafter: DraftsStates, target: Target, state: DraftState, depth:
     return torch.cat(drafted)
 
 
-def _best_of(tokens: list[int], parents: list[int], scores: list[float], nodes: int) -> TokenTree:
-    # sorted is stable and children stand behind their parents: on equal scores the parent is kept first
-    best = sorted(sorted(range(len(tokens)), key=lambda i: -scores[i])[:nodes])
-    index = {old: new for new, old in enumerate(best)} | {ROOT: ROOT}
-    return TokenTree.build([tokens[i] for i in best], [index[parents[i]] for i in best])
-
-
-def _keep_best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Unread:
-    # as `_best_of`, on the device
+def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Draft:
+    # the sort is stable and children stand behind their parents: on equal scores the parent is kept first
     best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
     index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # its last entry is the root's
     index[best] = torch.arange(best.shape[0], device=tokens.device)
-    return Unread.tree(tokens[best], index[parents[best]], depth)
+    return Draft(tokens[best], index[parents[best]], depth)
 
 
-class DrafterProposer:
+class DrafterProposer(Proposer):
     """EAGLE-style drafter with a dynamic tree (docs/methods.md §2.2)."""
 
     name = "drafter"
@@ -197,7 +184,7 @@ class DrafterProposer:
         following = torch.cat([chunk.prompt[:, 1:], self.embed(chunk.tokens)], 1)
         observe(self.drafter, self.state, following, chunk.hidden, 0)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         """A chain or dynamic tree of the settings' size."""
         return draft_tree(self.drafter, self.target, self.state, min(self.depth, depth), self.top_k, self.nodes)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,10 @@ from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read, upload
-from kerv_cli.engine.tree import TokenTree
-from kerv_cli.engine.unread import TreeRows, Unread
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early import EarlySettings
@@ -251,29 +251,22 @@ class EarlyProposer(ChainProposer):
         return self.features(chunk), chunk.situation.history.values(), max(chunk.limits, default=0)
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
-        """The draft on the device, (N + 1,) as `EarlyDrafter.on_device`; None where the host has it. Who
-        reads the vector hands it to `take`."""
+        """The draft on the device, (N + 1,) as `EarlyDrafter.on_device`; None where the host has it."""
         if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
             return None
         return self.early.on_device(*self._inputs(chunk))
 
-    def take(self, chunk: Chunk, numbers: np.ndarray) -> None:
-        """Takes the vector of `on_device`, read by the host."""
+    def receive(self, chunk: Chunk, numbers: np.ndarray) -> None:
+        """The host has read the vector of `on_device`."""
         self._drafted = chunk, EarlyDraft.of(numbers)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The drafted chain."""
-        numbers = self.on_device(chunk)
+        numbers, start = self.on_device(chunk), len(chunk.tokens)
         if numbers is None:
             return super().propose(chunk, depth)
-        start = len(chunk.tokens)
-
-        def assemble(vector: np.ndarray) -> TreeRows:
-            self.take(chunk, vector)
-            tree = TokenTree.chain(self.chains(chunk, depth)[0])
-            return tree, range(len(tree))
-
-        return Unread(numbers[start : min(chunk.size, start + depth)].long(), numbers, assemble)
+        chunk.reads.append((numbers, partial(self.receive, chunk)))
+        return Draft(numbers[start : min(chunk.size, start + depth)].long())
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """The drafted tokens behind the committed ones."""

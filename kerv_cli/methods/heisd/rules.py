@@ -10,10 +10,9 @@ from torch import Tensor
 from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.acceptance import Acceptance, Accepted, Strict, accept_by_group
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.draft import Draft, TokenTree
 from kerv_cli.engine.parts import Skip
-from kerv_cli.engine.proposer import Asks, Proposer
-from kerv_cli.engine.tree import TokenTree
-from kerv_cli.engine.unread import Unread
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.heisd import (
@@ -26,40 +25,35 @@ from kerv_cli.methods.retrieval.datastore import RetrievalProposer
 from kerv_cli.methods.spec_vla.rules import Relaxed
 
 
-class HybridProposer:
-    """HeiSD: retrieval on one side of the boundary, the drafter on the other (docs/methods.md §4.4)."""
+class HybridProposer(Proposer):
+    """HeiSD: retrieval on one side of the boundary, the drafter on the other (docs/methods.md §4.4). name: of the side
+    that drafts this chunk."""
 
     needs_states = True
 
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
         self.sides: dict[str, Proposer] = {"drafter": drafter, "retrieval": retrieval}
         self.nodes = max(drafter.nodes, retrieval.nodes)
-        self.side = drafter
+        self.side, self.name = drafter, drafter.name
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
         """proposer=hybrid."""
         return cls(DrafterProposer.build(settings, context), RetrievalProposer.build(settings, context))
 
-    @property
-    def name(self) -> str:
-        """Name of the side that drafts this chunk."""
-        return self.side.name
-
-    def begin(self, chunk: Chunk) -> None:
+    def prepare(self, chunk: Chunk) -> None:
         """Takes the side that the boundary chose for this chunk."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.side = self.sides[chunk.choice.mode]
+        self.name = self.side.name
+        self.side.prepare(chunk)
+
+    def begin(self, chunk: Chunk) -> None:
+        """Tells the side that drafts."""
         self.side.begin(chunk)
 
-    def ask(self, chunk: Chunk) -> None:
-        """Before the prefill: adds what the boundary's side has to read to `chunk.reads`."""
-        side = self.sides[chunk.choice.mode] if chunk.choice is not None else None
-        if isinstance(side, Asks):
-            side.ask(chunk)
-
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
-        """The tree of the boundary's side."""
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """The draft of the boundary's side."""
         return self.side.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:

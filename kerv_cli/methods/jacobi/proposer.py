@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.tree import TokenTree
+from kerv_cli.engine.draft import Draft
+from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.jacobi import JacobiProposerSettings
 
 
-class JacobiProposer:
+class JacobiProposer(Proposer):
     """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
 
     With strict acceptance the fixed point is AR's chunk. The first guess is the target tokens that the in-prefill
@@ -20,8 +21,6 @@ class JacobiProposer:
     """
 
     name = "jacobi"
-    needs_states = False
-    nodes = 0
 
     def __init__(self, depth: int = 0) -> None:
         self.depth = depth
@@ -37,9 +36,9 @@ class JacobiProposer:
         tokens = chunk.rejection.target[: chunk.left]
         self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.left - len(tokens))]
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The present guess as a chain."""
-        return TokenTree.chain(self.guess[: min(depth, self.depth or depth)])
+        return Draft.of(self.guess[: min(depth, self.depth or depth)])
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """The next guess: this round's target tokens behind the committed ones, then the old guess."""

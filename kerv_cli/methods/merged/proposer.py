@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.proposer import DraftsChunks, Stateless
+from kerv_cli.engine.draft import ROOT, Draft, TokenTree, merge
+from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.transfer import read, upload
-from kerv_cli.engine.tree import ROOT, TokenTree, merge
-from kerv_cli.engine.unread import TreeRows, Unread
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.retrieval import RetrievalProposerSettings
 
 
-class MergedProposer(Stateless):
+class MergedProposer(Proposer):
     """Merges the chains of several sources into one prefix tree (docs/methods.md §5). At most `nodes` nodes: the last
     chains are dropped first.
 
     fallback: sources that draft only where none of the others is sure of its chunk, because every node costs time.
     """
 
-    def __init__(self, sources: Sequence[DraftsChunks], nodes: int, fallback: Sequence[DraftsChunks] = ()) -> None:
+    def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
         every = [*sources, *fallback]
         self.name = every[0].name if len(every) == 1 else "merged"
         self.sources, self.fallback, self.nodes = sources, fallback, nodes
@@ -36,20 +35,24 @@ class MergedProposer(Stateless):
     def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
         """proposer=merged."""
 
-        def source(name: str) -> DraftsChunks:
+        def source(name: str) -> ChainProposer:
             part = find("proposer", name)
             source_settings: Any = part.default
             if isinstance(source_settings, RetrievalProposerSettings):
                 source_settings = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
-            proposer: DraftsChunks = part.built(source_settings, context)
+            proposer: ChainProposer = part.built(source_settings, context)
             return proposer
 
         sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
         return cls(sources, settings.nodes, fallback)
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
-        return self._on_device(chunk, depth) or self._tree(chunk, depth)
+        draft = self._on_device(chunk, depth)
+        if draft is None:
+            tree = self._tree(chunk, depth)
+            draft = Draft.of(tree.tokens, tree.parents)
+        return draft
 
     def _tree(self, chunk: Chunk, depth: int) -> TokenTree:
         sources = list(self.sources)
@@ -59,38 +62,37 @@ class MergedProposer(Stateless):
         tree = merge(chains)
         while len(tree) > self.nodes:
             if len(chains) == 1:
-                return TokenTree.chain(chains[0][: self.nodes])
+                return TokenTree.build(chains[0][: self.nodes])
             del chains[-1]
             tree = merge(chains)
         return tree
 
-    def _on_device(self, chunk: Chunk, depth: int) -> Unread | None:
+    def _on_device(self, chunk: Chunk, depth: int) -> Draft | None:
         """The early draft on the device with the chains of all other sources behind it; the host decides which of them
-        become nodes when it reads the draft. None where the early draft is on the host, or the rows have no room."""
+        become nodes when it has read the draft. None where the early draft is on the host, or the rows have no room."""
         early = next((source for source in self.sources if isinstance(source, EarlyProposer)), None)
         if early is None or (numbers := early.on_device(chunk)) is None:
             return None
-        start, device = len(chunk.tokens), numbers.device
+        start = len(chunk.tokens)
         draft = numbers[start : min(chunk.size, start + depth)].long()
         others = [s for s in (*self.sources, *self.fallback) if s is not early]
         chains = [chain for source in others for chain in source.chains(chunk, depth) if chain]
         lengths = [draft.shape[0], *(len(chain) for chain in chains)]
+        if sum(lengths) > max(self.nodes, chunk.size):
+            early.receive(chunk, read(numbers)[0])
+            return None
 
-        def assemble(vector: np.ndarray) -> TreeRows:
-            early.take(chunk, vector)
+        def choose() -> tuple[TokenTree, list[int]]:
             tree = self._tree(chunk, depth)
             return tree, rows_of(tree, [early.chains(chunk, depth)[0], *chains])
 
-        if sum(lengths) > max(self.nodes, chunk.size):
-            early.take(chunk, read(numbers)[0])
-            return None
-        if not chains:
-            return Unread(draft, numbers, assemble)
-        depths = np.concatenate([np.arange(length) for length in lengths])
-        chain_of = np.repeat(np.arange(len(lengths)), lengths)
-        visible = (chain_of[:, None] == chain_of) & (depths[:, None] >= depths)
-        tokens = torch.cat([draft, upload([token for chain in chains for token in chain], device)])
-        return Unread(tokens, numbers, assemble, upload(visible, device), upload(depths, device))
+        chunk.reads.append((numbers, partial(early.receive, chunk)))
+        parents: list[int] = []
+        for length in lengths:
+            parents += [ROOT, *range(len(parents), len(parents) + length - 1)]
+        if chains:
+            draft = torch.cat([draft, upload([token for chain in chains for token in chain], draft.device)])
+        return Draft(draft, torch.tensor(parents), choose=choose)
 
 
 def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
@@ -109,7 +111,7 @@ def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
     return [total + row for row in rows]
 
 
-def first_source(draft: Any) -> DraftsChunks:
+def first_source(draft: Any) -> ChainProposer:
     """What drafts whole chunks before the prefill: an in-prefill draft, of a merged one its first source."""
-    first: DraftsChunks = draft.sources[0] if isinstance(draft, MergedProposer) else draft
+    first: ChainProposer = draft.sources[0] if isinstance(draft, MergedProposer) else draft
     return first

@@ -30,10 +30,10 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.proposer import Stateless
+from kerv_cli.engine.draft import ROOT, Draft
+from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
-from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.retrieval.search import ExactIndex, Index, best
@@ -283,7 +283,7 @@ def neighbour_tree(
     nodes: int = 50,
     depth: int | None = None,
     cross: float = CROSS,
-) -> TokenTree:
+) -> Draft:
     """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
 
     chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
@@ -317,7 +317,7 @@ def neighbour_tree(
                 parents.append(node)
             node = children[node, token]
         offer(node, level + 1, gave, followed, cost)
-    return TokenTree.build(tokens, parents)
+    return Draft.of(tokens, parents)
 
 
 class _Weights(dict[int, float]):
@@ -372,7 +372,7 @@ def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[
     return len(group)
 
 
-class RetrievalProposer(Stateless):
+class RetrievalProposer(ChainProposer):
     """The nearest stored chunks of the task, merged by kinematic group (docs/methods.md §4.2)."""
 
     name = "retrieval"
@@ -399,8 +399,8 @@ class RetrievalProposer(Stateless):
         assert self._nearest is not None
         return self._nearest[1]
 
-    def ask(self, chunk: Chunk) -> None:
-        """Before the prefill: adds the pooled prompt, which the search key is made of, to `chunk.reads`."""
+    def prepare(self, chunk: Chunk) -> None:
+        """Adds the pooled prompt, which the search key is made of, to `chunk.reads`."""
         if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
             vector = self.datastore.pooled(chunk.prompt, self.target)
             chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
@@ -410,7 +410,7 @@ class RetrievalProposer(Stateless):
         self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
         chunk.similarity = float(self._nearest[1].similarity[0])
 
-    def propose(self, chunk: Chunk, depth: int) -> TokenTree:
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The neighbours' chunks as one tree, merged by kinematic group."""
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.loss import chunk_loss, judged_tokens
 from kerv_cli.engine.parts import Skip
-from kerv_cli.engine.proposer import DraftsChunks
+from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.record import STREAK, TRUSTED
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged.proposer import first_source
@@ -18,7 +18,7 @@ class StreakSkip(Skip):
     to `most`; a chunk that does not agree ends it. An episode begins with a verification, or with `opening` unverified
     decodes."""
 
-    def __init__(self, settings: StreakSkipSettings, source: DraftsChunks) -> None:
+    def __init__(self, settings: StreakSkipSettings, source: ChainProposer) -> None:
         self.settings, self.source = settings, source
         self.allowed = 0  # unverified decodes after the last verification
         self.left = 0  # of these, how many are still to come
