@@ -36,12 +36,14 @@ from kerv_cli.training.early_distillation import (
     EarlyRun,
     EarlySamples,
     accepted_tokens,
+    columns_of,
+    evenly,
     measure,
-    observations,
     teach_early,
 )
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.observations import split
+from kerv_cli.training.recorded import observations_of
 from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -273,21 +275,20 @@ def nano(policies: Path) -> CompactTarget:
 
 def test_observations_come_with_what_was_executed_before_them(nano: CompactTarget) -> None:
     demo = episode(10)
-    some = observations(nano, demo, 3, 1.0, 2)
-    assert len(some) == 10
-    assert some.known[:3].tolist() == [[0, 0], [0, 1], [1, 1]]
+    some = columns_of(nano, demo, 3, np.arange(10), 2)
+    assert some["known"][:3].tolist() == [[0, 0], [0, 1], [1, 1]]
     normal = nano.actions.normalise(demo.executed)
     for t in range(2, 10):
-        assert np.allclose(some.history[t], normal[t - 2 : t])
-    assert np.allclose(some.history[1, 1], normal[0])
-    assert torch.equal(some.states, torch.from_numpy(demo.states))
+        assert np.allclose(some["history"][t], normal[t - 2 : t])
+    assert np.allclose(some["history"][1, 1], normal[0])
+    assert some["episodes"].tolist() == [3] * 10
+    states = [one.state for one in observations_of(demo, np.arange(10), OBSERVATION, ())]
+    assert np.array_equal(np.stack(states), demo.states)
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.5, 5), (0.1, 1), (0.34, 4), (1.0, 10)])
-def test_a_share_of_the_observations_is_spread_evenly(nano: CompactTarget, share: float, count: int) -> None:
-    demo = episode(10)
-    some = observations(nano, demo, 0, share, 0)
-    where = [int(np.flatnonzero((demo.states == s).all(1))[0]) for s in some.states.numpy()]
+def test_a_share_of_the_observations_is_spread_evenly(share: float, count: int) -> None:
+    where = evenly(np.arange(10), share).tolist()
     assert len(where) == count
     assert where[0] == 0
     assert np.ptp(np.diff([*where, 10])) <= 1

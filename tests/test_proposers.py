@@ -160,15 +160,15 @@ def test_merging_drops_what_is_named_last_and_cuts_the_last_branch() -> None:
 
     one, two = Fixed("one", [[1, 2, 3], [1, 5, 6]]), Fixed("two", [[9, 9, 9]])
     chunk: Any = None
-    assert MergedProposer([one, two], 8).propose(chunk, 3).tokens == (1, 2, 3, 5, 6, 9, 9, 9)
-    assert MergedProposer([one, two], 7).propose(chunk, 3).tokens == (1, 2, 3, 5, 6)
-    assert MergedProposer([two, one], 2).propose(chunk, 3).tokens == (9, 9)
+    assert MergedProposer([one, two], 8).propose(chunk, 3).tree.tokens == (1, 2, 3, 5, 6, 9, 9, 9)
+    assert MergedProposer([one, two], 7).propose(chunk, 3).tree.tokens == (1, 2, 3, 5, 6)
+    assert MergedProposer([two, one], 2).propose(chunk, 3).tree.tokens == (9, 9)
     assert (MergedProposer([one, two], 8).name, MergedProposer([two], 8).name) == ("merged", "two")
     careful = MergedProposer([two], 8, fallback=[one])
     assert careful.name == "merged"
-    assert careful.propose(chunk, 3).tokens == (9, 9, 9, 1, 2, 3, 5, 6)
+    assert careful.propose(chunk, 3).tree.tokens == (9, 9, 9, 1, 2, 3, 5, 6)
     two.sure = True
-    assert careful.propose(chunk, 3).tokens == (9, 9, 9)
+    assert careful.propose(chunk, 3).tree.tokens == (9, 9, 9)
 
 
 # --- HeiSD: choice and skip

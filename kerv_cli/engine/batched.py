@@ -20,7 +20,7 @@ from kerv_cli.engine.chunk import Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, deviation, record_of
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.parts import TakesMany
-from kerv_cli.engine.protocol import Cache
+from kerv_cli.engine.protocol import Cache, EncodesMany
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, Round
 
 
@@ -91,11 +91,11 @@ class BatchDecoder:
         return records
 
     def _prompts(self, observations: Sequence[Observation]) -> list[Tensor]:
-        """The prompts (1, P, E). One by one where packed weights encode a single image faster than a batch of them."""
-        together = getattr(self.target, "encode_many", None)
-        if together is None:
-            return [self.target.encode(observation) for observation in observations]
-        return list(together(observations).split(1))
+        """The prompts (1, P, E). On a CPU one by one: packed weights encode one image after the other as fast as eight
+        together, and faster than more of them."""
+        if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
+            return list(self.target.encode_many(observations).split(1))
+        return [self.target.encode(observation) for observation in observations]
 
     def _complete(self, chunks: Sequence[Chunk]) -> None:
         """Commits all tokens of every chunk; prompts of one length run together, so that none is padded."""

@@ -5,8 +5,8 @@ Shapes: B batch (1 while decoding), P prompt tokens, T new tokens, S cached toke
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -78,6 +78,14 @@ class Target(Protocol):
 
     def head(self, hidden: Tensor) -> Tensor:
         """hidden (..., E) -> logits over the action tokens (..., V)."""
+
+
+@runtime_checkable
+class EncodesMany(Protocol):
+    """A target that encodes several observations faster than one after the other."""
+
+    def encode_many(self, observations: Sequence[Observation]) -> Tensor:
+        """The prompts (B, P, E) of B observations."""
 
 
 class ReadableTarget(Target, Protocol):

@@ -31,12 +31,11 @@ from kerv_cli.methods.retrieval.datastore import (
     projected,
     prompt_key,
 )
-from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import subset
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import WITHIN
-from kerv_cli.training.observations import check_shown, read_chunks, read_observations
-from kerv_cli.training.recorded import prompts_of, steps_of
+from kerv_cli.training.observations import check_shown, read_chunks
+from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -66,30 +65,12 @@ def entries_of(
     Raises:
         CheckpointError: too few labels, or frames of another size than the target takes.
     """
-    if not isinstance(target, CompactTarget):
-        return _recorded_entries(target, episode, segments, stride, space)
-    observations = read_observations(
-        episode, target.settings, target.observation, target.words, slice(None, None, stride)
-    )
-    steps = observations.steps.numpy()
-    tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
-    keys = []
-    for rows in np.array_split(np.arange(len(steps)), -(-len(steps) // BATCH)):
-        prompt, _ = target.encode_batch(observations.inputs(torch.from_numpy(rows), target.device))
-        keys.append(prompt_key(prompt, target, segments))
-    return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
-
-
-def _recorded_entries(
-    target: Any, episode: DemoEpisode, segments: Sequence[str], stride: int, space: ObservationSpace | None
-) -> Entries:
-    """The entries of an episode for a target of any family, which encodes one observation at a time; arguments and
-    errors as in `entries_of`."""
     steps = steps_of(target, episode)[::stride]
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
-    prompts = prompts_of(target, episode, space or target.observation, steps)
-    keys = np.concatenate([prompt_key(prompt, target, segments) for prompt in prompts])
-    return Entries(keys, tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
+    observations = observations_of(episode, steps, space or target.observation, target.cameras)
+    size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
+    keys = [prompt_key(prompt, target, segments) for prompt in prompts_of(target, observations, size)]
+    return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
 
 
 def directions(keys: np.ndarray, count: int) -> np.ndarray:

@@ -6,7 +6,7 @@ The history is what the demonstration *executed*, noise included.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -15,19 +15,18 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.settings import TrainSettings
-from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, padded
-from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Observations, Rows, observed_steps, read_observations, split
-from kerv_cli.training.recorded import greedy, prompts_of, spread_steps
+from kerv_cli.training.observations import Rows, split
+from kerv_cli.training.recorded import greedy, observations_of, prompts_of, steps_of
 from kerv_cli.training.runs import DrafterRun
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
-BATCH = 64  # observations that the target decodes at once
 RADII = {"strict": 0, "r3": 3, "r9": 9}
 
 
@@ -53,16 +52,6 @@ class EarlySamples(Rows):
     perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
 
 
-@dataclass(frozen=True)
-class EarlyObservations(Observations):
-    """Observations, and the other fields of EarlySamples that do not need the target."""
-
-    history: Tensor
-    known: Tensor
-    episodes: Tensor
-    perturbed: Tensor
-
-
 @torch.inference_mode()
 def teach_early(
     target: ReadableTarget,
@@ -75,71 +64,43 @@ def teach_early(
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
     """
-    if not isinstance(target, CompactTarget):
-        return _teach_recorded(target, dataset, settings, on_progress)
-    stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1
-    share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
-    parts: list[EarlySamples] = []
-    batch: list[EarlyObservations] = []
-    for index in range(len(dataset.episodes)):
-        batch.append(observations(target, dataset.load(index), index, share, settings.history))
-        if sum(map(len, batch)) >= BATCH or index + 1 == len(dataset.episodes):
-            parts.append(decode(target, EarlyObservations.joined(batch)))
-            batch = []
-        on_progress(index + 1, len(dataset.episodes))
-    return EarlySamples.joined(parts)
+    share, columns = share_of(dataset, settings.samples, bool(target.cameras)), list[dict[str, Tensor]]()
 
+    def observations() -> Iterator[Observation]:
+        for index in range(len(dataset.episodes)):
+            episode = dataset.load(index)
+            steps = evenly(steps_of(target, episode), share)
+            columns.append(columns_of(target, episode, index, steps, settings.history))
+            yield from observations_of(episode, steps, dataset.manifest.observation, target.cameras)
+            on_progress(index + 1, len(dataset.episodes))
 
-def _teach_recorded(
-    target: ReadableTarget, dataset: DemoDataset, settings: EarlySettings, on_progress: Callable[[int, int], None]
-) -> EarlySamples:
-    """The decodes of a target of any family that has `pooled`, one observation at a time; arguments as in
-    `teach_early`."""
-    parts, count, space = [], len(dataset.episodes), dataset.manifest.observation
-    for index in range(count):
-        episode = dataset.load(index)
-        chosen = spread_steps(target, episode, -(-settings.samples // count))
-        executed = target.actions.normalise(episode.executed)
-        histories = [padded(executed[:t], settings.history, target.actions.dofs) for t in chosen.tolist()]
-        history, known = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
-        prompts = list(prompts_of(target, episode, space, chosen))
-        features = torch.cat([target.pooled(prompt) for prompt in prompts]).half().cpu()
-        tokens = torch.cat([greedy(target, prompt)[0] for prompt in prompts]).cpu()
-        columns = (torch.full((len(chosen),), value) for value in (index, episode.perturbed))
-        parts.append(EarlySamples(features, history, known, tokens, *columns))
-        on_progress(index + 1, count)
-    return EarlySamples.joined(parts)
-
-
-def observations(
-    target: CompactTarget, episode: DemoEpisode, index: int, share: float, history: int
-) -> EarlyObservations:
-    """An evenly spread share of the episode's observations; the first is always one of them."""
-    order = np.arange(len(observed_steps(episode, target.settings)))
-    chosen = np.flatnonzero(np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9))
-    rows = read_observations(episode, target.settings, target.observation, target.words, chosen)
-    executed = target.actions.normalise(episode.executed)
-    histories = [padded(executed[:t], history, target.actions.dofs) for t in rows.steps.tolist()]
-    actions, known = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
-    episodes, perturbed = (torch.full((len(rows),), value) for value in (index, episode.perturbed))
-    return EarlyObservations(**vars(rows), history=actions, known=known, episodes=episodes, perturbed=perturbed)
-
-
-def decode(target: CompactTarget, observations: EarlyObservations) -> EarlySamples:
-    """The target's greedy decodes of some observations."""
     features, tokens = [], []
-    for indices in torch.arange(len(observations)).split(BATCH):
-        prompt, _ = target.encode_batch(observations.inputs(indices, target.device))
+    for prompt in prompts_of(target, observations()):
         features.append(target.pooled(prompt).half().cpu())
         tokens.append(greedy(target, prompt)[0].cpu())
-    return EarlySamples(
-        torch.cat(features),
-        observations.history,
-        observations.known,
-        torch.cat(tokens),
-        observations.episodes,
-        observations.perturbed,
-    )
+    joined = {name: torch.cat([column[name] for column in columns]) for name in columns[0]}
+    return EarlySamples(features=torch.cat(features), tokens=torch.cat(tokens), **joined)
+
+
+def share_of(dataset: DemoDataset, samples: int, framed: bool) -> float:
+    """The share of the observations that makes about `samples`. framed: only those with a frame are observed."""
+    stride = int(dataset.manifest.config["frame_stride"]) if framed else 1
+    return min(1.0, samples * stride / sum(e.steps for e in dataset.episodes))
+
+
+def evenly(steps: np.ndarray, share: float) -> np.ndarray:
+    """An evenly spread share of the steps (n,); the first is always one of them."""
+    order = np.arange(len(steps))
+    return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
+
+
+def columns_of(target: Target, episode: DemoEpisode, index: int, steps: np.ndarray, history: int) -> dict[str, Tensor]:
+    """The fields of `EarlySamples` that do not need the target, for some control steps (n,) of one episode."""
+    executed = target.actions.normalise(episode.executed)
+    histories = [padded(executed[:t], history, target.actions.dofs) for t in steps.tolist()]
+    actions, known = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
+    episodes, perturbed = (torch.full((len(steps),), value) for value in (index, episode.perturbed))
+    return {"history": actions, "known": known, "episodes": episodes, "perturbed": perturbed}
 
 
 class EarlyDistillation:

@@ -1,15 +1,15 @@
 """Recorded observations for any target, and its own decodes of them: the one interface between demonstrations and what
-is trained from them.
+is trained from a target.
 
-A demonstration holds frames, states and a task. `observation_at` turns one of its control steps into the observation
-that a target gets in an episode, and `Target.encode` does the rest. The compact target has a faster reader, in batches
-(`observations.py`).
+A demonstration holds frames, states and a task. `observations_of` turns its control steps into the observations that a
+target gets in an episode, and the target encodes them.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +18,13 @@ from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace
-from kerv_cli.engine.protocol import Target
-from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.imitation import Samples, load_samples
-from kerv_cli.training.observations import Rows, instruction_of, split
+from kerv_cli.engine.protocol import EncodesMany, Target
+from kerv_cli.training.observations import Rows, instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
+
+BATCH = 64
+"""Observations that a target encodes and decodes together."""
 
 
 def steps_of(target: Target, episode: DemoEpisode) -> np.ndarray:
@@ -31,38 +32,38 @@ def steps_of(target: Target, episode: DemoEpisode) -> np.ndarray:
     return episode.frame_steps if target.cameras else np.arange(episode.steps)
 
 
-def spread_steps(target: Target, episode: DemoEpisode, count: int) -> np.ndarray:
-    """At most `count` of `steps_of`, evenly spread."""
-    steps = steps_of(target, episode)
-    return steps[np.unique(np.linspace(0, len(steps) - 1, min(count, len(steps))).round().astype(int))]
-
-
-def observation_at(
-    episode: DemoEpisode, step: int, space: ObservationSpace, cameras: Sequence[str], instruction: str
-) -> Observation:
-    """The observation at a control step of a demonstration. space: the demonstrations'. cameras: names that the target
-    gives to the recorded frame.
+def observations_of(
+    episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, cameras: Sequence[str]
+) -> list[Observation]:
+    """The observations at some control steps (n,) of a demonstration. space: the demonstrations'. cameras: names that
+    the target gives to the recorded frame.
 
     Raises:
-        CheckpointError: cameras, but no frame of that step.
+        CheckpointError: cameras, but no frame of one of the steps.
     """
-    images = {}
+    pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
     if cameras:
-        rows = np.flatnonzero(episode.frame_steps == step)
-        if not len(rows):
-            raise CheckpointError(f"step {step} of {episode.task} {episode.seed} has no frame: record every step")
-        images = dict.fromkeys(cameras, episode.frames[rows[0]])
-    state = episode.states[step].astype(np.float64)
-    return Observation(state[: len(space.proprioception)], state, instruction, images)
+        rows = np.searchsorted(episode.frame_steps, steps).clip(max=len(episode.frame_steps) - 1)
+        missing = steps[episode.frame_steps[rows] != steps]
+        if len(missing):
+            raise CheckpointError(f"step {missing[0]} of {episode.task} {episode.seed} has no frame: record every step")
+        pictures = [dict.fromkeys(cameras, frame) for frame in np.asarray(episode.frames[rows])]
+    states, instruction = episode.states[steps].astype(np.float64), instruction_of(episode.task)
+    felt = len(space.proprioception)
+    return [
+        Observation(state[:felt], state, instruction, images) for state, images in zip(states, pictures, strict=True)
+    ]
 
 
-def prompts_of(
-    target: Target, episode: DemoEpisode, space: ObservationSpace, steps: Sequence[int] | np.ndarray
-) -> Iterator[Tensor]:
-    """The prompt (1, P, E) of every one of these control steps."""
-    instruction = instruction_of(episode.task)
-    for step in steps:
-        yield target.encode(observation_at(episode, int(step), space, target.cameras, instruction))
+def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
+    """The prompts (B, P, E) of the observations, in order, at most `size` together and those of one length alone."""
+    remaining = iter(observations)
+    while batch := list(itertools.islice(remaining, size)):
+        if isinstance(target, EncodesMany):
+            yield target.encode_many(batch)
+            continue
+        prompts = (target.encode(observation) for observation in batch)
+        yield from (torch.cat(list(equal)) for _, equal in itertools.groupby(prompts, lambda prompt: prompt.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -124,58 +125,45 @@ def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
 @torch.inference_mode()
 def teach(
     target: Target, dataset: DemoDataset, limit: int, held_out: float, on_progress: Callable[[int, int], None]
-) -> tuple[TeacherStates | StatesByLength, TeacherStates | StatesByLength]:
-    """The target's greedy decodes of about `limit` observations, evenly spread -> (training, held out) by whole
+) -> tuple[StatesByLength, StatesByLength]:
+    """The target's greedy decodes of at most `limit` observations, evenly spread -> (training, held out) by whole
     episodes, as `observations.split` divides them.
 
     Raises:
         UsageError: a share out of range. CheckpointError: a single episode, or a damaged one.
     """
-    if not isinstance(target, CompactTarget):
-        return teach_recorded(target, dataset, limit, held_out, on_progress)
-    tasks = tuple(dict.fromkeys(e.task for e in dataset.episodes))
-    training, validation = split(load_samples(dataset, target.settings, target.words, tasks), held_out)
-    states = _in_batches(target, training, limit, on_progress)
-    return states, _in_batches(target, validation, max(60, limit // 50), lambda done, total: None)
-
-
-def _in_batches(
-    target: CompactTarget, samples: Samples, limit: int, on_progress: Callable[[int, int], None]
-) -> TeacherStates:
-    """The decodes of at most `limit` of the samples, evenly spread."""
-    chosen = torch.linspace(0, len(samples) - 1, min(limit, len(samples))).long()
-    parts = []
-    for indices in chosen.split(64):
-        prompt, _ = target.encode_batch(samples.inputs(indices, target.device))
-        tokens, hidden = greedy(target, prompt)
-        parts.append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
-        on_progress(sum(map(len, parts)), len(chosen))
-    return TeacherStates.joined(parts)
-
-
-@torch.inference_mode()
-def teach_recorded(
-    target: Target,
-    dataset: DemoDataset,
-    limit: int,
-    held_out: float,
-    on_progress: Callable[[int, int], None],
-) -> tuple[StatesByLength, StatesByLength]:
-    """`teach` for a target of any family, one observation at a time. Prompts of one length lie together."""
     count = len(dataset.episodes)
     if count < 2:
         raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
     if not 0 < held_out <= 0.5:
         raise UsageError(f"train.held_out={held_out}: more than 0, at most 0.5")
-    every, share = min(max(2, round(1 / held_out)), count), -(-limit // count)
-    sides: tuple[dict[int, list[TeacherStates]], ...] = (defaultdict(list), defaultdict(list))
+    every = min(max(2, round(1 / held_out)), count)
+    sides: tuple[list[tuple[int, int]], ...] = ([], [])
     for index in range(count):
-        episode = dataset.load(index)
-        chosen = spread_steps(target, episode, share)
-        prompts = torch.cat(list(prompts_of(target, episode, dataset.manifest.observation, chosen)))
-        tokens, hidden = greedy(target, prompts)
-        states = TeacherStates(prompts.half().cpu(), hidden.half().cpu(), tokens.cpu())
-        sides[index % every == every - 1][prompts.shape[1]].append(states)
-        on_progress(index + 1, count)
-    training, validation = (StatesByLength(tuple(map(TeacherStates.joined, side.values()))) for side in sides)
-    return training, validation
+        sides[index % every == every - 1].extend((index, int(t)) for t in steps_of(target, dataset.load(index)))
+    states = _decodes(target, dataset, sides[0], limit, on_progress)
+    return states, _decodes(target, dataset, sides[1], max(60, limit // 50), lambda done, total: None)
+
+
+def _decodes(
+    target: Target,
+    dataset: DemoDataset,
+    rows: Sequence[tuple[int, int]],
+    limit: int,
+    on_progress: Callable[[int, int], None],
+) -> StatesByLength:
+    """The decodes of at most `limit` of the rows, (episode, control step), evenly spread."""
+    chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]
+    groups, done = defaultdict[int, list[TeacherStates]](list), 0
+
+    def observations() -> Iterator[Observation]:
+        for index, group in itertools.groupby(chosen, lambda row: row[0]):
+            steps = np.array([step for _, step in group])
+            yield from observations_of(dataset.load(index), steps, dataset.manifest.observation, target.cameras)
+
+    for prompt in prompts_of(target, observations()):
+        tokens, hidden = greedy(target, prompt)
+        groups[prompt.shape[1]].append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
+        done += len(prompt)
+        on_progress(done, len(chosen))
+    return StatesByLength(tuple(map(TeacherStates.joined, groups.values())))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -17,19 +18,23 @@ from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.network import Scout
 from kerv_cli.methods.scout.proposer import ScoutArtifact, check_sees
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.early_distillation import BATCH, EarlyObservations, measure, observations
+from kerv_cli.training.early_distillation import columns_of, evenly, measure, share_of
 from kerv_cli.training.imitation import position_loss, soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import split
-from kerv_cli.training.recorded import greedy
+from kerv_cli.training.observations import Observations, read_observations, split
+from kerv_cli.training.recorded import BATCH, greedy
 from kerv_cli.training.runs import DrafterRun, Progress
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 
 @dataclass(frozen=True)
-class ScoutSamples(EarlyObservations):
-    """Observations, and what the target says of them."""
+class ScoutSamples(Observations):
+    """Observations, and what the target says of them. history, known, episodes, perturbed: as in `EarlySamples`."""
 
+    history: Tensor
+    known: Tensor
+    episodes: Tensor
+    perturbed: Tensor
     tokens: Tensor  # (n, N) int64
     places: Tensor  # (n, K, 3) float32, metres
 
@@ -43,17 +48,19 @@ def teach_scout(
     Raises:
         CheckpointError: a demonstration's frames are not of the size that the target takes.
     """
-    stride = int(dataset.manifest.config["frame_stride"])
-    share = min(1.0, settings.samples * stride / sum(e.steps for e in dataset.episodes))
+    share = share_of(dataset, settings.samples, framed=True)
     parts: list[ScoutSamples] = []
     for index in range(len(dataset.episodes)):
-        rows = observations(target, dataset.load(index), index, share, settings.history)
+        episode = dataset.load(index)
+        chosen = evenly(np.arange(len(episode.frame_steps)), share)
+        rows = read_observations(episode, target.settings, target.observation, target.words, chosen)
+        columns = columns_of(target, episode, index, rows.steps.numpy(), settings.history)
         tokens, places = [], []
         for indices in torch.arange(len(rows)).split(BATCH):
             prompt, located = target.encode_batch(rows.inputs(indices, target.device))
             tokens.append(greedy(target, prompt)[0].cpu())
             places.append(located.float().cpu())
-        parts.append(ScoutSamples(**vars(rows), tokens=torch.cat(tokens), places=torch.cat(places)))
+        parts.append(ScoutSamples(**vars(rows), **columns, tokens=torch.cat(tokens), places=torch.cat(places)))
         on_progress(index + 1, len(dataset.episodes))
     return ScoutSamples.joined(parts)
 
