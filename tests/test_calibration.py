@@ -38,7 +38,7 @@ from kerv_cli.methods.calibration import (
     save_calibration,
 )
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.heisd.boundary import BoundaryRanges
+from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kinematics import KinematicThresholdSettings
 from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise
 from kerv_cli.methods.spec_vla import FixedThresholdSettings

@@ -22,7 +22,7 @@ from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, Po
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.cli.app import app
 from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability, save_calibration
-from kerv_cli.methods.heisd.boundary import BoundaryRanges
+from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild

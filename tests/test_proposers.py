@@ -21,8 +21,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.early.drafter import EarlyDraft, EarlyProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
-from kerv_cli.methods.heisd.boundary import Random
-from kerv_cli.methods.heisd.rules import HybridProposer, SkipLevels, VerifySkip
+from kerv_cli.methods.heisd.rules import HybridProposer, Random, SkipLevels, VerifySkip
 from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, RetrievalProposer, prompt_key

@@ -17,8 +17,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.heisd.boundary import Always
-from kerv_cli.methods.heisd.rules import HybridProposer
+from kerv_cli.methods.heisd.rules import Always, HybridProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
 from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_json
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, check_sources
-from kerv_cli.methods.heisd.boundary import LEAST, BoundaryRanges
+from kerv_cli.methods.heisd.rules import LEAST, BoundaryRanges
 from kerv_cli.methods.kinematics.prediction import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 
 FILE = "calibration.json"

@@ -28,7 +28,7 @@ from kerv_cli.methods.calibration import (
     save_calibration,
 )
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.heisd.boundary import BoundaryRanges
+from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.observations import check_frames, check_shown, instruction_of
 from kerv_cli.training.predictor_fit import (

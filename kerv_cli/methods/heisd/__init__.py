@@ -10,7 +10,6 @@ from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
 from kerv_cli.base.registry import STATES, add
 
 _RULES = "kerv_cli.methods.heisd.rules:"
-_BOUNDARY = "kerv_cli.methods.heisd.boundary:"
 
 
 @dataclass
@@ -78,9 +77,9 @@ class RandomBoundarySettings:
 
 
 for _name in ("always_retrieval", "always_drafter"):
-    add("boundary", _name, _BOUNDARY + "Always.build", chooses=True)
-add("boundary", "fused", _BOUNDARY + "Fused.build", FusedBoundarySettings, ("calibration",), chooses=True)
-add("boundary", "random", _BOUNDARY + "Random.build", RandomBoundarySettings, chooses=True)
+    add("boundary", _name, _RULES + "Always.build", chooses=True)
+add("boundary", "fused", _RULES + "Fused.build", FusedBoundarySettings, ("calibration",), chooses=True)
+add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, chooses=True)
 
 
 # --- what is executed without a verification (§4.3)
