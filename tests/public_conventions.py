@@ -20,11 +20,12 @@ from test_openvla import imported, loaded, shown
 from test_public_drafter import LANGUAGE, PATCHES, with_convention
 from torch import Tensor
 
+from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import MASKS, POSITIONS, Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.openvla.target import OpenVLATarget
 from kerv_cli.training.distillation import Distillation, acceptance_length
-from kerv_cli.training.recorded import TeacherStates, greedy
+from kerv_cli.training.recorded import TeacherStates
 
 OBSERVATIONS, STEPS = 64, 600
 

@@ -163,7 +163,7 @@ def test_an_artifact_of_another_target_is_refused(results: Path) -> None:
 def test_an_artifact_can_be_named(results: Path) -> None:
     shutil.move(results / "artifacts/drafter/nano-state", results / "artifacts/drafter/better")
     files = Artifacts(str(results), PolicySettings(target="nano-state", drafter="better"))
-    assert files.place("drafter") == results / "artifacts/drafter/better"
+    assert files.path("drafter") == results / "artifacts/drafter/better"
     files.check(["drafter"])
     by_path = PolicySettings(target="nano-state", others={"drafter": str(results / "artifacts/drafter/better")})
     assert Artifacts(str(results), by_path).check(["drafter"]) == files.check(["drafter"])

@@ -235,7 +235,7 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     assert {row.decodes for row in variability.values()} == {4}
     made = run.finish(variability, run.boundary(lambda done, total: None), run.skip(lambda done, total: None))
     folder = find_target(str(results), target)
-    assert run.path == CalibrationArtifact().place(str(results), None, folder)
+    assert run.path == CalibrationArtifact().path(str(results), None, folder)
     assert run.path == results / f"artifacts/calibration/{target}/calibration.json"
     loaded = CalibrationArtifact().checked(run.path, read_target(folder))
     assert loaded == made

@@ -395,7 +395,7 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
 
 
 def test_the_folder_is_beside_the_target(policies: Path) -> None:
-    place = EarlyArtifact().place
+    place = EarlyArtifact().path
     assert place("r", None, Path("r/pretrained/x/target")) == Path("r/pretrained/x/early")
     assert place("r", None, Path("r/artifacts/target/x")) == Path("r/artifacts/early/x")
     assert place("r", "mine", Path("r/pretrained/x/target")) == Path("r/artifacts/early/mine")

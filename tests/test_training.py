@@ -23,13 +23,13 @@ from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.cli.app import app
+from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
-from kerv_cli.training.recorded import greedy
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record

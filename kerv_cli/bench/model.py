@@ -173,7 +173,7 @@ def open_model(settings: BenchSettings) -> Model:
         if "/" not in settings.model and "is damaged" not in str(error):
             raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
         raise
-    drafter = artifacts.load("drafter") if artifacts.place("drafter").exists() else _drafter(target)
+    drafter = artifacts.load("drafter") if artifacts.path("drafter").exists() else _drafter(target)
     return Model(settings.model, target, drafter, blank(target), False)
 
 

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Chunk, Situation
-from kerv_cli.engine.decoder import Decoder, deviation, record_of
+from kerv_cli.engine.decoder import Decoder, actions_of, deviation, record_of
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.parts import TakesMany
-from kerv_cli.engine.protocol import Cache, EncodesMany
+from kerv_cli.engine.protocol import Cache, EncodesMany, Target
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, Round
 
 
@@ -85,8 +85,9 @@ class BatchDecoder:
             lane.decodes += 1
             if self.every and lane.decodes % self.every == 0:
                 samples.append(i)
-        for i, actions in zip(samples, self._autoregressive([chunks[i] for i in samples]), strict=True):
-            gap = deviation(self.target.actions, records[i].actions, actions) if actions is not None else 0.0
+        decoded = [[]] * len(samples) if self.skip is None else self._tokens([chunks[i] for i in samples])
+        for i, tokens in zip(samples, decoded, strict=True):
+            gap = deviation(space, records[i].actions, actions_of(space, tokens)) if tokens else 0.0
             records[i] = replace(records[i], deviation=gap)
         return records
 
@@ -98,40 +99,25 @@ class BatchDecoder:
         return [self.target.encode(observation) for observation in observations]
 
     def _complete(self, chunks: Sequence[Chunk]) -> None:
-        """Commits all tokens of every chunk; prompts of one length run together, so that none is padded."""
+        """Commits all tokens of every chunk, a round for each token that the target decodes."""
         if isinstance(self.skip, TakesMany):
             self.skip.take_many(chunks, self._cache)
             return
-        for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
-            group = [chunk for chunk in chunks if chunk.prompt_length == length]
-            _one_by_one(group, self._tokens(torch.cat([chunk.prompt for chunk in group])))
+        for chunk, tokens in zip(chunks, self._tokens(chunks), strict=True):
+            for start, token in enumerate(tokens):
+                mode = "decode" if start else "prefill"
+                chunk.commit(Round(mode, "none", start, (), (token,), 0, 1, 0, ()), [token])
 
-    def _tokens(self, prompt: Tensor) -> list[list[int]]:
-        """prompt (B, P, E) -> the N tokens of each row, decoded one by one."""
-        target, length = self.target, prompt.shape[1]
-        cache = self._cache(len(prompt))
-        hidden = target.forward(prompt, torch.arange(length, device=prompt.device), cache)
-        columns = [target.head(hidden[:, -1]).argmax(-1)]
-        for at in range(length, length + self._size - 1):
-            x = target.embed(columns[-1][:, None])
-            hidden = target.forward(x, torch.tensor([at], device=prompt.device), cache)
-            columns.append(target.head(hidden[:, 0]).argmax(-1))
-        tokens: list[list[int]] = torch.stack(columns, 1).tolist()
-        return tokens
-
-    def _autoregressive(self, chunks: Sequence[Chunk]) -> list[np.ndarray | None]:
-        """The actions (H, D) that autoregressive decoding would have chosen for each chunk; None where it decoded
-        them."""
-        actions: list[np.ndarray | None] = [None] * len(chunks)
-        if self.skip is None:
-            return actions
-        space = self.target.actions
+    def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
+        """The N tokens of each chunk, decoded one by one; prompts of one length run together, so that none is
+        padded."""
+        rows: dict[int, list[int]] = {}
         for length in dict.fromkeys(chunk.prompt_length for chunk in chunks):
             group = [i for i, chunk in enumerate(chunks) if chunk.prompt_length == length]
-            rows = self._tokens(torch.cat([chunks[i].prompt for i in group]))
-            for i, tokens in zip(group, rows, strict=True):
-                actions[i] = space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
-        return actions
+            prompt = torch.cat([chunks[i].prompt for i in group])
+            tokens, _ = greedy(self.target, prompt, self._cache(len(group)), self._size)
+            rows |= zip(group, tokens.tolist(), strict=True)
+        return [rows[i] for i in range(len(chunks))]
 
     def _record(self, chunk: Chunk) -> DecodeRecord:
         actions, predicted = self.decoder.actions_of(chunk)
@@ -149,9 +135,16 @@ class BatchDecoder:
         return self._caches[rows]
 
 
-def _one_by_one(chunks: Sequence[Chunk], rows: Sequence[Sequence[int]]) -> None:
-    """Commits each chunk's row of N tokens as autoregressive decoding does, a round for each."""
-    for chunk, tokens in zip(chunks, rows, strict=True):
-        for start, token in enumerate(tokens):
-            mode = "decode" if start else "prefill"
-            chunk.commit(Round(mode, "none", start, (), (token,), 0, 1, 0, ()), [token])
+@torch.inference_mode()
+def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int = 0) -> tuple[Tensor, Tensor]:
+    """prompt (B, P, E) -> greedy tokens (B, N) and the hidden states (B, P + N − 1, E) that predict them. cache: an
+    empty one with room for them. size: N; 0: of the target's chunk."""
+    length, size = prompt.shape[1], size or target.chunk * target.actions.dofs
+    cache = cache or target.new_cache(len(prompt), length + size)
+    hidden = [target.forward(prompt, torch.arange(length, device=prompt.device), cache)]
+    tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
+    for at in range(length, length + size - 1):
+        position = torch.tensor([at], device=prompt.device)
+        hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
+        tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
+    return torch.stack(tokens, 1), torch.cat(hidden, 1)

@@ -155,7 +155,7 @@ class Decoder:
         """The chunk's actions (steps, D) float32 in environment units, and how many of their numbers were predicted."""
         space = self.target.actions
         if chunk.closed is None:
-            return space.decode(np.array(chunk.tokens).reshape(-1, space.dofs)).astype(np.float32), 0
+            return actions_of(space, chunk.tokens), 0
         predicted = max(0, chunk.closed.size - len(chunk.tokens))
         return space.unnormalise(chunk.closed).astype(np.float32), predicted
 
@@ -358,6 +358,11 @@ def record_of(
         metric=chunk.choice.metric if chunk.choice is not None else None,
         reason=chunk.reason,
     )
+
+
+def actions_of(space: ActionSpace, tokens: Sequence[int]) -> np.ndarray:
+    """The tokens of whole control steps -> actions (steps, D) float32 in environment units."""
+    return space.decode(np.array(tokens).reshape(-1, space.dofs)).astype(np.float32)
 
 
 def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:

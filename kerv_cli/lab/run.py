@@ -28,7 +28,7 @@ from kerv_cli.lab.episode import OnStep, run_episode
 from kerv_cli.lab.plan import Cell
 from kerv_cli.lab.policy import artifacts_of, batch_decoder_for, clock_for, decoder_for
 from kerv_cli.lab.together import EpisodeEnd, Request, run_together
-from kerv_cli.methods.compose import own_decoder
+from kerv_cli.methods.compose import native_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import World
@@ -133,7 +133,7 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to,
     autoregressively or in parallel, TOGETHER at a time."""
-    decoder = BatchDecoder(own_decoder(target))
+    decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task in tasks for seed in seeds]
     outcomes = []
     for end in run_together(decoder, requests, TOGETHER, lambda task: new_world(task, settings)):

@@ -81,7 +81,7 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
 
 class Artifact(Generic[T]):
     """A kind of artifact: one JSON of the dataclass `schema`, with other files beside it or none, made for one target.
-    A kind says what is its own; `Weights` is the base of those that are a network.
+    `Weights` is the base of those that are a network.
 
     kind: as `needs` name it. noun: its name in messages. made: e.g. trained. again: the remedy.
     """
@@ -92,65 +92,62 @@ class Artifact(Generic[T]):
     again: str
     schema: type[T]
 
-    def place(self, results: str, name: str | None, target: Path) -> Path:
+    def path(self, results: str, name: str | None, target: Path) -> Path:
         """Its path; name None: the one beside the target in the folder `target`."""
         return artifact(results, self.kind, name) if name else beside(target, self.kind)
 
-    def json(self, place: Path) -> Path:
+    def json(self, path: Path) -> Path:
         """The file of its description."""
-        return place / f"{self.kind}.json"
+        return path / f"{self.kind}.json"
 
-    def load(self, place: Path, request: Request) -> Any:
-        """The artifact, loaded for the target. Raises CheckpointError as `checked`, or for files that do not fit."""
-        raise NotImplementedError
+    def load(self, path: Path, request: Request) -> Any:
+        """The artifact, loaded for the target; without more files its description. Raises CheckpointError as `checked`,
+        or for files that do not fit."""
+        return self.checked(path, request.description)
 
     def made_for(self, description: T) -> MadeFor:
         """The target that it was made for."""
-        made_for: MadeFor = description.target  # type: ignore[attr-defined]
-        return made_for
+        fields: Any = description
+        return MadeFor(fields.target, fields.actions, fields.chunk)
 
     def sources(self, description: T) -> Mapping[str, str]:
         """Kind -> hash of the other artifacts that it was made from; none, where target and demonstrations suffice."""
         return {}
 
-    def digest(self, place: Path, description: T) -> str:
+    def digest(self, path: Path, description: T) -> str:
         """The hash that is part of the identity of results."""
-        return sha256_of(self.json(place))
+        return sha256_of(self.json(path))
 
-    def read(self, place: Path) -> T:
+    def read(self, path: Path) -> T:
         """Its description, of any target.
 
         Raises:
             CheckpointError: missing, damaged, of another format, or its files are not those that it names.
         """
-        path = self.json(place)
-        if not path.is_file():
-            raise CheckpointError(f"no {self.noun} in {place}: {self.again}, or name a folder that holds one")
-        return self.described(path)
+        file = self.json(path)
+        if not file.is_file():
+            raise CheckpointError(f"no {self.noun} in {path}: {self.again}, or name a folder that holds one")
+        return self.described(file)
 
-    def described(self, path: Path) -> T:
-        """The description in `path`, which is there; errors as `read`."""
+    def described(self, file: Path) -> T:
+        """The description in `file`, which exists; errors as `read`."""
         try:
-            description = read_file(self.schema, path, f"a {self.noun} of this version of kerv")
+            description = read_file(self.schema, file, f"a {self.noun} of this version of kerv")
         except CheckpointError as error:
             raise CheckpointError(f"{error}; {self.again}") from error
-        check_files(path.parent, getattr(description, "files", {}), self.again)
+        check_files(file.parent, getattr(description, "files", {}), self.again)
         return description
 
-    def checked(self, place: Path, target: TargetDescription) -> T:
+    def checked(self, path: Path, target: TargetDescription) -> T:
         """Its description, of an artifact that was made for this target.
 
         Raises:
             CheckpointError: as `read`, or another target, action space or chunk length.
         """
-        description = self.read(place)
-        made_for, what = self.made_for(description), f"the {self.noun} in {place}"
+        description = self.read(path)
+        made_for, what = self.made_for(description), f"the {self.noun} in {path}"
         made_for.check_same(MadeFor.of(target), what, self.made, self.again)
         return description
-
-    def check_made_from(self, place: Path, description: T, used: Mapping[str, str]) -> None:
-        """Refuses other sources than the policy's; `used` and errors as in `check_sources`."""
-        check_sources(self.sources(description), used, f"the {self.noun} in {place} was {self.made}", self.again)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,38 +170,34 @@ class Weights(Artifact[W]):
         """A fresh network of this description, for a ReadableTarget."""
         raise NotImplementedError
 
-    def load(self, place: Path, request: Request) -> Any:
+    def load(self, path: Path, request: Request) -> Any:
         """The network with its weights, frozen, on the target's device in its number format."""
         target = request.target
-        module = self.module(self.checked(place, request.description), target)
-        return load_packed(module, place, self.kind, target.device, target.dtype)
+        module = self.module(self.checked(path, request.description), target)
+        return load_packed(module, path, self.kind, target.device, target.dtype)
 
-    def made_for(self, description: W) -> MadeFor:
-        """The target that it was trained for."""
-        return MadeFor(description.target, description.actions, description.chunk)
-
-    def digest(self, place: Path, description: W) -> str:
+    def digest(self, path: Path, description: W) -> str:
         """SHA-256 of the weights."""
         return description.sha256
 
-    def described(self, path: Path) -> W:
-        """See `Artifact.described`; the weights beside it are checked."""
-        return checkpoint.read_description(path.parent, self.kind, self.schema)
+    def described(self, file: Path) -> W:
+        """The description in `file`, whose weights lie beside it and are checked; errors as `read`."""
+        return checkpoint.read_description(file.parent, self.kind, self.schema)
 
     def save(
         self,
-        place: Path,
+        path: Path,
         module: nn.Module,
         made_for: MadeFor,
         provenance: Mapping[str, Any],
         stored: str = checkpoint.FLOAT32,
-        **own: Any,
+        **fields: Any,
     ) -> str:
-        """Writes weights and description -> SHA-256 of the weights. stored: how, as in `TrainSettings`. own: the fields
-        of this kind's description."""
+        """Writes weights and description -> SHA-256 of the weights. stored: how, as in `TrainSettings`. fields: those
+        that this kind's description adds."""
         shared = {"target": made_for.sha256, "actions": made_for.actions.as_dict(), "provenance": dict(provenance)}
         chunk = {} if self.any_chunk else {"chunk": made_for.chunk}
-        return checkpoint.save_module(place, self.kind, module, {**own, **shared, **chunk}, stored)
+        return checkpoint.save_module(path, self.kind, module, {**fields, **shared, **chunk}, stored)
 
 
 class Artifacts:
@@ -229,9 +222,9 @@ class Artifacts:
         """The target, loaded."""
         return _target(self.folder, self.description.sha256, self.device, self.dtype)
 
-    def place(self, kind: str) -> Path:
+    def path(self, kind: str) -> Path:
         """Path of the artifact of this kind."""
-        return kind_of(kind).place(self.results, self.policy.named(kind), self.folder)
+        return kind_of(kind).path(self.results, self.policy.named(kind), self.folder)
 
     def check(self, kinds: Iterable[str]) -> dict[str, str]:
         """Kind -> hash, of the target and of `kinds`.
@@ -240,12 +233,14 @@ class Artifacts:
             CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
                 one among `kinds`.
         """
-        there = {kind: (kind_of(kind), self.place(kind)) for kind in kinds}
-        described = {kind: own.checked(place, self.description) for kind, (own, place) in there.items()}
-        hashes = {TARGET: self.description.sha256}
-        hashes |= {kind: own.digest(place, described[kind]) for kind, (own, place) in there.items()}
-        for kind, (own, place) in there.items():
-            own.check_made_from(place, described[kind], hashes)
+        hashes, sources = {TARGET: self.description.sha256}, []
+        for kind in kinds:
+            files, path = kind_of(kind), self.path(kind)
+            description = files.checked(path, self.description)
+            hashes[kind] = files.digest(path, description)
+            sources.append((files.sources(description), f"the {files.noun} in {path} was {files.made}", files.again))
+        for hashes_of_sources, what, again in sources:
+            check_sources(hashes_of_sources, hashes, what, again)
         return hashes
 
     def load(self, kind: str) -> Any:
@@ -255,7 +250,7 @@ class Artifacts:
             CheckpointError: as `check`.
         """
         digest = self.check([kind])[kind]
-        return _artifact(kind, self.place(kind), digest, _Owner(self.folder, self.device, self.dtype, self.search))
+        return _artifact(kind, self.path(kind), digest, _Owner(self.folder, self.device, self.dtype, self.search))
 
 
 @dataclass(frozen=True)

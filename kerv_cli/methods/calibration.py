@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_json
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request, check_sources
+from kerv_cli.methods.artifacts import Artifact, MadeFor, check_sources
 from kerv_cli.methods.heisd.rules import LEAST, BoundaryRanges
 from kerv_cli.methods.kinematics.prediction import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
 
@@ -169,28 +169,28 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The calibration's file, which is its place."""
+    """The calibration's file, which is its path."""
 
     kind = noun = "calibration"
     made, again = "made", "run 'kerv calibrate'"
     schema = Calibration
 
-    def place(self, results: str, name: str | None, target: Path) -> Path:
+    def path(self, results: str, name: str | None, target: Path) -> Path:
         """Path of the named calibration, else of the target's: pretrained/<name>/calibration.json where it is shipped,
         artifacts/calibration/<name>/calibration.json where it was made here."""
         if name is None and target.name == "target":
             return target.parent / FILE
         if name is None and target.parent.name != "target":
             return target / FILE
-        return super().place(results, name, target) / FILE
+        return super().path(results, name, target) / FILE
 
-    def json(self, place: Path) -> Path:
-        """`place` itself."""
-        return place
+    def json(self, path: Path) -> Path:
+        """`path` itself."""
+        return path
 
-    def load(self, place: Path, request: Request) -> Calibration:
-        """The calibration."""
-        return self.checked(place, request.description)
+    def made_for(self, description: Calibration) -> MadeFor:
+        """The target that it was made for."""
+        return description.target
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:

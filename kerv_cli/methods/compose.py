@@ -171,6 +171,6 @@ class Method:
         return Decoder(target, Parts(**context.built), self.chunk)
 
 
-def own_decoder(target: Any) -> Decoder:
+def native_decoder(target: Any) -> Decoder:
     """A target as it was trained to decode: autoregressive, or all tokens in one pass."""
     return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)

@@ -49,7 +49,7 @@ def place_of(resolved: ResolvedStudy, name: str | None) -> Path:
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     artifacts = artifacts_of(first)
-    return CertificateArtifact().place(first.results, name or first.policy.certificate, artifacts.folder)
+    return CertificateArtifact().path(first.results, name or first.policy.certificate, artifacts.folder)
 
 
 def certify(

@@ -48,7 +48,7 @@ def read_predictions(results: Path, target: str) -> Predictions | None:
         CheckpointError: the calibration is damaged or of another format.
     """
     try:
-        path = CalibrationArtifact().place(str(results), None, find_target(str(results), target))
+        path = CalibrationArtifact().path(str(results), None, find_target(str(results), target))
     except UsageError:  # no such target
         return None
     if not path.is_file():

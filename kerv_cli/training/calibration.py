@@ -115,12 +115,12 @@ class CalibrationRun:
             raise UsageError(
                 f"fit_steps={settings.fit_steps}: at most the target's chunk of {longest}, 0 for all of it"
             )
-        self.path = self.artifacts.place("calibration")
+        self.path = self.artifacts.path("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
         check_shown(self.dataset, self.description)
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
-        self.datastore = self.artifacts.place("datastore")
+        self.datastore = self.artifacts.path("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()
         if self.stored:
             self.artifacts.check(["datastore"])

@@ -15,7 +15,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import find_target
 from kerv_cli.base.settings import WorldSettings
 from kerv_cli.engine.protocol import Target
-from kerv_cli.methods.compose import own_decoder
+from kerv_cli.methods.compose import native_decoder
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.worlds.demos.recording import DemoConfig
 from kerv_cli.worlds.spec import EnvironmentSpec, World
@@ -27,7 +27,7 @@ class TargetActor:
     current chunk that are not executed yet."""
 
     def __init__(self, target: Target, expert_share: float) -> None:
-        self.decoder = own_decoder(target)
+        self.decoder = native_decoder(target)
         self.chunk, self.share = target.chunk, expert_share
         self.actions: deque[NDArray[np.float64]] = deque()
         self.expert_steps = 0

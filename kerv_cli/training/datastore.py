@@ -102,7 +102,7 @@ class DatastoreBuild:
         for name in settings.key:
             if name not in parts:
                 raise UnknownName("key", name, parts)
-        self.folder = self.artifacts.place("datastore")
+        self.folder = self.artifacts.path("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
         description = self.artifacts.description

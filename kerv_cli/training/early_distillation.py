@@ -16,13 +16,14 @@ from torch import Tensor, nn
 
 from kerv_cli.base.settings import TrainSettings
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, padded
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, split
-from kerv_cli.training.recorded import greedy, observations_of, prompts_of, steps_of
+from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
 from kerv_cli.training.runs import DrafterRun
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode

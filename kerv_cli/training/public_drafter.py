@@ -30,7 +30,7 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     target: Any = artifacts.target
     shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
-    folder = artifacts.place("drafter")
+    folder = artifacts.path("drafter")
     drafter = PublicDrafter(shape)
     drafter.load_state_dict(tensors, assign=True)  # stored in their own number format
     parameters = sum(tensor.numel() for tensor in tensors.values())

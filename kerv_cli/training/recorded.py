@@ -18,6 +18,7 @@ from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import EncodesMany, Target
 from kerv_cli.training.observations import Rows, instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -106,20 +107,6 @@ class StatesByLength:
     def prompts(self, count: int) -> list[Tensor]:
         """About `count` prompts (1, P, E): from every group in proportion to its rows, evenly spread."""
         return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
-
-
-@torch.inference_mode()
-def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
-    """prompt (B, P, E) -> greedy tokens (B, N) and the hidden states (B, P + N − 1, E) that predict them."""
-    length, size = prompt.shape[1], target.chunk * target.actions.dofs
-    cache = target.new_cache(len(prompt), length + size)
-    hidden = [target.forward(prompt, torch.arange(length, device=prompt.device), cache)]
-    tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
-    for i in range(size - 1):
-        position = torch.tensor([length + i], device=prompt.device)
-        hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
-        tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
-    return torch.stack(tokens, 1), torch.cat(hidden, 1)
 
 
 @torch.inference_mode()

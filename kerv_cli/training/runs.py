@@ -282,7 +282,7 @@ class DrafterRun(Run):
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
-        self.folder = self.artifact.place(settings.results, name, self.target_folder)
+        self.folder = self.artifact.path(settings.results, name, self.target_folder)
         dataset = open_demos(settings.results, settings.demos)
         self.dataset = subset(dataset, settings.task, settings.starts)
         description = read_target(self.target_folder)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.settings import TrainSettings
+from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.network import Scout
 from kerv_cli.methods.scout.proposer import ScoutArtifact, check_sees
@@ -22,7 +23,7 @@ from kerv_cli.training.early_distillation import columns_of, evenly, measure, sh
 from kerv_cli.training.imitation import position_loss, soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, read_observations, split
-from kerv_cli.training.recorded import BATCH, greedy
+from kerv_cli.training.recorded import BATCH
 from kerv_cli.training.runs import DrafterRun, Progress
 from kerv_cli.worlds.demos.dataset import DemoDataset
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from kerv_cli.base.registry import add
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Draws, Stress, level_of
+from kerv_cli.worlds.stress.base import Array, Stress, level_of
 
 LEVELS = (0.05, 0.1, 0.2, 0.4)  # of half a DoF's range
 
@@ -16,7 +16,8 @@ class Drift(Stress):
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         self._low, self._high = np.array(space.low), np.array(space.high)
-        side = Draws(task, seed, self.kind, self.level).random().choice([-1.0, 1.0], space.dofs)
+        super().begin(task, seed, space)
+        side = self.draws.random().choice([-1.0, 1.0], space.dofs)
         self._offset = side * level_of(LEVELS, self.level) * (self._high - self._low) / 2
 
     def act(self, action: Array, step: int) -> Array:

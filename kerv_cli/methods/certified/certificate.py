@@ -16,7 +16,7 @@ from kerv_cli.base.registry import part_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
+from kerv_cli.methods.artifacts import Artifact, MadeFor
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.streak import StreakSkipSettings
@@ -115,12 +115,8 @@ class CertificateArtifact(Artifact[Certificate]):
     again = "run 'kerv calibrate success'"
     schema = Certificate
 
-    def load(self, place: Any, request: Request) -> Certificate:
-        """See `Artifact.load`."""
-        return self.checked(place, request.description)
-
     def made_for(self, description: Certificate) -> MadeFor:
-        """See `Artifact.made_for`."""
+        """Its target; the chunk is the method's, see `certified`."""
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:

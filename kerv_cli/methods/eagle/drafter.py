@@ -126,7 +126,7 @@ def draft_tree(drafter: DraftsStates, target: Target, state: DraftState, depth: 
         logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
         child_values, child_tokens = (best.flatten() for best in logp.topk(top_k, -1))
         values, flat = child_values.topk(top_k)
-        # every child competes for a place in the tree, only the best top_k are expanded further
+        # every child competes for a path in the tree, only the best top_k are expanded further
         parents.append(level[:, None].expand(-1, top_k).flatten())
         every.append(child_tokens)
         cumulative.append(child_values)
@@ -218,10 +218,10 @@ class DrafterArtifact(Weights[DrafterDescription]):
         """A fresh drafter."""
         return Drafter.beside(description.settings, target)
 
-    def load(self, place: Path, request: Request) -> DraftsStates:
+    def load(self, path: Path, request: Request) -> DraftsStates:
         """The drafter, ready for inference, of whichever layout."""
-        public = self.checked(place, request.description).public
+        public = self.checked(path, request.description).public
         if public is not None:
-            return load_public(place, public, request.target)
-        drafter: Drafter = super().load(place, request)
+            return load_public(path, public, request.target)
+        drafter: Drafter = super().load(path, request)
         return drafter

@@ -113,26 +113,18 @@ class EarlyDrafter(Packable):
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
         """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
         radius: r in bins, see `choose`."""
-        return EarlyDraft.of(read(self.on_device(features, history, radius))[0])
+        return EarlyDraft.of(read(self.on_device(features, [history], radius)[0])[0])
 
     @torch.inference_mode()
-    def on_device(self, features: Tensor, history: np.ndarray, radius: int) -> Tensor:
-        """The draft of `drafted` without a wait for the device: N tokens and the odds, (N + 1,) float64."""
-        weight = self.head.weight
-        inputs = padded(history, self.settings.history, self.actions.dofs)
-        actions, valid = (upload(x, weight.device).to(weight.dtype)[None] for x in inputs)
-        logits = self(features.to(weight.dtype), actions, valid)
-        tokens, odds = choose_with_odds(logits, radius, self.strict)
-        return torch.cat([tokens[0].double(), odds.double()])
-
-    @torch.inference_mode()
-    def tokens_of(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> list[list[int]]:
-        """features (B, F) and the executed actions of B episodes, as in `drafted` -> their drafts of all N tokens."""
+    def on_device(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> Tensor:
+        """features (B, F) and the executed actions of B episodes, each as in `drafted` -> N tokens and the odds of
+        each, (B, N + 1) float64, without a wait for the device."""
         weight = self.head.weight
         inputs = [padded(history, self.settings.history, self.actions.dofs) for history in histories]
-        actions, valid = (torch.from_numpy(np.stack(x)).to(weight) for x in zip(*inputs, strict=True))
-        tokens: list[list[int]] = choose(self(features.to(weight), actions, valid), radius, self.strict).tolist()
-        return tokens
+        actions, valid = (upload(np.stack(x), weight.device).to(weight.dtype) for x in zip(*inputs, strict=True))
+        logits = self(features.to(weight.dtype), actions, valid)
+        tokens, odds = choose_with_odds(logits, radius, self.strict)
+        return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
 
 class PackedBlock:
@@ -184,7 +176,7 @@ class EarlyDraft:
 
     @classmethod
     def of(cls, numbers: np.ndarray) -> EarlyDraft:
-        """numbers: as `EarlyDrafter.on_device`."""
+        """numbers: (N + 1,), a row of `EarlyDrafter.on_device`."""
         return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]))
 
 
@@ -240,21 +232,25 @@ class EarlyProposer(ChainProposer):
     def drafted(self, chunk: Chunk) -> EarlyDraft:
         """The draft of the chunk's N tokens."""
         if self._drafted is None or self._drafted[0] is not chunk:
-            self._drafted = chunk, self.early.drafted(*self._inputs(chunk))
+            history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
+            self._drafted = chunk, self.early.drafted(self.features(chunk), history, radius)
         return self._drafted[1]
 
     def features(self, chunk: Chunk) -> Tensor:
         """What the network reads of the chunk's observation, (1, F): the pooled prompt."""
         return self.target.pooled(chunk.prompt)
 
-    def _inputs(self, chunk: Chunk) -> tuple[Tensor, np.ndarray, int]:
-        return self.features(chunk), chunk.situation.history.values(), max(chunk.limits, default=0)
+    def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
+        """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyDrafter.on_device`."""
+        histories = [chunk.situation.history.values() for chunk in chunks]
+        features = torch.cat([self.features(chunk) for chunk in chunks])
+        return self.early.on_device(features, histories, max(chunks[0].limits, default=0))
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
-        """The draft on the device, (N + 1,) as `EarlyDrafter.on_device`; None where the host has it."""
+        """The draft on the device, (N + 1,), see `EarlyDraft.of`; None where the host has it."""
         if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
             return None
-        return self.early.on_device(*self._inputs(chunk))
+        return self._rows([chunk])[0]
 
     def receive(self, chunk: Chunk, numbers: np.ndarray) -> None:
         """The host has read the vector of `on_device`."""
@@ -274,9 +270,8 @@ class EarlyProposer(ChainProposer):
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """The drafts of B chunks whose limits are equal."""
-        histories = [chunk.situation.history.values() for chunk in chunks]
-        features = torch.cat([self.features(chunk) for chunk in chunks])
-        return self.early.tokens_of(features, histories, max(chunks[0].limits, default=0))
+        tokens: list[list[int]] = self._rows(chunks)[:, :-1].long().tolist()
+        return tokens
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether the estimate that the whole chunk is accepted reaches SURE."""

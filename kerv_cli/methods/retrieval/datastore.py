@@ -34,7 +34,7 @@ from kerv_cli.engine.draft import ROOT, Draft
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.transfer import read
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Request
+from kerv_cli.methods.artifacts import Artifact, Request
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.retrieval.search import ExactIndex, Index, best
 from kerv_cli.targets.checkpoint import TargetDescription
@@ -253,27 +253,23 @@ class DatastoreArtifact(Artifact[Manifest]):
     made, again = "built", AGAIN
     schema = Manifest
 
-    def json(self, place: Path) -> Path:
+    def json(self, path: Path) -> Path:
         """`manifest.json`."""
-        return place / "manifest.json"
+        return path / "manifest.json"
 
-    def read(self, place: Path) -> Manifest:
+    def read(self, path: Path) -> Manifest:
         """See `Artifact.read`; the seeds must be training seeds."""
-        manifest = super().read(place)
-        check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, place)
+        manifest = super().read(path)
+        check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, path)
         return manifest
 
-    def made_for(self, description: Manifest) -> MadeFor:
-        """The target that it was built for."""
-        return MadeFor(description.target, description.actions, description.chunk)
-
-    def digest(self, place: Path, description: Manifest) -> str:
+    def digest(self, path: Path, description: Manifest) -> str:
         """`Manifest.content`."""
         return description.content
 
-    def load(self, place: Path, request: Request) -> Datastore:
+    def load(self, path: Path, request: Request) -> Datastore:
         """The datastore, opened."""
-        return Datastore.open(place, request.description, request.search)
+        return Datastore.open(path, request.description, request.search)
 
 
 def neighbour_tree(

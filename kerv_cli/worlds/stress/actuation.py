@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Draws, Spells, Stress, level_of
+from kerv_cli.worlds.stress.base import Array, Spells, Stress, level_of
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Actuation(Stress):
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         """Draws the gains of the DoFs."""
         level = level_of(LEVELS, self.level)
-        self._random = Draws(task, seed, self.kind, self.level).random()
+        super().begin(task, seed, space)
+        self._random = self.draws.random()
         self._loose = ~space.is_strict
         self._low, self._high = np.array(space.low)[self._loose], np.array(space.high)[self._loose]
         self._half, self._middle = (self._high - self._low) / 2, (self._high + self._low) / 2

@@ -66,7 +66,8 @@ class Stress:
         self.spread = 1.0
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Draws the episode's shift, before its reset. space: of the actions that `act` gets."""
+        """Fixes the episode's random numbers, before its reset. space: of the actions that `act` gets."""
+        self.draws = Draws(task, seed, self.kind, self.level)
 
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Changes the MjModel of an episode that was just reset; `changes.keep` comes before each change."""

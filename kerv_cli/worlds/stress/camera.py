@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, level_of
+from kerv_cli.worlds.stress.base import ModelChanges, Stress, level_of
 from kerv_cli.worlds.stress.turning import turned_quaternion
 from kerv_cli.worlds.vectors import unit_vector
 
@@ -30,14 +29,10 @@ class CameraJitter(Stress):
     kind = "camera"
     changes_model = True
 
-    def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fixes the episode's random numbers."""
-        self._draws = Draws(task, seed, self.kind, self.level)
-
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Moves and turns every camera."""
         level = level_of(LEVELS, self.level)
-        random = self._draws.random()
+        random = self.draws.random()
         changes.keep(model.cam_pos, model.cam_quat)
         for camera in range(model.ncam):
             model.cam_pos[camera] += unit_vector(random, 3) * level.metres

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, level_of, robot_roots
+from kerv_cli.worlds.stress.base import ModelChanges, Stress, level_of, robot_roots
 
 LEVELS = (0.1, 0.2, 0.3, 0.45)
 """Share of a random colour in the colour that multiplies a surface's texture."""
@@ -23,13 +22,9 @@ class Colour(Stress):
     kind = "colour"
     changes_model = True
 
-    def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fixes the episode's random numbers."""
-        self._draws = Draws(task, seed, self.kind, self.level)
-
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Mixes the colours of background and table with random ones."""
-        share, random = level_of(LEVELS, self.level), self._draws.random()
+        share, random = level_of(LEVELS, self.level), self.draws.random()
         changes.keep(model.geom_rgba)
         scenery = scenery_of(model)
         bodies = sorted({int(model.geom_bodyid[geom]) for geom in scenery})

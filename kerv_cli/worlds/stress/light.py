@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, either, level_of
+from kerv_cli.worlds.stress.base import ModelChanges, Stress, either, level_of
 from kerv_cli.worlds.stress.turning import turned
 
 
@@ -30,14 +29,10 @@ class Light(Stress):
     kind = "light"
     changes_model = True
 
-    def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fixes the episode's random numbers."""
-        self._draws = Draws(task, seed, self.kind, self.level)
-
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Scales all light, and turns and moves the lamps."""
         level = level_of(LEVELS, self.level)
-        random, head = self._draws.random(), model.vis.headlight
+        random, head = self.draws.random(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
         strengths = (*lights, head.ambient, head.diffuse, head.specular)
         changes.keep(*strengths, model.light_dir, model.light_pos)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Draws, ModelChanges, Stress, either, level_of, objects
+from kerv_cli.worlds.stress.base import ModelChanges, Stress, either, level_of, objects
 
 
 @dataclass(frozen=True)
@@ -38,14 +37,10 @@ class Objects(Stress):
         super().__init__(level)
         self.spread = level_of(LEVELS, level).spread
 
-    def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Fixes the episode's random numbers."""
-        self._draws = Draws(task, seed, self.kind, self.level)
-
     def change(self, model: Any, changes: ModelChanges) -> None:
         """Scales the objects' size, mass and friction."""
         level = level_of(LEVELS, self.level)
-        random = self._draws.random()
+        random = self.draws.random()
         size, mass, friction = (either(random, factor) for factor in (level.size, level.mass, level.friction))
         changes.keep(model.geom_friction, model.dof_damping, model.dof_frictionloss, model.dof_invweight0)
         changes.keep(model.body_mass, model.body_inertia, model.body_subtreemass, model.body_invweight0)

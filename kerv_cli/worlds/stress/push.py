@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Draws, Spells, Stress, level_of
+from kerv_cli.worlds.stress.base import Array, Spells, Stress, level_of
 from kerv_cli.worlds.vectors import unit_vector
 
 SECONDS = 0.1
@@ -23,7 +23,8 @@ class Push(Stress):
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         """Fixes the episode's random numbers and its rate of bursts."""
         group = space.dofs_of("position")
-        self._random = Draws(task, seed, self.kind, self.level).random()
+        super().begin(task, seed, space)
+        self._random = self.draws.random()
         self._spells = Spells.per_second(level_of(LEVELS, self.level), SECONDS, space.control_hz)
         self._at = group
         low, high = np.array(space.low)[group], np.array(space.high)[group]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Draws, Stress, level_of
+from kerv_cli.worlds.stress.base import Stress, level_of
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,14 @@ class Sensor(Stress):
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         """Fixes the episode's random numbers and forgets the images of the last one."""
-        self._draws = Draws(task, seed, self.kind, self.level)
+        super().begin(task, seed, space)
         self._last: dict[str, NDArray[np.uint8]] = {}
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
         """The blurred and noisy image, or the last one of this camera. The random numbers follow from the control step,
         so that repeated calls of a step agree."""
         level = level_of(LEVELS, self.level)
-        random = self._draws.random(camera, step)
+        random = self.draws.random(camera, step)
         dropped = random.random() < level.dropped
         if dropped and camera in self._last:
             return self._last[camera]

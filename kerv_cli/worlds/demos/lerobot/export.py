@@ -25,26 +25,7 @@ from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import encode_png
-from kerv_cli.worlds.demos.lerobot.layout import (
-    ACTION,
-    COUNTERS,
-    DATA,
-    DONE,
-    ENVIRONMENT,
-    EPISODES,
-    EXECUTED,
-    FILE_MB,
-    IMAGES,
-    INFO,
-    STATE,
-    STATS,
-    TASKS,
-    VERSION,
-    VIDEO,
-    counters,
-    data_path,
-    numbers,
-)
+from kerv_cli.worlds.demos.lerobot import layout
 
 EVERY = 10  # statistics are computed from every tenth image
 
@@ -93,7 +74,7 @@ class Export:
     @property
     def image_keys(self) -> list[str]:
         """The feature of each view of the frames."""
-        return [f"{IMAGES}{view}" for view in self.camera.split(VIEWS)]
+        return [f"{layout.IMAGES}{view}" for view in self.camera.split(VIEWS)]
 
     def columns(self, episode: DemoEpisode) -> dict[str, np.ndarray]:
         """Every numeric column of an episode (n, …), one row per frame."""
@@ -103,11 +84,11 @@ class Export:
         done = np.zeros(count, dtype=bool)
         done[-1] = True
         return {
-            STATE: episode.states[steps, :width].astype(np.float32),
-            ENVIRONMENT: episode.states[steps].astype(np.float32),
-            ACTION: episode.labels[steps].astype(np.float32),
-            EXECUTED: episode.executed[steps].astype(np.float32),
-            DONE: done,
+            layout.STATE: episode.states[steps, :width].astype(np.float32),
+            layout.ENVIRONMENT: episode.states[steps].astype(np.float32),
+            layout.ACTION: episode.labels[steps].astype(np.float32),
+            layout.EXECUTED: episode.executed[steps].astype(np.float32),
+            layout.DONE: done,
             "timestamp": (np.arange(count) / self.rate).astype(np.float32),
             "frame_index": np.arange(count),
             "episode_index": np.full(count, len(self.episodes)),
@@ -124,7 +105,7 @@ class Export:
                 arrays[name] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
             else:
                 arrays[name] = pa.array(values)
-            if name != DONE:
+            if name != layout.DONE:
                 self.moments.setdefault(name, Moments()).add(values.reshape(len(values), -1))
         keys = self.image_keys
         for key, frames in zip(keys, np.split(np.asarray(episode.frames), len(keys), axis=2), strict=True):
@@ -146,16 +127,16 @@ class Export:
             }
         )
         self.rows += len(episode.frames)
-        order = [*keys, *(name for name in arrays if name not in (*COUNTERS, *keys)), *COUNTERS]
+        order = [*keys, *(name for name in arrays if name not in (*layout.COUNTERS, *keys)), *layout.COUNTERS]
         return pa.table({name: arrays[name] for name in order})
 
     def write_data(self, progress: Callable[[int, int], None]) -> None:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
-            with atomic_path(data_path(self.folder, file)) as temporary, contextlib.ExitStack() as stack:
+            with atomic_path(layout.data_path(self.folder, file)) as temporary, contextlib.ExitStack() as stack:
                 writer, size = None, 0
-                while index < total and size <= FILE_MB * 2**20:
+                while index < total and size <= layout.FILE_MB * 2**20:
                     table = self.table(self.dataset.load(index), file)
                     writer = writer or stack.enter_context(
                         pq.ParquetWriter(temporary, table.schema, compression="snappy")
@@ -172,38 +153,38 @@ class Export:
         image = {"dtype": "image", "shape": list(self.size), "names": ["height", "width", "channels"]}
         features = {
             **dict.fromkeys(self.image_keys, image),
-            STATE: numbers("float32", list(observation.proprioception)),
-            ENVIRONMENT: numbers("float32", [f"state_{i}" for i in range(observation.state)]),
-            ACTION: numbers("float32", list(actions.names)),
-            EXECUTED: numbers("float32", list(actions.names)),
-            DONE: {"dtype": "bool", "shape": [1], "names": None},
-            **counters(),
+            layout.STATE: layout.numbers("float32", list(observation.proprioception)),
+            layout.ENVIRONMENT: layout.numbers("float32", [f"state_{i}" for i in range(observation.state)]),
+            layout.ACTION: layout.numbers("float32", list(actions.names)),
+            layout.EXECUTED: layout.numbers("float32", list(actions.names)),
+            layout.DONE: {"dtype": "bool", "shape": [1], "names": None},
+            **layout.counters(),
         }
         return {
-            "codebase_version": VERSION,
+            "codebase_version": layout.VERSION,
             "robot_type": manifest.environment,
             "total_episodes": len(self.episodes),
             "total_frames": self.rows,
             "total_tasks": len(self.tasks),
             "chunks_size": 1000,
-            "data_files_size_in_mb": FILE_MB,
+            "data_files_size_in_mb": layout.FILE_MB,
             "video_files_size_in_mb": 200,
             "fps": int(self.rate) if self.rate == int(self.rate) else self.rate,
             "splits": {"train": f"0:{len(self.episodes)}"},
-            "data_path": DATA,
-            "video_path": VIDEO,
+            "data_path": layout.DATA,
+            "video_path": layout.VIDEO,
             "features": features,
         }
 
     def write_meta(self) -> None:
         """Tasks, episodes, statistics and, last, the description: without it there is no dataset."""
         names = pd.Index([_instruction(task) for task in self.tasks], name="task")
-        with atomic_path(self.folder / TASKS) as temporary:
+        with atomic_path(self.folder / layout.TASKS) as temporary:
             pd.DataFrame({"task_index": list(self.tasks.values())}, index=names).to_parquet(temporary)
-        with atomic_path(self.folder / EPISODES.format(chunk_index=0, file_index=0)) as temporary:
+        with atomic_path(self.folder / layout.EPISODES.format(chunk_index=0, file_index=0)) as temporary:
             pq.write_table(pa.Table.from_pylist(self.episodes), temporary)
-        write_json(self.folder / STATS, {name: moments.plain() for name, moments in self.moments.items()})
-        write_json(self.folder / INFO, self.info())
+        write_json(self.folder / layout.STATS, {name: moments.plain() for name, moments in self.moments.items()})
+        write_json(self.folder / layout.INFO, self.info())
 
 
 def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], None]) -> Export:
@@ -220,7 +201,7 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
     if len({_instruction(name) for name in names}) < len(names):
         raise UsageError("two tasks have the same instruction, which LeRobot tells tasks apart by: export them apart")
     tasks = {name: number for number, name in enumerate(names)}
-    (folder / INFO).unlink(missing_ok=True)
+    (folder / layout.INFO).unlink(missing_ok=True)
     result = Export(dataset, folder, config["camera"]["name"], rate, tasks)
     result.write_data(progress)
     result.write_meta()

@@ -21,17 +21,7 @@ from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
 from kerv_cli.worlds.demos.dataset import FORMAT, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
-from kerv_cli.worlds.demos.lerobot.layout import (
-    ACTION,
-    DATA,
-    ENVIRONMENT,
-    EXECUTED,
-    IMAGES,
-    INFO,
-    STATE,
-    TASKS,
-    VIDEO,
-)
+from kerv_cli.worlds.demos.lerobot import layout
 
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
@@ -49,27 +39,28 @@ class Source:
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
         """Raises CheckpointError: no dataset of version 3, or a damaged one. UnknownName: no such camera."""
-        info = read_json(folder / INFO)
+        info = read_json(folder / layout.INFO)
         version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
         if not version.startswith("v3."):
             raise CheckpointError(
-                f"{folder / INFO} is of version {version}, v3.x is read: convert it with LeRobot's own "
+                f"{folder / layout.INFO} is of version {version}, v3.x is read: convert it with LeRobot's own "
                 "convert_dataset_v21_to_v30"
             )
-        cameras = [k.removeprefix(IMAGES) for k, v in info["features"].items() if v["dtype"] in ("image", "video")]
-        if not cameras or ACTION not in info["features"]:
-            raise CheckpointError(f"{folder} has no images or no {ACTION}: it cannot be learned from")
+        pictures = [name for name, feature in info["features"].items() if feature["dtype"] in ("image", "video")]
+        cameras = [name.removeprefix(layout.IMAGES) for name in pictures]
+        if not cameras or layout.ACTION not in info["features"]:
+            raise CheckpointError(f"{folder} has no images or no {layout.ACTION}: it cannot be learned from")
         if camera and camera not in cameras:
             raise UnknownName("camera", camera, cameras)
         rows = [row for path in sorted(folder.glob("meta/episodes/*/*.parquet")) for row in _table(path).to_pylist()]
-        named = _table(folder / TASKS).to_pylist()
+        named = _table(folder / layout.TASKS).to_pylist()
         tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in named}
         return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
 
     @property
     def key(self) -> str:
         """Name of the feature that holds the camera's images."""
-        return self.camera if self.camera in self.info["features"] else f"{IMAGES}{self.camera}"
+        return self.camera if self.camera in self.info["features"] else f"{layout.IMAGES}{self.camera}"
 
     def names(self, feature: str, prefix: str) -> list[str]:
         """Names of a vector's numbers: the dataset's where they are complete and distinct, else `prefix`_0, …; empty
@@ -87,7 +78,7 @@ class Source:
     def table(self, episode: Mapping[str, Any]) -> pa.Table:
         """The rows of one episode, in order."""
         indices = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
-        path = self.folder / str(self.info.get("data_path") or DATA).format(**indices)
+        path = self.folder / str(self.info.get("data_path") or layout.DATA).format(**indices)
         table = _table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
         if len(table) != int(episode["length"]):
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
@@ -98,7 +89,7 @@ class Source:
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
         indices = {f"{x}_index": int(episode[f"videos/{self.key}/{x}_index"]) for x in ("chunk", "file")}
-        path = self.folder / str(self.info.get("video_path") or VIDEO).format(video_key=self.key, **indices)
+        path = self.folder / str(self.info.get("video_path") or layout.VIDEO).format(video_key=self.key, **indices)
         start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
         return np.stack(list(_video_frames(path, start, rate, len(table))))
 
@@ -139,13 +130,13 @@ def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], t
     number = int(row["episode_index"])
     columns = {
         name: np.stack(table[name].to_pylist()).astype(np.float32).reshape(len(table), -1)
-        for name in (ACTION, EXECUTED, STATE, ENVIRONMENT)
+        for name in (layout.ACTION, layout.EXECUTED, layout.STATE, layout.ENVIRONMENT)
         if name in table.column_names
     }
     if not all(np.isfinite(values).all() for values in columns.values()):
         raise CheckpointError(f"episode {number} of {source.folder} holds numbers that are not finite")
-    labels = columns[ACTION]
-    states = columns.get(ENVIRONMENT, columns.get(STATE, np.zeros((len(table), 0), np.float32)))
+    labels = columns[layout.ACTION]
+    states = columns.get(layout.ENVIRONMENT, columns.get(layout.STATE, np.zeros((len(table), 0), np.float32)))
     return DemoEpisode(
         task=names[int(table["task_index"][0].as_py())],
         seed=number,
@@ -155,7 +146,7 @@ def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], t
         frame_steps=np.arange(len(table), dtype=np.int64),
         states=states,
         labels=np.concatenate([labels, np.repeat(labels[-1:], tail, 0)]),
-        executed=columns.get(EXECUTED, labels),
+        executed=columns.get(layout.EXECUTED, labels),
         initial_state=states[0].astype(np.float64),
     )
 
@@ -168,7 +159,7 @@ def _manifest(
     actions: np.ndarray,
     state: int,
 ) -> dict[str, Any]:
-    proprioception = source.names(STATE, "state")
+    proprioception = source.names(layout.STATE, "state")
     observation = ObservationSpace(tuple(proprioception[:state]), state, (), (0.0, 0.0, 0.0))
     config = {
         "source": str(source.folder.resolve()),
@@ -198,7 +189,7 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
     Raises:
         UsageError: dofs=openvla for another number of DoFs, or an unknown strict one.
     """
-    names = tuple(source.names(ACTION, "action"))
+    names = tuple(source.names(layout.ACTION, "action"))
     if settings.dofs == "openvla":
         if len(names) != len(OPENVLA):
             raise UsageError(f"dofs=openvla: the dataset has {len(names)} DoFs ({', '.join(names)}), OpenVLA has 7")
