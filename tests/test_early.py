@@ -282,7 +282,7 @@ def test_observations_come_with_what_was_executed_before_them(nano: CompactTarge
         assert np.allclose(some["history"][t], normal[t - 2 : t])
     assert np.allclose(some["history"][1, 1], normal[0])
     assert some["episodes"].tolist() == [3] * 10
-    states = [one.state for one in observations_of(demo, np.arange(10), OBSERVATION, ())]
+    states = [one.state for one in observations_of(nano, demo, np.arange(10), OBSERVATION)]
     assert np.array_equal(np.stack(states), demo.states)
 
 

@@ -67,7 +67,7 @@ def entries_of(
     """
     steps = steps_of(target, episode)[::stride]
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
-    observations = observations_of(episode, steps, space or target.observation, target.cameras)
+    observations = observations_of(target, episode, steps, space or target.observation)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
     keys = [prompt_key(prompt, target, segments) for prompt in prompts_of(target, observations, size)]
     return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)

@@ -72,7 +72,7 @@ def teach_early(
             episode = dataset.load(index)
             steps = evenly(steps_of(target, episode), share)
             columns.append(columns_of(target, episode, index, steps, settings.history))
-            yield from observations_of(episode, steps, dataset.manifest.observation, target.cameras)
+            yield from observations_of(target, episode, steps, dataset.manifest.observation)
             on_progress(index + 1, len(dataset.episodes))
 
     features, tokens = [], []

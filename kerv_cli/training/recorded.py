@@ -20,7 +20,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import EncodesMany, Target
-from kerv_cli.training.observations import Rows, instruction_of
+from kerv_cli.training.observations import Rows, check_frames, instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
@@ -34,21 +34,23 @@ def steps_of(target: Target, episode: DemoEpisode) -> np.ndarray:
 
 
 def observations_of(
-    episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, cameras: Sequence[str]
+    target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """The observations at some control steps (n,) of a demonstration. space: the demonstrations'. cameras: names that
-    the target gives to the recorded frame.
+    """The observations at some control steps (n,) of a demonstration, as the target takes them; all its cameras see the
+    recorded frame. space: the demonstrations'.
 
     Raises:
-        CheckpointError: cameras, but no frame of one of the steps.
+        CheckpointError: cameras, but no frame of one of the steps, or frames of another size than `frame_shape`.
     """
     pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
-    if cameras:
+    if target.cameras:
+        if frame_shape := getattr(target, "frame_shape", None):
+            check_frames(episode, frame_shape[0])
         rows = np.searchsorted(episode.frame_steps, steps).clip(max=len(episode.frame_steps) - 1)
         missing = steps[episode.frame_steps[rows] != steps]
         if len(missing):
             raise CheckpointError(f"step {missing[0]} of {episode.task} {episode.seed} has no frame: record every step")
-        pictures = [dict.fromkeys(cameras, frame) for frame in np.asarray(episode.frames[rows])]
+        pictures = [dict.fromkeys(target.cameras, frame) for frame in np.asarray(episode.frames[rows])]
     states, instruction = episode.states[steps].astype(np.float64), instruction_of(episode.task)
     felt = len(space.proprioception)
     return [
@@ -146,7 +148,7 @@ def _decodes(
     def observations() -> Iterator[Observation]:
         for index, group in itertools.groupby(chosen, lambda row: row[0]):
             steps = np.array([step for _, step in group])
-            yield from observations_of(dataset.load(index), steps, dataset.manifest.observation, target.cameras)
+            yield from observations_of(target, dataset.load(index), steps, dataset.manifest.observation)
 
     for prompt in prompts_of(target, observations()):
         tokens, hidden = greedy(target, prompt)
