@@ -15,7 +15,7 @@ from kerv_cli.engine.acceptance import Acceptance, Strict
 from kerv_cli.engine.chunk import Chunk, Clock, Rejection, Situation, steps_of
 from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold, Watches
-from kerv_cli.engine.proposer import Asks, Proposer
+from kerv_cli.engine.proposer import Asks, Proposer, Remembers
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Look, Round
 from kerv_cli.engine.transfer import read, upload
@@ -110,8 +110,9 @@ class Decoder:
 
     def finish(self, success: bool) -> None:
         """The episode ended."""
-        if self.parts.skip is not None:
-            self.parts.skip.finish(success)
+        for part in (self.parts.skip, self.parts.prefill_draft, self.parts.proposer):
+            if isinstance(part, Remembers):
+                part.finish(success)
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:

@@ -63,6 +63,14 @@ class Asks(Protocol):
         """Called before the prefill: adds to `chunk.reads` the vectors to be read with its tokens."""
 
 
+@runtime_checkable
+class Remembers(Protocol):
+    """A part that keeps something from one episode for the next."""
+
+    def finish(self, success: bool) -> None:
+        """An episode ended. One that another follows without it, as in a warm-up, is not to be remembered."""
+
+
 class Stateless:
     """Base of proposers that need no hidden states and keep no state between rounds."""
 

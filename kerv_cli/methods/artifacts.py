@@ -113,6 +113,10 @@ class Artifact(Generic[T]):
         """Kind -> hash of the other artifacts that it was made from; none, where target and demonstrations suffice."""
         return {}
 
+    def brings(self, description: T) -> tuple[str, ...]:
+        """Further kinds that a method with this artifact reads, which the artifact alone knows."""
+        return ()
+
     def digest(self, place: Path, description: T) -> str:
         """The hash that is part of the identity of results."""
         return sha256_of(self.json(place))
@@ -240,12 +244,16 @@ class Artifacts:
             CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
                 one among `kinds`.
         """
-        there = {kind: (kind_of(kind), self.place(kind)) for kind in kinds}
-        described = {kind: own.checked(place, self.description) for kind, (own, place) in there.items()}
-        hashes = {TARGET: self.description.sha256}
-        hashes |= {kind: own.digest(place, described[kind]) for kind, (own, place) in there.items()}
-        for kind, (own, place) in there.items():
-            own.check_made_from(place, described[kind], hashes)
+        hashes, described, todo = {TARGET: self.description.sha256}, {}, list(kinds)
+        for kind in todo:
+            if kind in described:
+                continue
+            artifact, place = kind_of(kind), self.place(kind)
+            description = described[kind] = artifact.checked(place, self.description)
+            hashes[kind] = artifact.digest(place, description)
+            todo += artifact.brings(description)
+        for kind, description in described.items():
+            kind_of(kind).check_made_from(self.place(kind), description, hashes)
         return hashes
 
     def load(self, kind: str) -> Any:

@@ -10,7 +10,7 @@ import torch
 
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.proposer import DraftsChunks, Stateless
+from kerv_cli.engine.proposer import DraftsChunks, Remembers, Stateless
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.engine.unread import TreeRows, Unread
@@ -46,6 +46,12 @@ class MergedProposer(Stateless):
 
         sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
         return cls(sources, settings.nodes, fallback)
+
+    def finish(self, success: bool) -> None:
+        """Tells the sources."""
+        for source in (*self.sources, *self.fallback):
+            if isinstance(source, Remembers):
+                source.finish(success)
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree | Unread:
         """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
