@@ -13,10 +13,12 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import TrainSettings, WorldSettings
+from kerv_cli.base.settings import DemosSettings, PolicySettings, RolloutSettings, TrainSettings, WorldSettings
 from kerv_cli.cli.app import app
-from kerv_cli.training.dagger import TargetActs
+from kerv_cli.lab.policy import decoder_for
+from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import sample_weights
 from kerv_cli.training.loop import Job
@@ -27,6 +29,7 @@ from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.spec import EnvironmentSpec
 
 SHORT = CameraConfig()
 SIZES = ("target.width=16", "target.layers=1", "target.heads=2", "target.feed_forward=16")
@@ -107,9 +110,13 @@ def test_datasets_of_other_cameras_do_not_add_up(results: Path, tmp_path: Path) 
         DemoDataset.joined([open_demos(str(results), "few"), DemoDataset.open(tmp_path / "other")])
 
 
+def acts_of(target: str, spec: EnvironmentSpec, world: WorldSettings | None = None) -> PolicyActs:
+    return PolicyActs.of(DemosSettings(policy=PolicySettings(target=target), world=world or WorldSettings()), spec)
+
+
 @pytest.mark.bits
 def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
-    acts = TargetActs.of("results", "mt10-state", SPEC, WorldSettings())
+    acts = acts_of("mt10-state", SPEC)
     tasks, share = ("reach-v3",), 0.5
     config = DemoConfig(tasks, 2, camera=SHORT, frame_stride=20, workers=1, horizon=60, expert_share=share)
     config = DemoConfig(**(vars(config) | {"policy": acts.sha256}))
@@ -129,6 +136,23 @@ def test_a_target_acts_and_the_expert_labels(tmp_path: Path) -> None:
         np.testing.assert_allclose(expert(observation), label, atol=1e-6)
         observation = world.step(action)
     world.close()
+
+
+def test_a_policy_acts_by_its_method(tmp_path: Path) -> None:
+    words = ("policy=vision", "method=early_unverified", "task=reach", f"name={tmp_path / 'visited'}", "episodes=1")
+    short = ("world.horizon=12", "expert_share=0", "frame_stride=4", "runtime.workers=1")
+    done = CliRunner().invoke(app, ["demos", *words, *short])
+    assert done.exit_code == 0, done.output
+    episode = DemoDataset.open(tmp_path / "visited").load(0)
+    settings = compose("rollout", ["method=early_unverified"], RolloutSettings)
+    decoder, world = decoder_for(settings, "reach-v3"), SPEC.open_world("reach-v3", SHORT)
+    world.reset(0)
+    decoder.reset("reach-v3", 0, world.end_effector)
+    first = decoder.decode(world.observe(decoder.cameras)).actions
+    world.close()
+    np.testing.assert_allclose(episode.executed[: len(first)], first, atol=1e-6)
+    refused = CliRunner().invoke(app, ["demos", "policy=vision", "method=watch", "task=reach", *short])
+    assert (refused.exit_code, "skip=watch with kerv demos" in refused.stderr) == (2, True)
 
 
 def test_an_actors_failed_episode_is_kept(tmp_path: Path) -> None:
@@ -151,12 +175,12 @@ def test_a_target_of_another_frame_size_is_refused() -> None:
     settings = WorldSettings()
     settings.camera.size = 48
     with pytest.raises(UsageError, match=r"world.camera.size=48"):
-        TargetActs.of("results", "mt10-vision", SPEC, settings)
+        acts_of("mt10-vision", SPEC, settings)
 
 
 def test_a_target_of_other_actions_is_refused() -> None:
     with pytest.raises(CheckpointError, match="target 'mt10-state'"):
-        TargetActs.of("results", "mt10-state", spec_of("insert-peg"), WorldSettings())
+        acts_of("mt10-state", spec_of("insert-peg"))
 
 
 @pytest.mark.parametrize(
@@ -166,7 +190,7 @@ def test_a_recording_may_show_further_views_than_the_target_sees(camera: str, ac
     settings = WorldSettings()
     settings.camera.name = camera
     if accepted:
-        assert TargetActs.of("results", "mt10-vision", SPEC, settings).sha256
+        assert acts_of("mt10-vision", SPEC, settings).sha256
     else:
         with pytest.raises(UsageError, match="or join further views behind it"):
-            TargetActs.of("results", "mt10-vision", SPEC, settings)
+            acts_of("mt10-vision", SPEC, settings)

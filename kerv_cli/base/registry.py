@@ -32,11 +32,13 @@ OWN = (
     "kerv_cli.methods.eagle",
     "kerv_cli.methods.early",
     "kerv_cli.methods.scout",
+    "kerv_cli.methods.self_cache",
     "kerv_cli.methods.kinematics",
     "kerv_cli.methods.parallel",
     "kerv_cli.methods.streak",
     "kerv_cli.methods.unverified",
     "kerv_cli.methods.sp_vla",
+    "kerv_cli.methods.agreement",
     "kerv_cli.methods.watch",
     "kerv_cli.methods.retrieval",
     "kerv_cli.methods.heisd",
@@ -63,7 +65,7 @@ PREFILL, STATES = "prefill", "states"
 
 TRAITS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "artifact", "drafter", "column"), ()),
-    "proposer": ("when", "chains", "sides"),
+    "proposer": ("when", "chains", "sides", "remembers"),
     "boundary": ("chooses",),
     "skip": ("takes_draft", "merges", "parallel", "watches"),
     "predictor": ("fitted",),

@@ -335,17 +335,16 @@ class TrainTargetSettings(TaskSettings):
 
 
 @dataclass
-class DemosSettings(TaskSettings):
-    """`kerv demos`."""
+class DemosSettings(MethodSettings, TaskSettings):
+    """`kerv demos`. policy: what acts; expert, or a policy that the expert labels (DAgger)."""
 
-    groups: ClassVar = {"policy": "expert", "world": "default", "runtime": "workers"}
+    groups: ClassVar = {"policy": "expert", "world": "default", "runtime": "workers", "method": "ar"}
 
     name: str | None = setting(None, "default: the tasks' names, in small letters")
     episodes: int = number(100, 1, 100_000, help="episodes per task")
     seed: int = number(0, 0, 2**31 - 1, help="first seed")
     perturbed: float = number(0.5, 0, 1, help="share of episodes in which the expert is disturbed")
-    policy: PolicySettings = setting(PolicySettings, "what acts: expert, or a policy that the expert labels (DAgger)")
-    expert_share: float = number(0.3, 0, 1, help="of a target's chunks: those that the expert executes")
+    expert_share: float = number(0.3, 0, 1, help="of a policy's chunks: those that the expert executes")
     frame_stride: int = number(2, 1, 10_000, help="control steps between two images that are kept")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 

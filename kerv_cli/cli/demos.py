@@ -19,7 +19,7 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, print_figures, print_plan, print_table, progress_bar
 
 if TYPE_CHECKING:
-    from kerv_cli.training.dagger import TargetActs
+    from kerv_cli.training.dagger import PolicyActs
 
 
 @command(
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     examples=("kerv demos name=mine task=MT10 episodes=100", "kerv demos name=visited policy=vision task=reach --plan"),
 )
 def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
-    """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a target
-    visits, labelled by the expert."""
+    """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a policy
+    visits by its method, labelled by the expert."""
     from kerv_cli.worlds import resolve_tasks, spec_of
 
     tasks = resolve_tasks(settings.task)
@@ -66,15 +66,15 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
 
 
-def _actor(settings: DemosSettings, task: str) -> TargetActs | None:
-    """The target that moves the robot instead of the expert; None: the expert. task: one of the recorded tasks."""
+def _actor(settings: DemosSettings, task: str) -> PolicyActs | None:
+    """The policy that moves the robot instead of the expert; None: the expert. task: one of the recorded tasks."""
     from kerv_cli.worlds import spec_of
 
     target = settings.policy.target
     if settings.policy.kind != EXPERT:
-        from kerv_cli.training.dagger import TargetActs
+        from kerv_cli.training.dagger import PolicyActs
 
-        return TargetActs.of(settings.results, target, spec_of(task), settings.world)
+        return PolicyActs.of(settings, spec_of(task))
     if target != PolicySettings().target:
         raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
     return None

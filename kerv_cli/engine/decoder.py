@@ -109,8 +109,9 @@ class Decoder:
 
     def finish(self, success: bool) -> None:
         """The episode ended."""
-        if self.parts.skip is not None:
-            self.parts.skip.finish(success)
+        for part in (self.parts.skip, self.parts.prefill_draft, self.parts.proposer):
+            if part is not None:
+                part.finish(success)
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:

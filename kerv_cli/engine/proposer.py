@@ -37,6 +37,9 @@ class Proposer:
         target's states at chunk indices first … first + T − 1. target_tokens: the round's 1 + n argmax tokens, those
         behind rejected nodes included."""
 
+    def finish(self, success: bool) -> None:
+        """An episode ended. One that another follows without it, as in a warm-up, is not to be remembered."""
+
 
 class ChainProposer(Proposer):
     """Drafts whole chunks without the target's hidden states: a source of merged drafts and of unverified chunks."""

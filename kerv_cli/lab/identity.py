@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.registry import METHOD_KINDS, part_of
+from kerv_cli.base.registry import METHOD_KINDS, part_of, parts
 from kerv_cli.base.settings import (
     CONSTANT,
     EXPERT,
@@ -119,9 +119,12 @@ def complete_settings(settings: Plain) -> dict[str, Any]:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Whether an episode's result depends on the episodes before it in its cell: a skip level that feedback moves."""
-    skip = settings.get("skip", {})
-    return bool(skip.get("up") or skip.get("down"))
+    """Whether an episode's result depends on the episodes before it in its cell: a proposer that remembers them, or a
+    skip level that feedback moves."""
+    skip, drafts = settings.get("skip", {}), [settings.get(kind, {}) for kind in ("proposer", "prefill_draft")]
+    names = [name for d in drafts for name in (d.get("kind"), *d.get("sources", ()), *d.get("fallback", ()))]
+    remembers = {name for name in parts("proposer") if part_of("proposer", name).traits.get("remembers")}
+    return bool(skip.get("up") or skip.get("down") or remembers.intersection(names))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:

@@ -114,6 +114,10 @@ class Artifact(Generic[T]):
         """Kind -> hash of the other artifacts that it was made from; none, where target and demonstrations suffice."""
         return {}
 
+    def brings(self, description: T) -> tuple[str, ...]:
+        """Further kinds that a method with this artifact reads, which the artifact alone knows."""
+        return ()
+
     def digest(self, path: Path, description: T) -> str:
         """The hash that is part of the identity of results."""
         return sha256_of(self.json(path))
@@ -233,11 +237,14 @@ class Artifacts:
             CheckpointError: one is missing, damaged, or was made for another target, or from another artifact than the
                 one among `kinds`.
         """
-        hashes, sources = {TARGET: self.description.sha256}, []
-        for kind in kinds:
+        hashes, sources, todo = {TARGET: self.description.sha256}, [], list(kinds)
+        for kind in todo:
+            if kind in hashes:
+                continue
             files, path = kind_of(kind), self.path(kind)
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
+            todo += files.brings(description)
             sources.append((files.sources(description), f"the {files.noun} in {path} was {files.made}", files.again))
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)

@@ -9,7 +9,7 @@ from typing import Any
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import METHOD_KINDS, PREFILL, Part, part_of
-from kerv_cli.base.settings import RolloutSettings, ServeSettings
+from kerv_cli.base.settings import MethodSettings
 from kerv_cli.engine.chunk import steps_of
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
@@ -42,8 +42,8 @@ class Method:
     name: str = ""
 
     @classmethod
-    def of(cls, settings: RolloutSettings | ServeSettings) -> Method:
-        """The method of a rollout, or of a served policy."""
+    def of(cls, settings: MethodSettings) -> Method:
+        """The method of a command's settings."""
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number
@@ -30,7 +30,7 @@ class WatchSettings:
     tolerance: float = number(0.1, 0, FARTHEST)  # mean abs difference of two actions that still agree, normalised
 
 
-def check_source(settings: WatchSettings) -> None:
+def check_source(settings: Any) -> None:
     """Raises UnknownName for a source that is not there, UsageError for one that cannot look."""
     if not find("proposer", settings.source, "skip.source").traits.get("chains"):
         raise UsageError(f"skip.source={settings.source}: it does not draft whole chunks from an observation")
@@ -60,10 +60,19 @@ class Watch(Skip):
         return not chains or FARTHEST * chunk_loss(chunk.space, chains[0], planned, FARTHEST) <= self.tolerance
 
 
-def _needs(settings: WatchSettings) -> tuple[str, ...]:
+def needs_of_source(settings: Any) -> tuple[str, ...]:
     """What the source reads."""
     part = find("proposer", settings.source)
     return part.needs(part.default)
 
 
-add("skip", "watch", "kerv_cli.methods.watch:Watch.build", WatchSettings, _needs, check_source, 0x5F7FA8, watches=True)
+add(
+    "skip",
+    "watch",
+    "kerv_cli.methods.watch:Watch.build",
+    WatchSettings,
+    needs_of_source,
+    check_source,
+    0x5F7FA8,
+    watches=True,
+)

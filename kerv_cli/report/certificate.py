@@ -41,10 +41,11 @@ def place_of(resolved: ResolvedStudy, name: str | None) -> Path:
         raise UsageError(f"study '{resolved.study.name}' has nothing but its baseline to certify")
     first, tasks = candidates[0], resolve_tasks(baseline.task)
     for label, other in list(resolved.settings.items()):
-        differing = [kind for kind in METHOD_KINDS if kind != "skip" and getattr(other, kind) != getattr(first, kind)]
+        differing = [k for k in METHOD_KINDS if k not in _VARIED and getattr(other, k) != getattr(first, k)]
         if label != resolved.study.baseline and differing:
             raise UsageError(
-                f"setting '{label}' differs in {differing[0]}: a certificate is of settings that differ in skip="
+                f"setting '{label}' differs in {differing[0]}: a certificate is of settings that differ in "
+                f"{'= and '.join(_VARIED)}="
             )
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
@@ -72,6 +73,7 @@ def certify(
             Candidate(
                 label=label,
                 skip=dataclasses.asdict(settings.skip),
+                draft=dataclasses.asdict(settings.prefill_draft),
                 pairs=len(pairs),
                 ar=int(both[:, 0].sum()),
                 successes=int(both[:, 1].sum()),
@@ -84,7 +86,7 @@ def certify(
         testing = p is not None and p <= delta
         chosen = len(candidates) - 1 if testing else chosen
     artifacts = artifacts_of(first)
-    hashes = artifacts.check(Method.of(first).needs)
+    hashes = artifacts.check(need for settings in _settings(resolved)[1:] for need in Method.of(settings).needs)
     tasks = resolve_tasks(baseline.task)
     return Certificate(
         target=hashes.pop("target"),
@@ -105,7 +107,8 @@ def certify(
     )
 
 
-_VARIED = ("prefill_draft", "skip")  # what drafts is named by its artifacts' hashes
+_VARIED = ("prefill_draft", "skip")
+"""Kinds in which candidates may differ."""
 
 
 def write(place: Path, certificate: Certificate) -> Path:

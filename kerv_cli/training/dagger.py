@@ -1,34 +1,36 @@
-"""DAgger: a target moves the robot, the expert labels the states that it visits (Ross, Gordon, Bagnell 2011)."""
+"""DAgger: a policy moves the robot, the expert labels the states that it visits (Ross, Gordon, Bagnell 2011).
+
+The policy decodes by any method. So the states that a drafter's unverified chunks lead to are recorded with
+`method=scout_unverified`, for the drafter to be trained on.
+"""
 
 from __future__ import annotations
 
-import functools
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.places import find_target
-from kerv_cli.base.settings import WorldSettings
-from kerv_cli.engine.protocol import Target
-from kerv_cli.methods.compose import native_decoder
-from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.base.settings import DemosSettings, as_plain
+from kerv_cli.engine.decoder import Decoder
+from kerv_cli.lab.identity import hash_of
+from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.methods.compose import Method, native_decoder
 from kerv_cli.worlds.demos.recording import DemoConfig
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 
-class TargetActor:
-    """A target decodes chunks autoregressively (a parallel one in its one pass) and executes them whole. For a share of
-    the chunks, drawn by task and seed, the expert acts instead; then the target decodes anew. actions: those of the
-    current chunk that are not executed yet."""
+class PolicyActor:
+    """A policy decodes chunks and executes them whole. For a share of the chunks, drawn by task and seed, the expert
+    acts instead; then the policy decodes anew. decoder_of: task -> its decoder. actions: those of the current chunk
+    that are not executed yet."""
 
-    def __init__(self, target: Target, expert_share: float) -> None:
-        self.decoder = native_decoder(target)
-        self.chunk, self.share = target.chunk, expert_share
+    def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
+        self.decoder_of, self.share = decoder_of, expert_share
         self.actions: deque[NDArray[np.float64]] = deque()
         self.expert_steps = 0
         self.executed: NDArray[np.float32] | None = None
@@ -39,6 +41,7 @@ class TargetActor:
         self.random = np.random.default_rng([seed, *world.task.encode()])
         self.actions.clear()
         self.expert_steps, self.executed = 0, None
+        self.decoder = self.decoder_of(world.task)
         self.decoder.reset(world.task, seed, world.end_effector)
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -57,41 +60,30 @@ class TargetActor:
 
     def _decide(self) -> None:
         if self.random.random() < self.share:
-            self.expert_steps = self.chunk
+            self.expert_steps = self.decoder.steps
         else:
             self.actions = deque(self.decoder.decode(self.world.observe(self.decoder.cameras)).actions)
 
 
-@functools.lru_cache(maxsize=1)
-def _target_in(folder: Path, sha256: str) -> Target:
-    torch.set_num_threads(1)
-    target: Target
-    target, description = load_target(folder)
-    if description.sha256 != sha256:
-        raise CheckpointError(
-            f"the target in {folder} has changed since the recording began: record under another name="
-        )
-    return target
-
-
 @dataclass(frozen=True)
-class TargetActs:
-    """Makes the actor of a recording. folder, sha256: of the target."""
+class PolicyActs:
+    """Makes the actor of a recording. sha256: of the target, where that decodes as it was trained to; else a hash of
+    the method and of all weights."""
 
-    folder: Path
+    settings: DemosSettings
     sha256: str
 
     @classmethod
-    def of(cls, results: str, name: str, spec: EnvironmentSpec, world: WorldSettings) -> TargetActs:
-        """The target of that name, for worlds of an environment. The recording may show further views behind those
-        that the target sees, for a target that will see them.
+    def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
+        """The settings' policy, for worlds of an environment. The recording may show further views behind those that
+        the target sees, for a target that will see them.
 
         Raises:
-            UsageError: no such target, frames of another camera, or as `check_world`. CheckpointError: it is damaged,
-                or as `check_world`.
+            UsageError: no such target, frames of another camera, a method that does not fit, or as `check_world`.
+            CheckpointError: an artifact is missing or damaged, or as `check_world`.
         """
-        folder = find_target(results, name)
-        description = read_target(folder)
+        name, world = settings.policy.target, settings.world
+        description = _artifacts(settings).description
         description.check_world(name, spec.name, spec.actions, world.camera.size)
         views = [spec.camera_name(view) for view in description.cameras]
         camera = spec.camera_name(world.camera.name)
@@ -100,8 +92,44 @@ class TargetActs:
                 f"policy.target={name} sees {views[0]}, the recording would show {camera}: set "
                 f"world.camera.name={views[0]}, or join further views behind it"
             )
-        return cls(folder, description.sha256)
+        if not _is_plain(settings):
+            method = Method.of(settings)
+            method.check(description)
+            method.check_unwatched("kerv demos", "what acts looks at the world once per chunk")
+        return cls(settings, _hash(settings))
 
-    def __call__(self, config: DemoConfig) -> TargetActor:
-        """The actor, in the process that records."""
-        return TargetActor(_target_in(self.folder, self.sha256), config.expert_share)
+    def __call__(self, config: DemoConfig) -> PolicyActor:
+        """The actor, in the process that records.
+
+        Raises:
+            CheckpointError: other weights than those that the recording began with.
+        """
+        torch.set_num_threads(1)
+        if _hash(self.settings) != self.sha256:
+            raise CheckpointError(
+                f"the policy {self.settings.policy.target} has changed since the recording began: record under another "
+                "name="
+            )
+        return PolicyActor(self._decoder, config.expert_share)
+
+    def _decoder(self, task: str) -> Decoder:
+        artifacts = _artifacts(self.settings)
+        if _is_plain(self.settings):
+            return native_decoder(artifacts.target)
+        return Method.of(self.settings).decoder(artifacts.target, artifacts.load, task)
+
+
+def _is_plain(settings: DemosSettings) -> bool:
+    """Whether no method was chosen: the target decodes as it was trained to."""
+    return settings.parts() == DemosSettings().parts()
+
+
+def _artifacts(settings: DemosSettings) -> Artifacts:
+    return Artifacts(settings.results, settings.policy, settings.datastore)
+
+
+def _hash(settings: DemosSettings) -> str:
+    if _is_plain(settings):
+        return _artifacts(settings).description.sha256
+    hashes = _artifacts(settings).check(Method.of(settings).needs)
+    return hash_of([hashes, {kind: as_plain(part) for kind, part in settings.parts().items()}])

@@ -20,17 +20,16 @@ class CertifiedSkipSettings:
 
 @dataclass
 class ScopedSettings:
-    """Drafts by whether the certificate covers the task."""
+    """The draft that the certificate names on its tasks, another elsewhere."""
 
     kind: str = "scoped"
-    inside: str = "scout"
     outside: str = "merged"
 
 
 def _needs(settings: Any) -> tuple[str, ...]:
-    """The certificate, and what both sources read."""
-    sources = (part_of("prefill_draft", name) for name in (settings.inside, settings.outside))
-    return "certificate", *(need for part in sources for need in part.needs(part.default))
+    """The certificate, which brings what its draft reads, and what the other draft reads."""
+    outside = part_of("prefill_draft", settings.outside)
+    return "certificate", *outside.needs(outside.default)
 
 
 _CERTIFICATE = "kerv_cli.methods.certified.certificate:"

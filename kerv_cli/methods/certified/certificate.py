@@ -24,9 +24,10 @@ from kerv_cli.methods.streak import StreakSkipSettings
 
 @dataclass(frozen=True)
 class Candidate:
-    """One rule of the fixed order. skip: its settings. pairs: episodes paired with AR's on the same seeds, of which AR
-    solved `ar`, the rule `successes`; lost, won: pairs that only one of both solved. p: of the hypothesis that the rule
-    loses more than the margin; None: not tested, because one before it was not shown."""
+    """One rule of the fixed order. skip, draft: settings of its skip rule and of its in-prefill draft. pairs: episodes
+    paired with AR's on the same seeds, of which AR solved `ar`, the rule `successes`; lost, won: pairs that only one of
+    both solved. p: of the hypothesis that the rule loses more than the margin; None: not tested, because one before it
+    was not shown."""
 
     label: str
     skip: dict[str, Any]
@@ -37,6 +38,17 @@ class Candidate:
     won: int
     p: float | None
     needed: int = 0  # pairs more that would show it at these rates; 0: none, −1: never
+    draft: dict[str, Any] = field(default_factory=lambda: {"kind": "scout"})  # the only one of the first certificates
+
+    @property
+    def rule(self) -> Any:
+        """Settings of the skip rule."""
+        return read(part_of("skip", self.skip["kind"]).settings, self.skip, "the certificate's rule")
+
+    @property
+    def source(self) -> Any:
+        """Settings of the draft."""
+        return read(part_of("prefill_draft", self.draft["kind"]).settings, self.draft, "the certificate's draft")
 
 
 @dataclass(frozen=True)
@@ -65,10 +77,9 @@ class Certificate:
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def rule(self) -> Any:
-        """Settings of the certified skip rule; those of `none` where nothing was certified, or verifying always was."""
-        plain = {"kind": "none"} if self.chosen is None else self.candidates[self.chosen].skip
-        return read(part_of("skip", plain["kind"]).settings, plain, "the certificate's rule")
+    def certified(self) -> Candidate | None:
+        """The boldest rule that was shown; None: none was."""
+        return None if self.chosen is None else self.candidates[self.chosen]
 
     def check_method(self, method: Mapping[str, Any], dtype: str) -> None:
         """Refuses a method that decodes otherwise than what was certified. method: kind -> settings of its parts.
@@ -99,9 +110,9 @@ class Certificate:
 
     def sentence(self) -> str:
         """What it says."""
-        if self.chosen is None:
+        chosen = self.certified
+        if chosen is None:
             return "nothing is certified: every draft is verified"
-        chosen = self.candidates[self.chosen]
         return (
             f"{chosen.label}: not more than {self.margin:g} points below AR on these {len(self.tasks)} instructions, "
             f"{100 * (1 - self.delta):.0f} % confidence, {chosen.pairs} pairs"
@@ -123,6 +134,13 @@ class CertificateArtifact(Artifact[Certificate]):
         """The drafters whose drafts were certified."""
         return description.drafts
 
+    def brings(self, description: Certificate) -> tuple[str, ...]:
+        """What the certified draft reads."""
+        if description.certified is None:
+            return ()
+        source = description.certified.source
+        return part_of("prefill_draft", source.kind).needs(source)
+
 
 def covers(context: Context) -> bool:
     """Whether the certificate covers the decoder's task."""
@@ -131,9 +149,13 @@ def covers(context: Context) -> bool:
 
 
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """prefill_draft=scoped: the source for the task at hand."""
-    part = part_of("prefill_draft", settings.inside if covers(context) else settings.outside)
-    proposer: Proposer = part.built(part.default, context)
+    """prefill_draft=scoped: the draft for the task at hand."""
+    certificate: Certificate = context.artifact("certificate")
+    if covers(context) and certificate.certified is not None:
+        source = certificate.certified.source
+    else:
+        source = part_of("prefill_draft", settings.outside).default
+    proposer: Proposer = part_of("prefill_draft", source.kind).built(source, context)
     return proposer
 
 
@@ -142,7 +164,9 @@ def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     certificate: Certificate = context.artifact("certificate")
     rule: Any = StreakSkipSettings(most=settings.most)
     if covers(context):
-        rule, chunk = certificate.rule, context.chunk or context.target.chunk
+        if certificate.certified is None:
+            return None
+        rule, chunk = certificate.certified.rule, context.chunk or context.target.chunk
         certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
         if chunk != certificate.chunk:
             raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")

@@ -46,6 +46,11 @@ class MergedProposer(Proposer):
         sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
         return cls(sources, settings.nodes, fallback)
 
+    def finish(self, success: bool) -> None:
+        """Tells the sources."""
+        for source in (*self.sources, *self.fallback):
+            source.finish(success)
+
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """One prefix tree of all sources' chains; fallback sources join where none of the others is sure."""
         draft = self._on_device(chunk, depth)
