@@ -1,7 +1,7 @@
 """The vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector behind both.
 
-Modules are named as in the published checkpoints. What those hold and nothing reads is not here: the last block of each
-tower (OpenVLA takes the output of the last but one), the norm behind it and SigLIP's pooling head.
+Modules are named as in the published checkpoints. The towers lack what those hold and nothing reads: the last block of
+each (OpenVLA takes the output of the last but one), the norm behind it and SigLIP's pooling head.
 
 Shapes: B batch, n patches, W width of a tower, E width of the language model.
 """
@@ -116,6 +116,17 @@ class VisionTower(nn.Module):
         for block in self.blocks:
             x = block(x)
         return x[:, self.prefix :]
+
+
+class PoolingHead(nn.Module):
+    """SigLIP's pooling head, which checkpoints hold and no output reads: its tensors alone."""
+
+    def __init__(self, tower: Tower) -> None:
+        super().__init__()
+        self.latent = nn.Parameter(torch.zeros(1, 1, tower.width))
+        self.q, self.kv = nn.Linear(tower.width, tower.width), nn.Linear(tower.width, 2 * tower.width)
+        self.proj, self.norm = nn.Linear(tower.width, tower.width), nn.LayerNorm(tower.width)
+        self.mlp = Perceptron(tower)
 
 
 class VisionBackbone(nn.Module):
