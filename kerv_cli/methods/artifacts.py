@@ -250,12 +250,12 @@ class Artifacts:
             CheckpointError: as `check`.
         """
         digest = self.check([kind])[kind]
-        return _artifact(kind, self.path(kind), digest, _Owner(self.folder, self.device, self.dtype, self.search))
+        return _artifact(kind, self.path(kind), digest, _Key(self.folder, self.device, self.dtype, self.search))
 
 
 @dataclass(frozen=True)
-class _Owner:
-    """Of a loaded artifact. search: settings without a hash of their own, compared by their text."""
+class _Key:
+    """What a loaded artifact depends on besides its files. search: settings without a hash, compared by their text."""
 
     folder: Path
     device: str
@@ -279,7 +279,7 @@ def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
 
 
 @functools.lru_cache(maxsize=64)
-def _artifact(kind: str, path: Path, digest: str, owner: _Owner) -> Any:
-    description = checkpoint.read_target(owner.folder)
-    target = _target(owner.folder, description.sha256, owner.device, owner.dtype)
-    return kind_of(kind).load(path, Request(description, target, owner.search))
+def _artifact(kind: str, path: Path, digest: str, key: _Key) -> Any:
+    description = checkpoint.read_target(key.folder)
+    target = _target(key.folder, description.sha256, key.device, key.dtype)
+    return kind_of(kind).load(path, Request(description, target, key.search))

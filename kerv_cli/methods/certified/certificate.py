@@ -88,7 +88,7 @@ class Certificate:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
 
     def check_world(self, world: Mapping[str, Any]) -> None:
-        """Refuses another camera or horizon; of a stressed world the certificate says nothing, and stress is asked for.
+        """Refuses another camera or horizon. A stressed world is not refused: the certificate says nothing of it.
 
         Raises:
             UsageError: another one; names both values.
@@ -98,7 +98,7 @@ class Certificate:
                 raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
 
     def sentence(self) -> str:
-        """What it says."""
+        """The certificate in one sentence."""
         if self.chosen is None:
             return "nothing is certified: every draft is verified"
         chosen = self.candidates[self.chosen]
