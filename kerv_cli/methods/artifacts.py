@@ -19,7 +19,7 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.settings import PolicySettings
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.packed import load_packed
@@ -36,7 +36,7 @@ class Request:
     """The target to load an artifact for. search: settings of a datastore's search."""
 
     description: TargetDescription
-    target: Any = None  # a ReadableTarget, as kinds with weights of their own read it
+    target: Any = None  # a ReadableTarget, as networks read it
     search: Any = None
 
 
@@ -166,8 +166,8 @@ class Weights(Artifact[W]):
 
     any_chunk = False  # whether the target's H does not matter
 
-    def module(self, description: W, target: Any) -> nn.Module:
-        """A fresh network of this description, for a ReadableTarget."""
+    def module(self, description: W, target: ReadableTarget) -> nn.Module:
+        """A fresh network of this description."""
         raise NotImplementedError
 
     def load(self, path: Path, request: Request) -> Any:

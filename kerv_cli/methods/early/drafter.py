@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.draft import Draft
@@ -225,7 +226,7 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, EarlyDraft] | None = None
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> EarlyProposer:
+    def build(cls, settings: NoSettings, context: Context) -> EarlyProposer:
         """proposer=early."""
         return cls(context.artifact("early"), context.target)
 
