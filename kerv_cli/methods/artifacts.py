@@ -268,14 +268,12 @@ class _Key:
 
 def kind_of(name: str) -> Artifact[Any]:
     """The kind of artifact of this name. Raises UnknownName: there is none."""
-    kind: Artifact[Any] = find("artifact", name).built()
-    return kind
+    return find("artifact", name).built()
 
 
 @functools.lru_cache(maxsize=16)
 def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
-    target: Target = checkpoint.load_target(folder, device, DTYPES[dtype])[0]
-    return target
+    return checkpoint.load_target(folder, device, DTYPES[dtype])[0]
 
 
 @functools.lru_cache(maxsize=64)

@@ -133,8 +133,7 @@ def covers(context: Context) -> bool:
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
     """prefill_draft=scoped: the source for the task at hand."""
     part = part_of("prefill_draft", settings.inside if covers(context) else settings.outside)
-    proposer: Proposer = part.built(part.default, context)
-    return proposer
+    return part.built(part.default, context)
 
 
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
@@ -146,5 +145,4 @@ def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
         certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
         if chunk != certificate.chunk:
             raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
-    skip: Skip | None = part_of("skip", rule.kind).built(rule, context)
-    return skip
+    return part_of("skip", rule.kind).built(rule, context)

@@ -108,8 +108,7 @@ class EarlyDrafter(Packable):
         x = self.enter(x)
         for block in self.blocks:
             x = block(x)
-        logits: Tensor = self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
-        return logits
+        return self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
 
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
         """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
@@ -271,8 +270,7 @@ class EarlyProposer(ChainProposer):
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """The drafts of B chunks whose limits are equal."""
-        tokens: list[list[int]] = self._rows(chunks)[:, :-1].long().tolist()
-        return tokens
+        return self._rows(chunks)[:, :-1].long().tolist()
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether the estimate that the whole chunk is accepted reaches SURE."""

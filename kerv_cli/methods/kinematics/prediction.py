@@ -248,8 +248,7 @@ def predictor_of(settings: NoSettings, context: Context) -> Predictor:
     """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
     name, target = settings.kind, context.target
     if name in FILTERS:
-        filtered: Predictor = context.calibration.predictor(name, horizon=target.chunk)
-        return filtered
+        return context.calibration.predictor(name, horizon=target.chunk)
     return PLAIN[name](target.actions.is_strict, PLAIN[name].least, horizon=target.chunk)
 
 

@@ -414,5 +414,4 @@ class RetrievalProposer(ChainProposer):
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
         start = len(chunk.tokens)
-        chains: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
-        return chains
+        return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()

@@ -98,8 +98,7 @@ def _interpolated(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
     """rows (n, …) at the fractional indices `at` (m,) -> (m, …)."""
     below = np.clip(np.floor(at).astype(int), 0, len(rows) - 2)
     share = (at - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
-    mixed: np.ndarray = rows[below] * (1 - share) + rows[below + 1] * share
-    return mixed
+    return rows[below] * (1 - share) + rows[below + 1] * share
 
 
 def resized(image: np.ndarray, size: int) -> np.ndarray:

@@ -28,8 +28,7 @@ class PatchEmbedding(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """See the class."""
-        patches: Tensor = self.proj(pixels).flatten(2).transpose(1, 2)
-        return patches
+        return self.proj(pixels).flatten(2).transpose(1, 2)
 
 
 class Attention(nn.Module):
@@ -46,8 +45,7 @@ class Attention(nn.Module):
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(q, k, v)
-        projected: Tensor = self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
-        return projected
+        return self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
 
 
 class Perceptron(nn.Module):
@@ -60,8 +58,7 @@ class Perceptron(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x (B, n, W) -> (B, n, W)."""
-        hidden: Tensor = self.fc2(F.gelu(self.fc1(x)))
-        return hidden
+        return self.fc2(F.gelu(self.fc1(x)))
 
 
 class LayerScale(nn.Module):
@@ -90,8 +87,7 @@ class Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """x (B, n, W) -> (B, n, W)."""
         x = x + self.ls1(self.attn(self.norm1(x)))
-        out: Tensor = x + self.ls2(self.mlp(self.norm2(x)))
-        return out
+        return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 class VisionTower(nn.Module):
