@@ -25,7 +25,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import MASKS, POSITIONS, Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.openvla.target import OpenVLATarget
 from kerv_cli.training.distillation import Distillation, acceptance_length
-from kerv_cli.training.recorded import TeacherStates
+from kerv_cli.training.recorded import StatesByLength, TeacherStates
 
 OBSERVATIONS, STEPS = 64, 600
 
@@ -53,7 +53,7 @@ def distilled(target: OpenVLATarget, convention: Convention, steps: int = STEPS)
     with torch.inference_mode():
         prompts = torch.cat([target.encode(shown(seed)) for seed in range(OBSERVATIONS)])
         tokens, hidden = greedy(target, prompts)
-    states = TeacherStates(prompts.clone(), hidden.clone(), tokens.clone())
+    states = StatesByLength((TeacherStates(prompts.clone(), hidden.clone(), tokens.clone()),))
     run = Distillation(drafter, target, states, states, DrafterSettings(unroll=2))  # type: ignore[arg-type]
     optimiser = torch.optim.AdamW(drafter.parameters(), 3e-3)
     with seen_by_the_prompt_alone(drafter, prompts.shape[1]):

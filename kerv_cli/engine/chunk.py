@@ -178,16 +178,16 @@ class Chunk:
         judged. Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2)."""
         return float(np.mean(self._differences)) if self._differences else None
 
-    def commit(self, played: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
-        """Commits `tokens` after a forward; `played` is its record."""
+    def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
+        """Commits `tokens` after a forward. record: of its round."""
         self.forwards += 1
         self.tokens += tokens
-        self.rounds.append(played)
+        self.rounds.append(record)
         self.rejection = rejection or Rejection()
-        if played.drafted:
-            both = np.array((played.drafted, played.target_tokens[: len(played.drafted)]))
+        if record.drafted:
+            both = np.array((record.drafted, record.target_tokens[: len(record.drafted)]))
             drafted, targets = self.space.values_of(both)
-            moving = ~self.space.strict_tokens(self.size)[played.start : played.start + len(drafted)]
+            moving = ~self.space.strict_tokens(self.size)[record.start : record.start + len(drafted)]
             self._differences += np.abs(drafted - targets)[moving].tolist()
 
     def skip(self, tokens: Sequence[int], proposer: str) -> None:

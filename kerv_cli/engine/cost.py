@@ -193,7 +193,7 @@ def sequence_of_record(decode: DecodeRecord) -> Work:
     """The work of a decode that was just recorded."""
     names = ("mode", "proposer", "start", "tree_size", "accepted")
     return work_of(
-        {name: np.array([getattr(played, name) for played in decode.rounds]) for name in names},
+        {name: np.array([getattr(one, name) for one in decode.rounds]) for name in names},
         np.array([len(decode.rounds)]),
         {name: np.array([decode.phases.get(name, unsaid)]) for name, unsaid in zip(READ_PHASES, _UNSAID, strict=True)},
         np.array([decode.similarity is not None]),

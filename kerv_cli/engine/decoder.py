@@ -314,7 +314,7 @@ class Decoder:
         nodes = path if rejected is None else (*path, rejected)
         targets = [target_tokens[tree.parents[i] + 1] for i in nodes]
         bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
-        played = Round(
+        record = Round(
             mode="verify",
             proposer=proposer.name,
             start=start,
@@ -326,7 +326,7 @@ class Decoder:
             threshold=acceptance.limits(r),
         )
         rejection = Rejection(tuple(tree.tokens[i] for i in behind[1:]), tuple(target_tokens[i + 1] for i in behind))
-        chunk.commit(played, [tree.tokens[i] for i in path] + bonus, rejection)
+        chunk.commit(record, [tree.tokens[i] for i in path] + bonus, rejection)
         return path
 
     def rectify(self, chunk: Chunk) -> None:
@@ -354,7 +354,7 @@ def record_of(
         phases=phases,
         compensated=compensated,
         variability=chunk.variability,
-        skipped=any(played.mode == "skip" for played in chunk.rounds),
+        skipped=any(record.mode == "skip" for record in chunk.rounds),
         similarity=chunk.similarity,
         metric=chunk.choice.metric if chunk.choice is not None else None,
         reason=chunk.reason,
@@ -375,9 +375,9 @@ def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarra
 
 def mode_of(rounds: Sequence[Round]) -> str:
     """`DecodeRecord.mode` of a chunk's rounds."""
-    for played in rounds:
-        if played.mode in ("skip", PARALLEL):
-            return played.mode
-        if played.drafted:
-            return played.proposer
+    for record in rounds:
+        if record.mode in ("skip", PARALLEL):
+            return record.mode
+        if record.drafted:
+            return record.proposer
     return "ar"

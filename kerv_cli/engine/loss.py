@@ -28,8 +28,8 @@ def judged_tokens(chunk: Chunk, chain: Sequence[int]) -> list[int] | None:
     """
     if not chunk.rounds:
         return None
-    played, rejection = chunk.rounds[-1], chunk.rejection
-    path = [*played.drafted, *rejection.draft]
-    if played.start or len(path) < chunk.size - 1 or path != list(chain[: len(path)]):
+    verification, rejection = chunk.rounds[-1], chunk.rejection
+    path = [*verification.drafted, *rejection.draft]
+    if verification.start or len(path) < chunk.size - 1 or path != list(chain[: len(path)]):
         return None
-    return [*played.target_tokens[: len(played.drafted)], *rejection.target[: len(rejection.draft)]]
+    return [*verification.target_tokens[: len(verification.drafted)], *rejection.target[: len(rejection.draft)]]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
-from kerv_cli.base.registry import PREFILL, add
+from kerv_cli.base.registry import PREFILL, NoSettings, add
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.context import Context
 
 _NOTHING = "kerv_cli.methods.ar:nothing"
 
 
-def nothing(settings: Any, context: Any) -> None:
+def nothing(settings: NoSettings, context: Context) -> None:
     """Choices that stand for the absence of a part."""
 
 

@@ -19,7 +19,7 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.settings import PolicySettings
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.packed import load_packed
@@ -36,7 +36,7 @@ class Request:
     """The target to load an artifact for. search: settings of a datastore's search."""
 
     description: TargetDescription
-    target: Any = None  # a ReadableTarget, as kinds with weights of their own read it
+    target: Any = None  # a ReadableTarget, as networks read it
     search: Any = None
 
 
@@ -170,8 +170,8 @@ class Weights(Artifact[W]):
 
     any_chunk = False  # whether the target's H does not matter
 
-    def module(self, description: W, target: Any) -> nn.Module:
-        """A fresh network of this description, for a ReadableTarget."""
+    def module(self, description: W, target: ReadableTarget) -> nn.Module:
+        """A fresh network of this description."""
         raise NotImplementedError
 
     def load(self, path: Path, request: Request) -> Any:
@@ -257,12 +257,12 @@ class Artifacts:
             CheckpointError: as `check`.
         """
         digest = self.check([kind])[kind]
-        return _artifact(kind, self.path(kind), digest, _Owner(self.folder, self.device, self.dtype, self.search))
+        return _artifact(kind, self.path(kind), digest, _Key(self.folder, self.device, self.dtype, self.search))
 
 
 @dataclass(frozen=True)
-class _Owner:
-    """Of a loaded artifact. search: settings without a hash of their own, compared by their text."""
+class _Key:
+    """What a loaded artifact depends on besides its files. search: settings without a hash, compared by their text."""
 
     folder: Path
     device: str
@@ -275,18 +275,16 @@ class _Owner:
 
 def kind_of(name: str) -> Artifact[Any]:
     """The kind of artifact of this name. Raises UnknownName: there is none."""
-    kind: Artifact[Any] = find("artifact", name).built()
-    return kind
+    return find("artifact", name).built()
 
 
 @functools.lru_cache(maxsize=16)
 def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
-    target: Target = checkpoint.load_target(folder, device, DTYPES[dtype])[0]
-    return target
+    return checkpoint.load_target(folder, device, DTYPES[dtype])[0]
 
 
 @functools.lru_cache(maxsize=64)
-def _artifact(kind: str, path: Path, digest: str, owner: _Owner) -> Any:
-    description = checkpoint.read_target(owner.folder)
-    target = _target(owner.folder, description.sha256, owner.device, owner.dtype)
-    return kind_of(kind).load(path, Request(description, target, owner.search))
+def _artifact(kind: str, path: Path, digest: str, key: _Key) -> Any:
+    description = checkpoint.read_target(key.folder)
+    target = _target(key.folder, description.sha256, key.device, key.dtype)
+    return kind_of(kind).load(path, Request(description, target, key.search))

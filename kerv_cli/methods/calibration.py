@@ -169,7 +169,7 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The calibration's file, which is its path."""
+    """The calibration: one file, which its path names."""
 
     kind = noun = "calibration"
     made, again = "made", "run 'kerv calibrate'"

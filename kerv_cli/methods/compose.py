@@ -25,7 +25,7 @@ _BATCHED = {
 """Kinds of prefill_draft, proposer and skip -> the method that is made of them."""
 
 
-def is_parallel(target: Any) -> bool:
+def is_parallel(target: object) -> bool:
     """Whether a target decodes all tokens at once; see `targets.protocol.ParallelTarget`."""
     return bool(getattr(target, "parallel", False))
 

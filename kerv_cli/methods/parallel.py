@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import NoSettings, add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class ParallelPass(Skip):
         self.target = target
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> ParallelPass:
+    def build(cls, settings: NoSettings, context: Context) -> ParallelPass:
         """skip=parallel."""
         return cls(context.target)
 

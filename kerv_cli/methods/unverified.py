@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.registry import add
+from kerv_cli.base.registry import NoSettings, add
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class AlwaysSkip(Skip):
         self.source = source
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> AlwaysSkip:
+    def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
         """skip=always."""
         return cls(context.built["prefill_draft"])
 

@@ -209,8 +209,7 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
     status = os.stat(path)
     version = status.st_ino, status.st_size, status.st_mtime_ns
-    description: T = _read_description(path, kind, schema, version)  # type: ignore[arg-type]
-    return description
+    return _read_description(path, kind, schema, version)  # type: ignore[arg-type]
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:

@@ -32,8 +32,8 @@ class Distillation:
         self,
         drafter: Drafter,
         target: Target,
-        states: TeacherStates | StatesByLength,
-        held_out: TeacherStates | StatesByLength,
+        states: StatesByLength,
+        held_out: StatesByLength,
         settings: DrafterSettings,
     ) -> None:
         self.module, self.target, self.settings = drafter, target, settings

@@ -71,15 +71,11 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
 
 @dataclass(frozen=True)
 class TeacherStates(Rows):
-    """The target's greedy decodes of n observations."""
+    """The target's greedy decodes of n observations whose prompts are equally long."""
 
     prompt: Tensor  # (n, P, E) float16
     hidden: Tensor  # (n, P + N − 1, E) float16
     tokens: Tensor  # (n, N) int64
-
-    def parts(self, indices: Tensor) -> list[TeacherStates]:
-        """The rows at `indices` (B,), in batches of one prompt length: here one."""
-        return [self.where(indices)]
 
     def prompts(self, count: int) -> list[Tensor]:
         """At most `count` prompts (1, P, E), evenly spread."""
@@ -89,7 +85,7 @@ class TeacherStates(Rows):
 
 @dataclass(frozen=True)
 class StatesByLength:
-    """Teacher states whose prompts differ in length: a group per length, rows counted through all groups."""
+    """Teacher states: a group per length of the prompt, rows counted through all groups."""
 
     groups: tuple[TeacherStates, ...]
 

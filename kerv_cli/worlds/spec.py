@@ -244,8 +244,7 @@ class EnvironmentSpec:
         Raises:
             UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
         """
-        world: World = load(self.world_class)(self, task, camera, horizon)
-        return world
+        return load(self.world_class)(self, task, camera, horizon)
 
     def expert(self, task: str) -> Expert:
         """The scripted expert of the task.
@@ -255,5 +254,4 @@ class EnvironmentSpec:
         """
         if not self.expert_class:
             raise UsageError(f"{self.name} has no scripted experts: record demonstrations with its own tools")
-        expert: Expert = load(self.expert_class)(self, task)
-        return expert
+        return load(self.expert_class)(self, task)

@@ -21,8 +21,7 @@ from kerv_cli.base.files import write_json
 from kerv_cli.targets.checkpoint import save_tensors
 from kerv_cli.targets.openvla.config import CONFIG, SHAPES, STATISTICS, Language, Shape, Tower
 from kerv_cli.targets.openvla.image import DEFAULTS, PREPROCESSOR
-from kerv_cli.targets.openvla.layout import Sizes, layout
-from kerv_cli.targets.openvla.loading import INDEX
+from kerv_cli.targets.openvla.loading import INDEX, Sizes, layout
 from kerv_cli.targets.openvla.prompt import BEGIN, BOUNDARY, TOKENIZER
 
 TINY = Shape(

@@ -99,7 +99,7 @@ class Certificate:
             raise UsageError(f"skip=certified with runtime.dtype={dtype}: the certificate is of {self.dtype}")
 
     def check_world(self, world: Mapping[str, Any]) -> None:
-        """Refuses another camera or horizon; of a stressed world the certificate says nothing, and stress is asked for.
+        """Refuses another camera or horizon. A stressed world is not refused: the certificate says nothing of it.
 
         Raises:
             UsageError: another one; names both values.
@@ -109,7 +109,7 @@ class Certificate:
                 raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
 
     def sentence(self) -> str:
-        """What it says."""
+        """The certificate in one sentence."""
         chosen = self.certified
         if chosen is None:
             return "nothing is certified: every draft is verified"
@@ -155,8 +155,7 @@ def scoped(settings: ScopedSettings, context: Context) -> Proposer:
         source = certificate.certified.source
     else:
         source = part_of("prefill_draft", settings.outside).default
-    proposer: Proposer = part_of("prefill_draft", source.kind).built(source, context)
-    return proposer
+    return part_of("prefill_draft", source.kind).built(source, context)
 
 
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
@@ -170,5 +169,4 @@ def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
         certificate.check_method(context.method, str(context.target.dtype).removeprefix("torch."))
         if chunk != certificate.chunk:
             raise UsageError(f"skip=certified with chunk={chunk}: the certificate is of {certificate.chunk}")
-    skip: Skip | None = part_of("skip", rule.kind).built(rule, context)
-    return skip
+    return part_of("skip", rule.kind).built(rule, context)

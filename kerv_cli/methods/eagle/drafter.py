@@ -79,8 +79,7 @@ class Drafter(LayerStack):
         """following, hidden (B, T, E) at positions (T,) -> predicted hidden states (B, T, E); seen (T, M) bool as in
         `attention_mask`."""
         x = self.fuse(torch.cat([following, hidden], -1))
-        predicted: Tensor = self.norm(self.run_layers(x, positions, cache, seen))
-        return predicted
+        return self.norm(self.run_layers(x, positions, cache, seen))
 
 
 @dataclass
@@ -223,5 +222,4 @@ class DrafterArtifact(Weights[DrafterDescription]):
         public = self.checked(path, request.description).public
         if public is not None:
             return load_public(path, public, request.target)
-        drafter: Drafter = super().load(path, request)
-        return drafter
+        return super().load(path, request)

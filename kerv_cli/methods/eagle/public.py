@@ -21,8 +21,7 @@ from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import Language
-from kerv_cli.targets.openvla.layout import Sizes, layer_tensors
-from kerv_cli.targets.openvla.loading import SINGLE, check_layout, conversion, open_shards
+from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, conversion, open_shards, sizes_of
 from kerv_cli.targets.openvla.trunk import KeyValueCache, LlamaLayer, run_layers
 
 POSITIONS, MASKS = ("sequence", "text"), ("causal", "prompt")
@@ -111,18 +110,10 @@ class PublicDrafter(nn.Module):
         return mask
 
 
-def layout_of(language: Language, bias: bool) -> dict[str, Sizes]:
+def layout_of(shape: PublicShape) -> dict[str, Sizes]:
     """Name -> shape of a drafter's own tensors."""
-    width, inner = language.hidden_size, language.key_value_heads * language.channels
-    tensors: dict[str, Sizes] = {"fc.weight": (width, 2 * width)}
-    if bias:
-        tensors["fc.bias"] = (width,)
-    for number in range(language.num_hidden_layers):
-        layer = layer_tensors(f"layers.{number}", width, inner, language.intermediate_size)
-        if number == 0:
-            del layer["layers.0.input_layernorm.weight"]
-        tensors |= layer
-    return tensors
+    with torch.device("meta"):
+        return sizes_of(PublicDrafter(shape))
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
@@ -145,11 +136,10 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")
     shards = open_shards(folder)
-    bias = "fc.bias" in shards.shapes
-    layout = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
-    check_layout(layout, layout_of(language, bias), folder)
     skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
-    shape = PublicShape(language, bias, convention.check(), skipped.stop - skipped.start)
+    shape = PublicShape(language, "fc.bias" in shards.shapes, convention.check(), skipped.stop - skipped.start)
+    layout = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
+    check_layout(layout, layout_of(shape), folder)
     return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}
 
 
@@ -161,7 +151,7 @@ def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> Pub
     """
     tensors = load_tensors(folder / WEIGHTS, "drafter")
     layout = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    check_layout(layout, layout_of(shape.language, shape.bias), folder)
+    check_layout(layout, layout_of(shape), folder)
     drafter = PublicDrafter(shape)
     drafter.load_state_dict(tensors)
     return drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)

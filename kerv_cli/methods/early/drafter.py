@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.draft import Draft
@@ -107,8 +108,7 @@ class EarlyDrafter(Packable):
         x = self.enter(x)
         for block in self.blocks:
             x = block(x)
-        logits: Tensor = self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
-        return logits
+        return self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
 
     def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
         """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
@@ -225,7 +225,7 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, EarlyDraft] | None = None
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> EarlyProposer:
+    def build(cls, settings: NoSettings, context: Context) -> EarlyProposer:
         """proposer=early."""
         return cls(context.artifact("early"), context.target)
 
@@ -270,8 +270,7 @@ class EarlyProposer(ChainProposer):
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """The drafts of B chunks whose limits are equal."""
-        tokens: list[list[int]] = self._rows(chunks)[:, :-1].long().tolist()
-        return tokens
+        return self._rows(chunks)[:, :-1].long().tolist()
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether the estimate that the whole chunk is accepted reaches SURE."""

@@ -24,7 +24,6 @@ from kerv_cli.methods.kinematics import CompensateSettings
 
 MINIMUM = 4  # actions that a prediction needs; longer windows were not measurably better on the demonstrations
 HORIZON = 8  # steps ahead that weights are computed for
-LEAST_HISTORY = {"hold": 1, "linear": 2}  # actions that a predictor needs at least; filters: MINIMUM
 
 DRAFT = "draft"
 """`rectifier.predictor` that fills from the rejected draft instead of from a kinematic predictor."""
@@ -125,16 +124,15 @@ class Predictor:
         self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """(horizon, window) of one DoF."""
-        raise NotImplementedError
+        """(horizon, window) of one DoF; here all weight on the newest action."""
+        weights = np.zeros((self.horizon, window))
+        weights[:, -1] = 1.0
+        return weights
 
     def _table(self, window: int) -> np.ndarray:
         """(D, horizon, window)."""
-        rows = [
-            hold_weights(window, self.horizon) if self.held[dof] else self.weights(dof, window)
-            for dof in range(self.dofs)
-        ]
-        return np.stack(rows)
+        last = Predictor.weights(self, 0, window)
+        return np.stack([last if self.held[dof] else self.weights(dof, window) for dof in range(self.dofs)])
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
         """history (m, D) in [-1, 1], oldest first, its last `window` count -> (steps, D) in [-1, 1].
@@ -159,21 +157,10 @@ class Predictor:
         return np.clip(predicted, -1.0, 1.0)
 
 
-def hold_weights(window: int, horizon: int) -> np.ndarray:
-    """(horizon, window): all weight on the newest action."""
-    weights = np.zeros((horizon, window))
-    weights[:, -1] = 1.0
-    return weights
-
-
 class Hold(Predictor):
     """The last action again: the baseline of every prediction."""
 
     name = "hold"
-
-    def weights(self, dof: int, window: int) -> np.ndarray:
-        """(horizon, window), all weight on the newest action."""
-        return hold_weights(window, self.horizon)
 
 
 class Linear(Predictor):
@@ -228,8 +215,9 @@ class Acceleration(Kalman):
     order = 3
 
 
+PLAIN: dict[str, type[Predictor]] = {kind.name: kind for kind in (Hold, Linear)}
 FILTERS: dict[str, type[Kalman]] = {kind.name: kind for kind in (Kalman, Damped, Acceleration)}
-PREDICTORS = (Hold.name, Linear.name, *FILTERS)
+PREDICTORS = (*PLAIN, *FILTERS)
 
 
 def build_predictor(
@@ -247,10 +235,8 @@ def build_predictor(
         UnknownName: no such predictor.
         UsageError: a filter without its noise, or a number out of range.
     """
-    if kind == Hold.name:
-        return Hold(held, minimum, window, horizon)
-    if kind == Linear.name:
-        return Linear(held, minimum, window, horizon)
+    if kind in PLAIN:
+        return PLAIN[kind](held, minimum, window, horizon)
     if kind not in FILTERS:
         raise UnknownName("predictor", kind, PREDICTORS)
     if kind not in noise:
@@ -261,10 +247,9 @@ def build_predictor(
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
     """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
     name, target = settings.kind, context.target
-    if find("predictor", name).traits.get("fitted"):
+    if name in FILTERS:
         return context.calibration.predictor(name, horizon=target.chunk)
-    least = LEAST_HISTORY.get(name, MINIMUM)
-    return build_predictor(name, target.actions.is_strict, {}, least, horizon=target.chunk)
+    return PLAIN[name](target.actions.is_strict, PLAIN[name].least, horizon=target.chunk)
 
 
 class PredictionProposer(ChainProposer):

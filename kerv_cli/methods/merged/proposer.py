@@ -40,8 +40,7 @@ class MergedProposer(Proposer):
             source_settings: Any = part.default
             if isinstance(source_settings, RetrievalProposerSettings):
                 source_settings = RetrievalProposerSettings(neighbours=settings.neighbours, nodes=settings.nodes)
-            proposer: ChainProposer = part.built(source_settings, context)
-            return proposer
+            return part.built(source_settings, context)
 
         sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
         return cls(sources, settings.nodes, fallback)
@@ -118,5 +117,4 @@ def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
 
 def first_source(draft: Any) -> ChainProposer:
     """What drafts whole chunks before the prefill: an in-prefill draft, of a merged one its first source."""
-    first: ChainProposer = draft.sources[0] if isinstance(draft, MergedProposer) else draft
-    return first
+    return draft.sources[0] if isinstance(draft, MergedProposer) else draft

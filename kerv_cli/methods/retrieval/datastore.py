@@ -290,20 +290,20 @@ def neighbour_tree(
     other neighbours with probability `cross`; 0 merges whole chunks only.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
-    ways = _Ways(chunks.tolist(), list(space.segments(start, stop)), cross)
+    continuations = _Continuations(chunks.tolist(), list(space.segments(start, stop)), cross)
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
     waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
     order = count()
 
-    def offer(parent: int, level: int, gave: int, followed: int, cost: float) -> None:
-        for surprise, group, given, staying in ways.on(level, gave, followed):
-            heappush(waiting, (cost + surprise, next(order), parent, level, group, given, staying))
+    def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
+        for surprise, group, members, common in continuations.on(level, last, whole):
+            heappush(waiting, (cost + surprise, next(order), parent, level, group, members, common))
 
-    offer(ROOT, 0, ways.everyone, ways.everyone, 0.0)
+    offer(ROOT, 0, continuations.everyone, continuations.everyone, 0.0)
     while waiting and len(tokens) < nodes:
-        cost, _, node, level, group, gave, followed = heappop(waiting)
+        cost, _, node, level, group, last, whole = heappop(waiting)
         if len(tokens) + len(group) - _shared(children, node, group) > nodes:
             continue  # a group is in the tree as a whole or not at all
         for token in group:
@@ -312,7 +312,7 @@ def neighbour_tree(
                 tokens.append(token)
                 parents.append(node)
             node = children[node, token]
-        offer(node, level + 1, gave, followed, cost)
+        offer(node, level + 1, last, whole, cost)
     return Draft.of(tokens, parents)
 
 
@@ -325,9 +325,9 @@ class _Weights(dict[int, float]):
         return weight
 
 
-class _Ways:
-    """The groups that may follow a path. A path is described by two sets of neighbours: `gave`, those that have its
-    last group, and `followed`, those among them that have all its groups."""
+class _Continuations:
+    """The groups that may follow a path. A path is described by two sets of neighbours: `last`, those that have its
+    last group, and `whole`, those among them that have all its groups."""
 
     def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
         self.everyone = (1 << len(rows)) - 1
@@ -340,23 +340,23 @@ class _Ways:
                 givers[group] = givers.get(group, 0) | 1 << i
             self.levels.append((strict, list(givers.items())))
 
-    def on(self, level: int, gave: int, followed: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
+    def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
         """Yields (−log probability, the group's tokens, the two sets of the lengthened path), best neighbour first."""
         if level == len(self.levels):
             return
         strict, givers = self.levels[level]
         pool = self.everyone
         if strict:
-            pool = gave
-            givers = [(group, given & gave) for group, given in givers if given & gave]
+            pool = last
+            givers = [(group, members & last) for group, members in givers if members & last]
             givers.sort(key=lambda way: way[1] & -way[1])
         weights, cross = self.weights, self.cross
-        of_followed, of_pool = weights[followed], weights[pool]
-        for group, given in givers:
-            staying = given & followed
-            probability = (1 - cross) * weights[staying] / of_followed + cross * weights[given] / of_pool
+        of_whole, of_pool = weights[whole], weights[pool]
+        for group, members in givers:
+            common = members & whole
+            probability = (1 - cross) * weights[common] / of_whole + cross * weights[members] / of_pool
             if probability > 0:
-                yield -math.log(probability), group, given, staying or given
+                yield -math.log(probability), group, members, common or members
 
 
 def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
@@ -414,5 +414,4 @@ class RetrievalProposer(ChainProposer):
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
         start = len(chunk.tokens)
-        chains: list[list[int]] = self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
-        return chains
+        return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.registry import NoSettings
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyProposer
@@ -28,7 +29,7 @@ class ScoutProposer(EarlyProposer):
         self.scout, self.inputs = scout, target.inputs
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> ScoutProposer:
+    def build(cls, settings: NoSettings, context: Context) -> ScoutProposer:
         """proposer=scout."""
         return cls(context.artifact("scout"), context.target)
 
@@ -53,7 +54,7 @@ class ScoutArtifact(Weights[ScoutDescription]):
     again = "run 'kerv train drafter drafter=scout'"
     schema = ScoutDescription
 
-    def module(self, description: ScoutDescription, target: Any) -> Scout:
+    def module(self, description: ScoutDescription, target: ReadableTarget) -> Scout:
         """A fresh scout, which looks through the target's camera.
 
         Raises:
@@ -62,7 +63,7 @@ class ScoutArtifact(Weights[ScoutDescription]):
         return Scout.beside(description.settings, check_sees(target))
 
 
-def check_sees(target: Any) -> CompactTarget:
+def check_sees(target: object) -> CompactTarget:
     """The target, if it sees.
 
     Raises:

@@ -41,8 +41,7 @@ class BlockedLinear:
         self.blocked = torch.ops.mkldnn._reorder_linear_weight(weight.to(torch.bfloat16).contiguous(), ROWS)
 
     def __call__(self, x: Tensor) -> Tensor:
-        product: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.blocked, None, "none", [], "")
-        return product
+        return torch.ops.mkldnn._linear_pointwise(x, self.blocked, None, "none", [], "")
 
 
 class BlockedLayer:

@@ -239,8 +239,7 @@ class CompactTarget(Packable):
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Action tokens (B, T) int64 -> (B, T, E)."""
-        embedded: Tensor = self.embedding(tokens)
-        return embedded
+        return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
         """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
@@ -250,8 +249,7 @@ class CompactTarget(Packable):
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
-        hidden: Tensor = self.trunk(x, positions, cache, seen)
-        return hidden
+        return self.trunk(x, positions, cache, seen)
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """prompt (B, P, E) -> hidden states (B, N, E) of all tokens, in one forward (docs/methods.md §6). No action

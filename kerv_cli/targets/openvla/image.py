@@ -56,13 +56,13 @@ def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
     strategy = value.get("image_resize_strategy", RESIZE) if isinstance(value, dict) else None
     if strategy != RESIZE:
         raise CheckpointError(f"{path} asks for image_resize_strategy={strategy}; OpenVLA's is {RESIZE}")
-    given = value.get("tvf_normalize_params")
-    if given is None:
+    towers = value.get("tvf_normalize_params")
+    if towers is None:
         means, stds = value.get("means"), value.get("stds")
         if means is None or stds is None:
             return DEFAULTS
-        given = [{"mean": mean, "std": std} for mean, std in zip(means, stds, strict=False)]
-    plain = [{k: v for k, v in one.items() if k in ("mean", "std")} for one in given]
+        towers = [{"mean": mean, "std": std} for mean, std in zip(means, stds, strict=False)]
+    plain = [{k: v for k, v in one.items() if k in ("mean", "std")} for one in towers]
     if len(plain) != 2:
         raise CheckpointError(f"{path} normalises for {len(plain)} vision towers, OpenVLA has two")
     first, second = (read(Normalisation, one, f"{path}, tvf_normalize_params") for one in plain)
@@ -98,8 +98,7 @@ def _interpolated(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
     """rows (n, …) at the fractional indices `at` (m,) -> (m, …)."""
     below = np.clip(np.floor(at).astype(int), 0, len(rows) - 2)
     share = (at - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
-    mixed: np.ndarray = rows[below] * (1 - share) + rows[below + 1] * share
-    return mixed
+    return rows[below] * (1 - share) + rows[below + 1] * share
 
 
 def resized(image: np.ndarray, size: int) -> np.ndarray:

@@ -15,8 +15,7 @@ from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.targets.checkpoint import FORMAT, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.image import read_normalisations
-from kerv_cli.targets.openvla.layout import layout
-from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, open_shards
+from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, layout, open_shards
 from kerv_cli.targets.openvla.prompt import PROMPTS, Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
 from kerv_cli.worlds import specs

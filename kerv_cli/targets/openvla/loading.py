@@ -20,10 +20,10 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json, sha256_of
 from kerv_cli.targets.openvla.config import Shape
-from kerv_cli.targets.openvla.layout import Sizes, layout, unread
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
-from kerv_cli.targets.openvla.vision import Projector, VisionBackbone
+from kerv_cli.targets.openvla.vision import Block, PoolingHead, Projector, VisionBackbone
 
+Sizes = tuple[int, ...]
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 PICKLED = ("*.bin", "*.pt", "*.pth", "*.ckpt")
 SHOWN = 3  # names of each kind in a message
@@ -149,6 +149,25 @@ class OpenVLAModel(nn.Module):
         self.language_model = LanguageModel(shape.language)
 
 
+def layout(shape: Shape) -> dict[str, Sizes]:
+    """Name -> shape of every tensor of a checkpoint: those of the modules, and of each tower what nothing reads, its
+    last block, the norm behind it and SigLIP's pooling head."""
+    with torch.device("meta"):
+        tensors = sizes_of(OpenVLAModel(shape))
+        for name, tower in zip(("featurizer", "fused_featurizer"), shape.towers, strict=True):
+            unread = {f"blocks.{tower.depth - 1}": Block(tower), "norm": nn.LayerNorm(tower.width)}
+            if tower.pooled:
+                unread["attn_pool"] = PoolingHead(tower)
+            for part, module in unread.items():
+                tensors |= sizes_of(module, f"vision_backbone.{name}.{part}.")
+    return tensors
+
+
+def sizes_of(module: nn.Module, prefix: str = "") -> dict[str, Sizes]:
+    """Name -> shape of a module's tensors."""
+    return {f"{prefix}{name}": tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+
+
 def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8: bool) -> OpenVLAModel:
     """The model of `folder`, frozen. int8: the layers of the language model with one byte per weight.
 
@@ -159,7 +178,8 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
     check_layout(shards.shapes, layout(shape), folder)
     with torch.device("meta"):
         model = OpenVLAModel(shape)
-    state = {n: t.to(device=device, dtype=dtype) for n, t in shards.items() if not unread(n, shape)}
+    names = model.state_dict().keys()
+    state = {n: t.to(device=device, dtype=dtype) for n, t in shards.items() if n in names}
     model.load_state_dict(state, assign=True)
     del state
     if int8:

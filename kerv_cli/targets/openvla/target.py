@@ -113,18 +113,15 @@ class OpenVLATarget:
 
     def see(self, pixels: Tensor) -> Tensor:
         """pixels (B, 6, s, s) -> vision tokens (B, n, E)."""
-        patches: Tensor = self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
-        return patches
+        return self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
 
     def _words(self, instruction: str) -> Tensor:
         ids = upload([self.prompter.ids(instruction)], self.device)
-        embedded: Tensor = self.model.language_model.model.embed_tokens(ids)
-        return embedded
+        return self.model.language_model.model.embed_tokens(ids)
 
     def embed(self, tokens: Tensor) -> Tensor:
         """Action tokens (B, T) int64 -> (B, T, E)."""
-        embedded: Tensor = self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
-        return embedded
+        return self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> KeyValueCache:
         """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
@@ -135,8 +132,7 @@ class OpenVLATarget:
         self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
-        hidden: Tensor = self.model.language_model.model(x, positions, cache, seen)
-        return hidden
+        return self.model.language_model.model(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
         """hidden (..., E) -> logits over the action tokens (..., V)."""

@@ -79,8 +79,7 @@ class LlamaAttention(nn.Module):
         causal = mask is None and tokens > 1
         shared = self.shared != self.heads
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
-        out: Tensor = self.o_proj(attended.transpose(1, 2).reshape(batch, tokens, width))
-        return out
+        return self.o_proj(attended.transpose(1, 2).reshape(batch, tokens, width))
 
 
 class LlamaPerceptron(nn.Module):
@@ -95,8 +94,7 @@ class LlamaPerceptron(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x (B, T, E) -> (B, T, E)."""
-        out: Tensor = self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
-        return out
+        return self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
 
 
 class LlamaLayer(nn.Module):
@@ -121,8 +119,7 @@ class LlamaLayer(nn.Module):
     ) -> Tensor:
         """x (B, T, E) -> (B, T, E)."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, layer)
-        out: Tensor = x + self.mlp(self.post_attention_layernorm(x))
-        return out
+        return x + self.mlp(self.post_attention_layernorm(x))
 
 
 def run_layers(
@@ -159,8 +156,7 @@ class LlamaModel(nn.Module):
         self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """x (B, T, E) at `positions` (T,) -> hidden states behind the final norm (B, T, E)."""
-        normed: Tensor = self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
-        return normed
+        return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
 
 
 class LanguageModel(nn.Module):

@@ -1,7 +1,7 @@
 """The vision tower of OpenVLA: DINOv2 ViT-L/14 with registers and SigLIP So400m/14, and the projector behind both.
 
-Modules are named as in the published checkpoints. What those hold and nothing reads is not here: the last block of each
-tower (OpenVLA takes the output of the last but one), the norm behind it and SigLIP's pooling head.
+Modules are named as in the published checkpoints. The towers lack what those hold and nothing reads: the last block of
+each (OpenVLA takes the output of the last but one), the norm behind it and SigLIP's pooling head.
 
 Shapes: B batch, n patches, W width of a tower, E width of the language model.
 """
@@ -28,8 +28,7 @@ class PatchEmbedding(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """See the class."""
-        patches: Tensor = self.proj(pixels).flatten(2).transpose(1, 2)
-        return patches
+        return self.proj(pixels).flatten(2).transpose(1, 2)
 
 
 class Attention(nn.Module):
@@ -46,8 +45,7 @@ class Attention(nn.Module):
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(q, k, v)
-        projected: Tensor = self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
-        return projected
+        return self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
 
 
 class Perceptron(nn.Module):
@@ -60,8 +58,7 @@ class Perceptron(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x (B, n, W) -> (B, n, W)."""
-        hidden: Tensor = self.fc2(F.gelu(self.fc1(x)))
-        return hidden
+        return self.fc2(F.gelu(self.fc1(x)))
 
 
 class LayerScale(nn.Module):
@@ -90,8 +87,7 @@ class Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """x (B, n, W) -> (B, n, W)."""
         x = x + self.ls1(self.attn(self.norm1(x)))
-        out: Tensor = x + self.ls2(self.mlp(self.norm2(x)))
-        return out
+        return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 class VisionTower(nn.Module):
@@ -116,6 +112,17 @@ class VisionTower(nn.Module):
         for block in self.blocks:
             x = block(x)
         return x[:, self.prefix :]
+
+
+class PoolingHead(nn.Module):
+    """SigLIP's pooling head, which checkpoints hold and no output reads: its tensors alone."""
+
+    def __init__(self, tower: Tower) -> None:
+        super().__init__()
+        self.latent = nn.Parameter(torch.zeros(1, 1, tower.width))
+        self.q, self.kv = nn.Linear(tower.width, tower.width), nn.Linear(tower.width, 2 * tower.width)
+        self.proj, self.norm = nn.Linear(tower.width, tower.width), nn.LayerNorm(tower.width)
+        self.mlp = Perceptron(tower)
 
 
 class VisionBackbone(nn.Module):

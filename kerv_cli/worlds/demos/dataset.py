@@ -89,8 +89,8 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
 
 def entry_of(path: Path, episode: DemoEpisode) -> dict[str, Any]:
     """The manifest's entry of an episode that lies in `path`."""
-    own = {name: getattr(episode, name) for name in ("seed", "perturbed", "steps")}
-    return {**own, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
+    fields = {name: getattr(episode, name) for name in ("seed", "perturbed", "steps")}
+    return {**fields, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
 
 
 def totals(

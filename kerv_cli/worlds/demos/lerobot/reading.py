@@ -178,8 +178,7 @@ def _manifest(
         **totals(entries, {}, missing=0),
         "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
     }
-    plain: dict[str, Any] = json.loads(json.dumps(manifest))
-    return plain
+    return json.loads(json.dumps(manifest))
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
