@@ -31,7 +31,7 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
-from kerv_cli.lab.policy import identity_of
+from kerv_cli.lab.policy import check
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
@@ -133,7 +133,7 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     asked = settings_of(results, *overrides.split())
     method = Method.of(asked)
     assert set(method.needs) == wanted
-    identity = identity_of(asked)
+    identity = check(asked)
     assert {"target", *wanted} == set(identity) - {"observation"}
     assert settings_from(as_plain(asked)) == asked
     files = files_of(asked)
