@@ -15,7 +15,8 @@ from kerv_cli.engine.record import Delay, EpisodeRecord
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.latency import latency_figure, latency_summary, latency_table
+from kerv_cli.report.latency import latency_summary, latency_table
+from kerv_cli.report.plots import latency_figure
 from kerv_cli.report.report import report
 from kerv_cli.report.tables import load_study
 
