@@ -78,13 +78,13 @@ class Laps(Clock):
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """As `Clock.lap`."""
+        """Ends a phase; see `Clock.lap`."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """As `Clock.stop`."""
+        """Seconds in all; see `Clock.stop`."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -102,7 +102,7 @@ class Dummy(Stateless):
         self.nodes, self.tokens = nodes, tokens
 
     def propose(self, chunk: Chunk, depth: int) -> TokenTree:
-        """As `Proposer.propose`."""
+        """The dummy draft; see `Proposer.propose`."""
         first, chain = len(chunk.tokens), min(self.nodes, depth)
         tokens = range(self.nodes) if self.tokens is None else self.tokens[first : first + self.nodes]
         return TokenTree.build(tokens, [*range(-1, chain - 1), *[ROOT] * (len(tokens) - chain)])
