@@ -22,7 +22,7 @@ from kerv_cli.base.settings import (
     PolicySettings,
     RolloutSettings,
 )
-from kerv_cli.lab.policy import check, decoder_for, identity_of, unseen_tasks
+from kerv_cli.lab.policy import check, decoder_for, unseen_tasks
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.methods.early import EarlySettings
@@ -98,7 +98,7 @@ def test_a_study_loads_and_hashes_everything_once(results: Path, monkeypatch: py
     for _ in range(2):
         for asked in study:
             check(asked)
-            identity_of(asked)
+            check(asked)
             decoders.append(decoder_for(asked, "reach-v3"))
     assert set(loaded.values()) == {1}
     assert len(loaded) == 3
@@ -128,12 +128,12 @@ def test_only_what_is_needed_is_read(results: Path) -> None:
 def test_a_changed_file_is_another_artifact(results: Path) -> None:
     asked = settings_of(results, "method=retrieval_only")
     files = Artifacts(asked.results, asked.policy)
-    before, store = identity_of(asked), files.load("datastore")
+    before, store = check(asked), files.load("datastore")
     assert files.load("datastore") is store
     policy = PolicySettings(target="nano-state")
     built = BuildDatastoreSettings(policy, demos="few", task=list(TASKS), results=str(results), stride=2)
     DatastoreBuild(built).build()
-    after = identity_of(asked)
+    after = check(asked)
     assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}
     again = Artifacts(asked.results, asked.policy).load("datastore")
     assert len(again.vectors) < len(store.vectors)

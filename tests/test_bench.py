@@ -211,7 +211,6 @@ def test_the_command_ends_with_one_document(tmp_path: Path) -> None:
     assert (there.about["projected"], there.about["device_name"], there.prompt) == (True, "H100 SXM", 31)
     assert set(there.phases) == set(read_profile(path).phases)
     assert there.decode(8) > 8 * 12 * 15e-6
-    assert (tmp_path / "bench/nano-float32.png").stat().st_size > 5000
     compared = kerv("--compare", str(path), str(path))
     assert "one token" in compared
     assert "1.00" in compared

@@ -15,9 +15,19 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import StudySettings
 from kerv_cli.lab.plan import plan
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report import decided
-from kerv_cli.report.choose import choices, pareto, safest_first, sentence, short
-from kerv_cli.report.decided import LARGER, OPEN, SMALLER, confidence_of_a_look, verdict_of
+from kerv_cli.report import decide
+from kerv_cli.report.decide import (
+    LARGER,
+    OPEN,
+    SMALLER,
+    choices,
+    confidence_of_a_look,
+    pareto,
+    safest_first,
+    sentence,
+    short,
+    verdict_of,
+)
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.statistics import PairedCounts, paired_difference, pairs_to_settle, ratio
 from kerv_cli.report.tables import load_study, rows_of
@@ -137,12 +147,12 @@ def test_verdicts_come_from_the_stored_pairs_and_are_stored(tmp_path: Path) -> N
     for cell in cells:
         store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
     store.write_plan(StudySettings("stopped", ""), cells)
-    assert [len(look) for look in decided.looks_of(cells, 2)] == [2, 2]
-    (found,) = decided.verdicts(load_study(store), ["spec_vla"], 0.5, 2, 2)
+    assert [len(look) for look in decide.looks_of(cells, 2)] == [2, 2]
+    (found,) = decide.verdicts(load_study(store), ["spec_vla"], 0.5, 2, 2)
     assert found.pairs == 4
-    decided.write_verdicts(store.root, {"spec_vla": found}, 50.0, 2)
+    decide.write_verdicts(store.root, {"spec_vla": found}, 50.0, 2)
     assert json.loads((store.root / "decided.json").read_text())["loss_points"] == 50.0
-    again = decided.read_verdicts(store.root)
+    again = decide.read_verdicts(store.root)
     assert again is not None
     assert list(again["label"]) == ["spec_vla"]
 

@@ -15,7 +15,8 @@ from kerv_cli.engine.record import Delay, EpisodeRecord
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.latency import latency_figure, latency_summary, latency_table
+from kerv_cli.report.latency import latency_summary, latency_table
+from kerv_cli.report.plots import latency_figure
 from kerv_cli.report.report import report
 from kerv_cli.report.tables import load_study
 
@@ -75,7 +76,7 @@ def test_every_setting_stands_beside_ar_at_its_latency(results: Path) -> None:
     assert own["difference"] == 0.0
     assert fast["held_share"] == 0.0 < rows.loc["ar ar_ms=100 none"]["held_share"]  # four steps of its chunk, and nine
     told = latency_summary(table).set_index("setting")
-    assert told.loc["spec_vla ar_ms=100 none"]["minus AR's"].startswith("100.0 (")
+    assert told.loc["spec_vla ar_ms=100 none"]["minus AR's"].startswith("100 (")
     assert told.loc["ar ar_ms=100 none"]["minus AR's"] == ""
 
 

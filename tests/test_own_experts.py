@@ -11,7 +11,7 @@ import pytest
 from kerv_cli.base.config import compose
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.lab.policy import identity_of
+from kerv_cli.lab.policy import check
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
 from kerv_cli.worlds.metaworld.experts import OURS, VERSION, HandlePullSide
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -113,7 +113,7 @@ def test_the_peg_is_carried_without_being_dragged() -> None:
 def test_what_ours_did_is_told_from_what_metaworlds_did() -> None:
     """In the identity of an expert's cells, and in a recording's configuration; of other tasks nothing changes."""
     peg, reach = (compose("rollout", ["policy=expert", f"task={task}"], RolloutSettings) for task in (PEG, "reach"))
-    assert identity_of(peg)["expert"] == f"{PEG} {VERSION}"
-    assert "expert" not in identity_of(reach)
+    assert check(peg)["expert"] == f"{PEG} {VERSION}"
+    assert "expert" not in check(reach)
     configs = [_identity(DemoConfig((task,), episodes=1))["config"] for task in (PEG, "reach-v3")]
     assert [config.get("experts") for config in configs] == [{PEG: VERSION}, None]

@@ -31,7 +31,8 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.history import ActionHistory
-from kerv_cli.lab.policy import identity_of
+from kerv_cli.lab.catalogue import find_runs, matching
+from kerv_cli.lab.policy import check
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
@@ -133,7 +134,7 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     asked = settings_of(results, *overrides.split())
     method = Method.of(asked)
     assert set(method.needs) == wanted
-    identity = identity_of(asked)
+    identity = check(asked)
     assert {"target", *wanted} == set(identity) - {"observation"}
     assert settings_from(as_plain(asked)) == asked
     files = files_of(asked)
@@ -167,6 +168,12 @@ def test_what_is_missing_or_damaged_gets_one_line(results: Path, change: Any, sa
     with pytest.raises(CheckpointError, match=says) as refused:
         files_of(settings_of(results)).check(["follow"])
     assert "\n" not in str(refused.value)
+
+
+def test_its_weights_are_a_run_of_the_results_folder(results: Path) -> None:
+    (run,) = matching(find_runs(results), {"kind": "follow"})
+    assert (run.id, run.state, run.is_training) == ("follow/mine", "complete", True)
+    assert set(run.made_from) == {"target"}
 
 
 def test_a_table_of_another_target_or_action_space_is_refused(results: Path) -> None:

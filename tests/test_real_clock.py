@@ -350,9 +350,9 @@ def test_a_profile_is_part_of_the_results_identity(results: Path) -> None:
     found = []
     for seconds in (0.005, 0.006):
         profile_file(results, encode={"rows": [1], "seconds": [seconds]})
-        found.append(policies_of.identity_of(chosen)["profile"])
+        found.append(policies_of.check(chosen)["profile"])
     assert found[0] != found[1]
-    assert "profile" not in policies_of.identity_of(dataclasses.replace(chosen, rollout=RolloutSettings().rollout))
+    assert "profile" not in policies_of.check(dataclasses.replace(chosen, rollout=RolloutSettings().rollout))
 
 
 # --- what is refused: one line, exit code 2

@@ -18,9 +18,9 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.cost import Profile, predicted, sequence_of_record
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.measures import MACRO, MICRO
-from kerv_cli.report.motion import differences, motion
+from kerv_cli.report.measures import MACRO, MICRO, measure
 from kerv_cli.report.reprice import Machine, machine_columns, open_machines, repriced_summary, repriced_table
+from kerv_cli.report.summary import differences
 from kerv_cli.report.tables import StudyData, load_study
 
 PROFILE = Profile(
@@ -190,14 +190,14 @@ def test_motion_is_paired_over_what_both_solved(data: StudyData) -> None:
     method.loc[method.index[0], ["success", "path_length"]] = [False, 99.0]
     method.loc[method.index[1:], "path_length"] = 1.5
     for averaging in (MICRO, MACRO):
-        found = motion(method, ar, averaging)
+        found = measure(method, ar, averaging)
         assert (found["path_m"], found["path_m_ratio"], found["jerk_ratio"]) == pytest.approx((1.5, 1.5, 1.0))
         assert found["path_m_ratio_low"] == pytest.approx(1.5)
         assert math.isnan(found["gripper_switches_ratio"])  # nothing to divide by
     older = method.assign(path_length=None, jerk=None, gripper_switches=None)
-    assert math.isnan(motion(older, ar, MICRO)["path_m"])
-    assert math.isnan(motion(older, ar, MICRO)["path_m_ratio"])
-    assert motion(older, ar, MICRO)["steps_to_success"] > 0
+    assert math.isnan(measure(older, ar, MICRO)["path_m"])
+    assert math.isnan(measure(older, ar, MICRO)["path_m_ratio"])
+    assert measure(older, ar, MICRO)["steps_to_success"] > 0
 
 
 def test_the_report_says_why_the_speeds_differ() -> None:

@@ -18,11 +18,15 @@ from typing import Any
 import pandas as pd
 import pytest
 from click.testing import Result
+from studies_synthetic import prepare, threshold_study
 from typer.testing import CliRunner
 
+from kerv_cli.base.settings import StudySettings
 from kerv_cli.cli.app import app
 from kerv_cli.lab.catalogue import find_runs, matching
+from kerv_cli.lab.execute import execute
 from kerv_cli.lab.run import CellRunner
+from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.export import TRACKERS, export
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
@@ -94,6 +98,19 @@ def test_a_run_is_shown_and_a_wrong_name_refused(results: Path) -> None:
     assert missing.exit_code == 2
     assert "unknown run 'nothing-like-it'" in missing.stderr
     assert "kerv rollout" in kerv("runs", "show", "last", "results=/tmp/no-such-results").stderr
+
+
+def test_two_runs_of_a_study_are_compared_by_their_speedups(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        store = StudyStore(tmp_path, name)
+        cells = threshold_study(["reach-v3", "push-v3"])
+        store.write_plan(StudySettings(name, "", "ar"), cells)
+        execute(cells, prepare, store)
+    pairs = json.loads(works("runs", "compare", "one", "two", f"results={tmp_path}", "--json"))
+    assert [pair["first"].partition(":")[2] for pair in pairs] == ["ar", "naive_sd", "spec_vla r=3", "spec_vla r=9"]
+    ratios = [{row["measure"]: row for row in pair["results"]}.get("per step against ar") for pair in pairs]
+    assert ratios[0] is None
+    assert all(row is not None and row["change"] == row["second"] / row["first"] == 1.0 for row in ratios[1:])
 
 
 def test_comparison_says_what_differs_in_settings_and_results(results: Path) -> None:

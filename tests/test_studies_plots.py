@@ -17,12 +17,10 @@ from kerv_cli.base.registry import Part
 from kerv_cli.base.settings import RolloutSettings, StudySettings
 from kerv_cli.lab.plan import plan
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.drawing import COLOURS, INK, STYLE, new_figure, setting_colours
+from kerv_cli.report.drawing import COLOURS, INK, STYLE, new_figure, place_labels, setting_colours
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.plots import series_of, study_figures
-from kerv_cli.report.scatter import place_labels
+from kerv_cli.report.plots import has_task_map, series_of, study_figures, task_map
 from kerv_cli.report.tables import load_study, study_table
-from kerv_cli.report.task_map import has_task_map, task_map
 
 
 def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:

@@ -427,7 +427,6 @@ class ReportSettings(CommandSettings):
     """`kerv report`."""
 
     only: str | None = setting(None, "one study, by name or file; default: all that are there")
-    against: str | None = setting(None, "results folder with another run of that study: how far the two agree")
     on: list[str] = setting([], "profiles of 'kerv bench' that price the study's decodes")
     loss: float = number(3.0, above=0, most=99.9, help="--choose: bound on the loss of success, points")
 

@@ -78,13 +78,13 @@ class Laps(Clock):
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """As `Clock.lap`."""
+        """Ends a phase; see `Clock.lap`."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """As `Clock.stop`."""
+        """Seconds in all; see `Clock.stop`."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -102,7 +102,7 @@ class Dummy(Proposer):
         self.nodes, self.tokens = nodes, tokens
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """As `Proposer.propose`."""
+        """The dummy draft; see `Proposer.propose`."""
         first, chain = len(chunk.tokens), min(self.nodes, depth)
         tokens = range(self.nodes) if self.tokens is None else self.tokens[first : first + self.nodes]
         return Draft.of(tokens, [*range(-1, chain - 1), *[ROOT] * (len(tokens) - chain)])
@@ -131,7 +131,7 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
     seconds = {phase: sum(s for name, s in laps if name == phase) for phase in ("vision", "prefill", "verify")}
     yield ("encode", 1), seconds["vision"]
     yield ("prefill", prompt + rounds[0].tree_size), seconds["prefill"]
-    nodes = {played.tree_size for played in rounds[1:]}
+    nodes = {one.tree_size for one in rounds[1:]}
     if len(nodes) == 1:
         yield ("verify", 1 + nodes.pop()), seconds["verify"] / (len(rounds) - 1)
     drafter = decoder.parts.proposer
@@ -139,11 +139,11 @@ def costs_of(decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Seque
         # behind the limits of acceptance: the prompt's states, then by turns a draft and the states of its tokens
         _, prompt_states, *turns = (s for name, s in laps if name == "propose")
         yield ("feed", prompt), prompt_states
-        for played, drafting in zip(rounds[1:], turns[::2], strict=False):
-            levels = min(drafter.depth, decoder.steps * decoder.target.actions.dofs - played.start - 1)
+        for one, drafting in zip(rounds[1:], turns[::2], strict=False):
+            levels = min(drafter.depth, decoder.steps * decoder.target.actions.dofs - one.start - 1)
             yield ("tree" if drafter.top_k > 1 else "draft", levels), drafting
-        for played, feeding in zip(rounds[1:], turns[1::2], strict=False):
-            yield ("feed", 1 + played.accepted), feeding
+        for one, feeding in zip(rounds[1:], turns[1::2], strict=False):
+            yield ("feed", 1 + one.accepted), feeding
 
 
 @torch.inference_mode()
@@ -157,7 +157,7 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
     every, seconds = decoders(model), dict[Key, list[float]]()
     sources = source_decoders(settings)
     for turn in range(_WARM_UP + settings.repeats):
-        found: list[tuple[Key, float]] = []
+        costs: list[tuple[Key, float]] = []
         for decoder in every:
             evicting.sum()
             clock = Laps(device)
@@ -166,11 +166,11 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
             chunk = decoder.decode_prompt(prompt, clock)
             decoder.actions_of(chunk)
             clock.stop()
-            found += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
+            costs += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
         for kind, source in sources.items():
             evicting.sum()
-            found.append(((kind, 1), source.decode(blank(source.target)).phases["propose"]))
-        for key, value in found if turn >= _WARM_UP else ():
+            costs.append(((kind, 1), source.decode(blank(source.target)).phases["propose"]))
+        for key, value in costs if turn >= _WARM_UP else ():
             seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
     return machine, phases_of(seconds, model.sizes, machine)
@@ -214,6 +214,6 @@ def flipped(model: Model, chunks: int) -> tuple[int, int]:
         observation = model.observation.with_images(images)
         tokens = Decoder(model.target).decode(observation).tokens
         again = Decoder(model.target, Parts(proposer=Dummy(len(tokens), tokens))).decode(observation)
-        differ += sum(played.accepted < len(played.drafted) for played in again.rounds)
+        differ += sum(one.accepted < len(one.drafted) for one in again.rounds)
         compared += len(tokens)
     return differ, compared

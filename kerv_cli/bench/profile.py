@@ -20,7 +20,7 @@ _HALF = 2  # bytes of a bfloat16
 def profile_of(phases: Sequence[Phase], tokens: int = 0) -> Profile:
     """The profile of measured costs, their medians. tokens: N."""
     points = {kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in KINDS}
-    costs = {kind: tuple(zip(*found, strict=True)) for kind, found in points.items() if found}
+    costs = {kind: tuple(zip(*pairs, strict=True)) for kind, pairs in points.items() if pairs}
     prompt = costs["prefill"][0][0] if "prefill" in costs else 0
     return Profile(int(prompt), {kind: (rows, seconds) for kind, (rows, seconds) in costs.items()}, tokens)
 
@@ -31,11 +31,11 @@ def projections(
     """(device, document) of every device of `projections`, for the shape `projected` in bfloat16. Its rows behind the
     prompt are those measured here."""
     shape = shape_of(settings.projected, model.size)
-    there = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
+    sizes = Sizes(shape, model.target.actions.tokens, _HALF, _HALF)
     here, prompt = min(p.rows for p in phases if p.kind == "prefill"), prompt_of(shape)
     longer = [replace(p, rows=p.rows - here + prompt) if _counts_prompt(p, here) else p for p in phases]
     moved = [
-        replace(p, read=read, flops=flops) for p in longer for read, flops in [there.needs(p.kind, p.rows, prompt)]
+        replace(p, read=read, flops=flops) for p in longer for read, flops in [sizes.needs(p.kind, p.rows, prompt)]
     ]
     for name, (bandwidth, flops) in settings.projections.items():
         device = Machine(bandwidth * 1e9, flops * 1e12)
@@ -56,11 +56,11 @@ def shares(phases: Sequence[Phase], machine: Machine) -> tuple[float, float]:
     are none of one kind, that of all."""
     counted = [p for p in phases if p.floor > 0]
     by_memory = [p.read / machine.bandwidth >= p.flops / machine.flops for p in counted]
-    found = [
+    by_bound = [
         [min(1.0, p.share) for p, bound in zip(counted, by_memory, strict=True) if bound == kind]
         for kind in (True, False)
     ]
-    memory, arithmetic = (statistics.median(part or [*found[0], *found[1]]) for part in found)
+    memory, arithmetic = (statistics.median(part or [*by_bound[0], *by_bound[1]]) for part in by_bound)
     return memory, arithmetic
 
 

@@ -1,16 +1,11 @@
-"""Tables and the roofline plot of a bench."""
+"""Tables of a bench."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from kerv_cli.base.files import atomic_path
 from kerv_cli.bench.ceilings import MethodCeiling
-from kerv_cli.bench.machine import Machine
 from kerv_cli.bench.phases import Phase
 
 
@@ -29,7 +24,7 @@ def card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
 
 
 def phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
-    """One row per phase: times in milliseconds, rates, share of the roofline."""
+    """One row per phase: times in milliseconds, rates, share of the device's rate."""
     rows: list[tuple[str, ...]] = []
     for phase in phases:
         limited = phase.floor > 0
@@ -62,34 +57,3 @@ def comparison_rows(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[st
             mine, theirs = phase["seconds"], other[phase["name"]]["seconds"]
             rows.append((phase["name"], f"{1e3 * mine:.2f}", f"{1e3 * theirs:.2f}", f"{mine / theirs:.2f}"))
     return rows
-
-
-def plot_roofline(path: Path, title: str, machine: Machine, phases: Sequence[Phase]) -> None:
-    """GFLOP/s over operations per byte, both logarithmic: the device's roof and every phase below it."""
-    import matplotlib as mpl
-
-    from kerv_cli.report.drawing import INK, STYLE, colour, entitle, new_figure
-    from kerv_cli.report.scatter import place_labels
-
-    limited = [phase for phase in phases if phase.floor > 0]
-    with mpl.rc_context(STYLE):
-        figure = new_figure(7.0, 4.6)
-        axes = figure.subplots()
-        intensity = [phase.flops / phase.read for phase in limited]
-        knee = machine.flops / machine.bandwidth
-        x = np.geomspace(min([*intensity, knee]) / 2, max([*intensity, knee]) * 2, 64)
-        axes.plot(x, np.minimum(machine.flops, x * machine.bandwidth) / 1e9, color=INK)
-        labels, shades = [], []
-        for number, kind in enumerate(dict.fromkeys(phase.kind for phase in limited)):
-            group = [phase for phase in limited if phase.kind == kind]
-            at = [phase.flops / phase.read for phase in group], [phase.flops / phase.seconds / 1e9 for phase in group]
-            axes.plot(*at, "o", color=colour(number), label=kind)
-            labels += [(a, b, str(phase.rows)) for phase, a, b in zip(group, *at, strict=True)]
-            shades += [colour(number)] * len(group)
-        axes.set(xscale="log", yscale="log", xlabel="operations per byte", ylabel="GFLOP/s")
-        axes.legend(title="phase, by rows")
-        about = f"roof: {machine.bandwidth / 1e9:.1f} GB/s and {machine.flops / 1e9:.0f} GFLOP/s, measured"
-        entitle(figure, title, about)
-        place_labels(figure, axes, labels, shades)
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png", dpi=130)

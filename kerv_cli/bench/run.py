@@ -18,7 +18,6 @@ from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
 from kerv_cli.bench.phases import Phase, flipped, measure
 from kerv_cli.bench.profile import profile_of, projections
-from kerv_cli.bench.report import plot_roofline
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder
 
@@ -113,11 +112,10 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:
-    """Writes the document, the roofline and the projections of `projected` -> their paths."""
+    """Writes the document and the projections of `projected` -> their paths."""
     path = place_of(settings.results, bench.model.name, bench.dtype, ".json")
     write_json(path, bench.document())
-    plot_roofline(path.with_suffix(".png"), bench.title, bench.machine, bench.phases)
-    paths = [path, path.with_suffix(".png")]
+    paths = [path]
     for device, document in (
         projections(settings, bench.model, bench.machine, bench.phases) if settings.projected else ()
     ):

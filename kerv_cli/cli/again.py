@@ -20,7 +20,7 @@ from kerv_cli.lab.catalogue import ROLLOUT, RunEntry, description_of, find_run, 
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
-from kerv_cli.lab.policy import check, identity_of
+from kerv_cli.lab.policy import check
 from kerv_cli.lab.run import CellRunner, reference_decode
 from kerv_cli.lab.store import STUDIES, StudyStore, new_rollout
 from kerv_cli.report.viewing import save_recording
@@ -57,8 +57,7 @@ def plan_again(run: RunEntry, results: str) -> Again:
 
 def _again(cell: Cell, results: str) -> Cell:
     settings = settings_from({**cell.settings, "results": results, "episodes": 1, "seed": cell.seeds[0]})
-    check(settings)
-    identity = identity_of(settings)
+    identity = check(settings)
     for kind in cell.identity.keys() | identity.keys():
         was, now = cell.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and was != now:

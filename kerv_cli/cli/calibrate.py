@@ -135,7 +135,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     from kerv_cli.base.config import compose
     from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve
-    from kerv_cli.report.certificate import certify, place_of, verdicts, write
+    from kerv_cli.report.certificate import certify, folder_of, verdicts, write
 
     own = [word for word in words if word.split("=")[0] in OWN]
     theirs = [word for word in words if word not in own]
@@ -147,7 +147,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     if cfg:
         print_settings(resolved)
         return
-    place = place_of(resolved, settings.name)
+    place = folder_of(resolved, settings.name)
     store, covered = covered_cells(resolved, theirs)
     if plan:
         print_sweep_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)

@@ -9,7 +9,7 @@ import typer
 
 from kerv_cli.base.settings import ReportSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, console, print_json, print_table
+from kerv_cli.cli.common import AsJson, print_json, print_table
 
 Publish = Annotated[
     bool,
@@ -32,7 +32,7 @@ def studies_there() -> list[str]:
 @command(
     "report",
     ReportSettings,
-    keys="study results on against loss",
+    keys="study results on loss",
     examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
     # a folder of results; to Hydra study= would be a choice among the files of conf/study
     typed={"study": "only"},
@@ -53,7 +53,6 @@ def report(
     from kerv_cli.base.places import results_dir
     from kerv_cli.cli.sweep import tell_table
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.agreement import agreement_summary
     from kerv_cli.report.report import report as write_report
     from kerv_cli.report.reprice import ASSUMES, repriced_summary
     from kerv_cli.report.tables import rows_of
@@ -61,7 +60,7 @@ def report(
     if choose:
         _choose(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.against, settings.on)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.on)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
@@ -69,8 +68,6 @@ def report(
         return
     for name, table in output.tables.items():
         tell_table(table, StudyStore(results_dir(settings.results), name), words)
-    if output.agreement is not None:
-        console().print(agreement_summary(output.agreement))
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
@@ -83,8 +80,8 @@ def _choose(settings: ReportSettings, as_json: bool) -> None:
     from kerv_cli.base.errors import UsageError
     from kerv_cli.base.places import results_dir
     from kerv_cli.lab.store import StudyStore, begun_studies
-    from kerv_cli.report.choose import choices, choices_frame, sentence, short
-    from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
+    from kerv_cli.report.decide import choices, sentence, short
+    from kerv_cli.report.tables import load_study, per_task_table, study_table
 
     results = results_dir(settings.results)
     names = [settings.only] if settings.only else begun_studies(results)
@@ -94,7 +91,7 @@ def _choose(settings: ReportSettings, as_json: bool) -> None:
     for name in names:
         data = load_study(StudyStore(results, name))
         groups = choices(study_table(data), per_task_table(data), settings.loss)
-        answers[name] = rows_of(choices_frame(groups))
+        answers[name] = [choice.as_dict() for choice in groups]
         if not as_json:
             typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
             typer.echo(f"  {sentence(groups[0], settings.loss, data.plan.baseline)}")

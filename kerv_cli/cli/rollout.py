@@ -100,16 +100,16 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
     with at_work("loading the policy"):
         from kerv_cli.base.runtime import set_up
         from kerv_cli.lab.plan import plan as plan_cells
-        from kerv_cli.lab.policy import check, identity_of
+        from kerv_cli.lab.policy import check
 
+        identities = {label: check(settings) for label, settings in resolved.settings.items()}
         for settings in resolved.settings.values():
-            check(settings)
             settings.runtime.device, _ = set_up(settings.runtime)
     warn_unseen(resolved, tasks)
     return plan_cells(
         resolved.settings,
         tasks,
-        identity_of,
+        identities.__getitem__,
         baseline=study.baseline,
         overrides=resolved.overrides,
         block=study.block,

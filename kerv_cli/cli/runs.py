@@ -193,11 +193,11 @@ def rerun(
     settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
     """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
-    from kerv_cli.lab.catalogue import TRAINED, find_run
+    from kerv_cli.lab.catalogue import find_run
 
     results, (name,) = settings.results, _runs(names)
     run = find_run(results, name)
-    if run.kind in TRAINED:
+    if run.is_training:
         _train_again(run, results, plan, as_json)
         return
     if not run.has_episodes:

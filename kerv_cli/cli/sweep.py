@@ -189,13 +189,13 @@ def _until_decided(
 ) -> Outcome:
     """Runs block after block of seeds, without the settings whose question is answered; the plan holds what was run."""
     from kerv_cli.lab.events import Outcome
-    from kerv_cli.report import decided
+    from kerv_cli.report import decide
     from kerv_cli.report.tables import load_study
 
     study, margin = resolved.study, resolved.loss / 100
-    blocks = decided.looks_of(cells, study.block)
-    typer.echo(decided.rule(resolved.loss, len(blocks)), err=True)
-    latest: dict[str, decided.Verdict] = {}
+    blocks = decide.looks_of(cells, study.block)
+    typer.echo(decide.rule(resolved.loss, len(blocks)), err=True)
+    latest: dict[str, decide.Verdict] = {}
     planned: list[Cell] = []
     total = Outcome()
     open_labels = [label for label in resolved.settings if label != study.baseline]
@@ -207,11 +207,11 @@ def _until_decided(
         total = Outcome(*lists, total.seconds + outcome.seconds)
         if outcome.failed:
             return total
-        verdicts = decided.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
-        typer.echo(f"look {look} of {len(blocks)}: {decided.summary(verdicts)}", err=True)
+        verdicts = decide.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
+        typer.echo(f"look {look} of {len(blocks)}: {decide.summary(verdicts)}", err=True)
         latest |= {verdict.label: verdict for verdict in verdicts}
-        decided.write_verdicts(store.root, latest, resolved.loss, len(blocks))
-        open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decided.OPEN]
+        decide.write_verdicts(store.root, latest, resolved.loss, len(blocks))
+        open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decide.OPEN]
         if not open_labels:
             break
     return total

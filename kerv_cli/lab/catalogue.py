@@ -19,29 +19,24 @@ from kerv_cli.base.files import read_json, sha256_of, storage_errors, sync, visi
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
+from kerv_cli.base.registry import parts
 from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, unique_cells
 from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, stores
 
 SWEEP, ROLLOUT = "sweep", "rollout"
-DESCRIPTIONS = {
-    "demos": "manifest.json",
-    "target": "target.json",
-    "drafter": "drafter.json",
-    "early": "early.json",
-    "scout": "scout.json",
-    "certificate": "certificate.json",
-    "datastore": "manifest.json",
-    "calibration": "calibration.json",
-    "risk": "risk.json",
-    "score": "score.json",
-}
-"""Kind of artifact -> the file that describes it; risk and score are of an older kerv."""
-TRAINED = ("target", "drafter", "early", "scout")
-KINDS = (SWEEP, ROLLOUT, *DESCRIPTIONS)
+OLDER = ("risk", "score")
+"""Kinds of artifacts that an older kerv made."""
+LOG, WEIGHTS = "log.csv", "model.safetensors"
+"""Files of a training."""
 LAST = "last"
 """Stands for the newest run where one is named."""
+
+
+def artifact_kinds() -> tuple[str, ...]:
+    """Kinds of what is recorded, trained, built and calibrated, those of plugins among them."""
+    return ("demos", "target", *parts("artifact"), *OLDER)
 
 
 @dataclass(frozen=True)
@@ -68,12 +63,17 @@ class RunEntry:
         """Whether the run is a sweep or a rollout."""
         return self.kind in (SWEEP, ROLLOUT)
 
+    @property
+    def is_training(self) -> bool:
+        """Whether the run is a training, or weights that were imported or copied."""
+        return not self.has_episodes and any((self.folder / name).is_file() for name in (LOG, WEIGHTS))
+
 
 def find_runs(results: str | Path) -> list[RunEntry]:
     """Every run of the results folder, the newest first."""
     root = Path(results).expanduser()
     runs = [_study(store) for family in (STUDIES, ROLLOUTS) for store in stores(root, family)]
-    runs += [run for kind in DESCRIPTIONS for run in _artifacts(root / "artifacts" / kind, kind)]
+    runs += [run for kind in artifact_kinds() for run in _artifacts(root / "artifacts" / kind, kind)]
     return sorted(runs, key=lambda run: (run.started, run.id), reverse=True)
 
 
@@ -108,8 +108,9 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     for key in filters:
         if key not in filter_names:
             raise UnknownName("filter", key, filter_names)
-    if filters.get("kind", SWEEP) not in KINDS:
-        raise UnknownName("kind of run", filters["kind"], KINDS)
+    kinds = (SWEEP, ROLLOUT, *artifact_kinds())
+    if filters.get("kind", SWEEP) not in kinds:
+        raise UnknownName("kind of run", filters["kind"], kinds)
     return [run for run in runs if _agrees(run, filters)]
 
 
@@ -186,21 +187,22 @@ def description_of(run: RunEntry) -> dict[str, Any]:
 
 
 def _described(folder: Path, kind: str) -> dict[str, Any]:
-    path = folder / DESCRIPTIONS[kind]
+    path = _description(folder, kind)
     return dict(read_json(path)) if path.is_file() else {}
+
+
+def _description(folder: Path, kind: str) -> Path:
+    """The file that describes an artifact."""
+    return folder / ("manifest.json" if kind in ("demos", "datastore") else f"{kind}.json")
 
 
 def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
     with contextlib.suppress(OSError):
         clean(folder)
     for path in visible(folder):
-        traces = (DESCRIPTIONS[kind], *_BEGUN.get(kind, ()))
-        if any((path / name).is_file() for name in traces):
+        # an unfinished recording and a training before its first validation have no description yet
+        if any(file.is_file() for file in (_description(path, kind), path / "recording.json", path / LOG)):
             yield _artifact(path, kind)
-
-
-_BEGUN = {"demos": ("recording.json",), **dict.fromkeys(TRAINED, ("log.csv",))}
-"""Kind -> files that an unfinished one has."""
 
 
 def _artifact(folder: Path, kind: str) -> RunEntry:
@@ -212,13 +214,13 @@ def _artifact(folder: Path, kind: str) -> RunEntry:
         settings = dict(provenance.get("settings") or {})
         return replace(
             run,
-            state=_trained_state(folder, settings) if kind in TRAINED else "complete" if value else "begun",
+            state=_trained_state(folder, settings) if run.is_training else "complete" if value else "begun",
             methods=(kind,),
             tasks=tuple(settings.get("task") or value.get("tasks") or ()),
             episodes=int(value.get("episodes", 0)) if kind == "demos" else 0,
             figures=_figures(value, provenance),
             command=tuple(str(provenance.get("command", "")).split()[1:]),
-            sha256=_hash_of(folder / DESCRIPTIONS[kind], value),
+            sha256=_hash_of(_description(folder, kind), value),
             made_from=_made_from(value, provenance),
         )
     except (KervError, OSError, ValueError, TypeError, AttributeError, KeyError):
@@ -233,9 +235,9 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
 
 
 def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
-    if not (folder / "log.csv").is_file():
+    if not (folder / LOG).is_file():
         return "complete"  # copied or imported: it has no log
-    with (folder / "log.csv").open(newline="", encoding="utf-8") as file:
+    with (folder / LOG).open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
     return "complete" if step >= steps else f"step {step:.0f} of {steps}"
@@ -260,7 +262,7 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     hash."""
     names = {other.sha256: other.id for other in runs if other.sha256}
     for folder in visible(shipped_dir()):
-        for kind in TRAINED:
+        for kind in artifact_kinds():
             with contextlib.suppress(KervError):
                 names.setdefault(str(_described(folder / kind, kind).get("sha256", "")), f"shipped {folder.name}")
     return {kind: names.get(value, value[:12]) for kind, value in run.made_from.items()}

@@ -7,7 +7,6 @@ take turns in it, episode by episode, and a cell is written after its last episo
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import os
 import secrets
@@ -18,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any, ParamSpec, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError
 from kerv_cli.base.leftovers import clean
@@ -33,8 +32,6 @@ from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Block, Cell, blocks_of
 from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.store import StudyStore
-
-P = ParamSpec("P")
 
 _POLL_SECONDS = 1.0  # between two looks at blocks that another sweep computes
 
@@ -273,13 +270,13 @@ class BlockRun:
 
     def _take_turns(self) -> Results:
         turns = [_Turn(cell, self) for cell in self.block.cells]
-        results = {turn.cell.id: result for turn in turns if (result := turn.prepare()) is not None}
+        results = {turn.cell.id: result for turn in turns if (result := _attempt(turn.prepare)) is not None}
         order = 0
         for seed in self.block.seeds:
             for turn in (turns[index] for index in self.block.order(seed)):
                 if turn.cell.id in results:
                     continue
-                result = turn.take(seed, order)
+                result = _attempt(turn.take, seed, order)
                 order += 1
                 if result is not None:
                     results[turn.cell.id] = result
@@ -299,7 +296,7 @@ class BlockRun:
             for order, (cell, _, end) in enumerate(self.prepare.together(cells) if cells else ()):
                 if cell.id in results:
                     continue  # another of its episodes failed
-                result = turns[cell.id].add(end, order)
+                result = _attempt(turns[cell.id].add, end, order)
                 if result is not None:
                     results[cell.id] = result
                     if result.storage:
@@ -309,21 +306,16 @@ class BlockRun:
         return results
 
 
-def _guarded(step: Callable[P, CellResult | None]) -> Callable[P, CellResult | None]:
-    """The step with an error as the cell's result."""
-
-    @functools.wraps(step)
-    def attempt(*args: P.args, **kwargs: P.kwargs) -> CellResult | None:
-        try:
-            return step(*args, **kwargs)
-        except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
-            return failed(error)
-
-    return attempt
+def _attempt(step: Callable[..., CellResult | None], *arguments: Any) -> CellResult | None:
+    """The step's result; an error is the cell's result."""
+    try:
+        return step(*arguments)
+    except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
+        return failed(error)
 
 
 class _Turn:
-    """One cell's part in a block. Its methods return the cell's result as soon as it has failed or is complete."""
+    """One cell's part in a block. Its methods return the cell's result as soon as it is complete, or raise."""
 
     def __init__(self, cell: Cell, work: BlockRun) -> None:
         self.cell, self.work = cell, work
@@ -331,7 +323,6 @@ class _Turn:
         self.episodes: list[tuple[EpisodeRecord, Circumstances]] = []
         self.seconds = 0.0
 
-    @_guarded
     def prepare(self) -> CellResult | None:
         """Builds the setting, unless the cell is complete."""
         clock = time.perf_counter()
@@ -342,7 +333,6 @@ class _Turn:
         self.seconds += time.perf_counter() - clock
         return None
 
-    @_guarded
     def take(self, seed: int, order: int) -> CellResult | None:
         """Runs one episode; writes the cell after its last one."""
         note_running(self.work.store.claims, self.cell, self.work.name)
@@ -352,7 +342,6 @@ class _Turn:
         record = self.run_episode(seed)
         return self._keep(record, order, started, load, time.perf_counter() - clock)
 
-    @_guarded
     def add(self, end: EpisodeRecord | Exception, order: int) -> CellResult | None:
         """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
         note_running(self.work.store.claims, self.cell, self.work.name)

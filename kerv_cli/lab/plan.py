@@ -3,12 +3,11 @@ identity.py."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -136,7 +135,7 @@ def make_cell(
 def plan(
     settings_by_label: Mapping[str, RolloutSettings],
     tasks: Sequence[str],
-    identity: Identity | Callable[[RolloutSettings], Identity],
+    identity: Identity | Callable[[str], Identity],
     *,
     baseline: str | None = None,
     overrides: Mapping[str, str] | None = None,
@@ -148,7 +147,7 @@ def plan(
     Args:
         settings_by_label: resolved settings; their order is kept.
         tasks: full task names, suites already expanded.
-        identity: hashes of the weights, one mapping for all settings or a function where settings differ in them.
+        identity: hashes of the weights, one mapping for all settings or those of a label.
         baseline: label to put first.
         overrides: what the user wrote for each label, kept for the tables.
         block: seeds of a cell.
@@ -165,8 +164,8 @@ def plan(
     if blocks * len(tasks) * repeats > MOST_CELLS:
         raise UsageError(f"the study has {blocks * len(tasks) * repeats} cells: at most {MOST_CELLS}, plan fewer")
     labels = sorted(settings_by_label, key=lambda label: label != baseline)
-    hashes = {label: identity(s) if callable(identity) else identity for label, s in settings_by_label.items()}
-    plain = {label: dataclasses.asdict(settings) for label, settings in settings_by_label.items()}
+    hashes = {label: identity(label) if callable(identity) else identity for label in labels}
+    plain = {label: asdict(settings) for label, settings in settings_by_label.items()}
     words = overrides or {}
     return [
         make_cell(label, words.get(label, ""), plain[label], hashes[label], task, seeds, repeat)
@@ -271,7 +270,7 @@ class StudyPlan:
 class _Label:
     overrides: str
     identity: dict[str, str]
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # without the task
 
 
 @dataclass(frozen=True)
@@ -285,7 +284,7 @@ class _Line:
     repeat: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _File:
     """plan.yaml: every label's settings once, then one line per cell."""
 
@@ -293,31 +292,25 @@ class _File:
     title: str
     baseline: str
     axis: str
+    note: str = ""
     labels: dict[str, _Label]
     cells: tuple[_Line, ...]
-    note: str = ""
 
 
 def plan_text(plan: StudyPlan) -> str:
     """The plan as YAML: every label's settings once, then one line per cell."""
-    labels: dict[str, dict[str, Any]] = {}
-    for cell in plan.cells:
-        if cell.label not in labels:
-            settings = {key: value for key, value in cell.settings.items() if key != "task"}
-            labels[cell.label] = {"overrides": cell.overrides, "identity": cell.identity, "settings": settings}
-    head: dict[str, Any] = {
-        "study": plan.name,
-        "title": plan.title,
-        "baseline": plan.baseline,
-        "axis": plan.axis,
-        "note": plan.note,
-        "labels": labels,
+    first = {cell.label: cell for cell in reversed(plan.cells)}
+    labels = {
+        label: {
+            "overrides": first[label].overrides,
+            "identity": first[label].identity,
+            "settings": without(first[label].settings, {"task"}),
+        }
+        for label in plan.labels
     }
-    cells = [
-        {"id": c.id, "label": c.label, "task": c.task, "seeds": seeds_text(c.seeds), "repeat": c.repeat}
-        for c in plan.cells
-    ]
-    return to_yaml(head) + to_yaml({"cells": cells}, default_flow_style=None, width=1000)
+    head = {"study": plan.name, **{name: getattr(plan, name) for name in ("title", "baseline", "axis", "note")}}
+    lines = [asdict(_Line(c.id, c.label, c.task, seeds_text(c.seeds), c.repeat)) for c in plan.cells]
+    return to_yaml({**head, "labels": labels}) + to_yaml({"cells": lines}, default_flow_style=None, width=1000)
 
 
 def plan_from_text(text: str) -> StudyPlan:
@@ -347,16 +340,8 @@ def _cells_of(file: _File) -> Iterator[Cell]:
             complete[line.label] = complete_settings(label.settings)
         if key not in shared:
             shared[key] = {**complete[line.label], "task": [line.task]}
-        yield Cell(
-            id=line.id,
-            label=line.label,
-            overrides=label.overrides,
-            task=line.task,
-            seeds=parse_seeds(line.seeds),
-            settings=shared[key],
-            identity=label.identity,
-            repeat=line.repeat,
-        )
+        seeds = parse_seeds(line.seeds)
+        yield Cell(line.id, line.label, label.overrides, line.task, seeds, shared[key], label.identity, line.repeat)
 
 
 def merge_plans(old: StudyPlan, new: StudyPlan) -> StudyPlan:

@@ -27,6 +27,7 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
 
+PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
 CALIBRATION_DECODES = 15
 """Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
@@ -43,25 +44,6 @@ def is_expert(settings: RolloutSettings) -> bool:
     return settings.policy.kind == EXPERT
 
 
-def identity_of(settings: RolloutSettings) -> dict[str, str]:
-    """Hashes of everything that determines a result besides the settings, without loading weights.
-
-    Raises:
-        CheckpointError: as `check`.
-    """
-    if is_expert(settings):
-        tasks = resolve_tasks(settings.task)
-        experts = spec_of(tasks[0]).experts
-        hashes = ";".join(f"{task} {experts[task]}" for task in sorted(tasks) if task in experts)
-        return {"target": "", **({"expert": hashes} if hashes else {}), OBSERVATION: "state (privileged)"}
-    profile = clock.profile_identity(settings)
-    artifacts = artifacts_of(settings)
-    # every row of a table has it, so that a privileged policy is recognised
-    observation = str(artifacts.description.settings.get(OBSERVATION, "vision"))
-    observation = "state (privileged)" if observation == "state" else observation
-    return {**artifacts.check(Method.of(settings).needs), **profile, OBSERVATION: observation}
-
-
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
     """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
     if is_expert(settings):
@@ -74,8 +56,9 @@ def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
     return [task for task in tasks if task not in trained_on]
 
 
-def check(settings: RolloutSettings) -> None:
-    """Refuses settings that cannot run, before anything heavy starts.
+def check(settings: RolloutSettings) -> dict[str, str]:
+    """Refuses settings that cannot run, before anything heavy starts -> the identity of their results: hashes of
+    everything that determines these besides the settings, and what is observed.
 
     Raises:
         UsageError: a number out of range, training seeds, a camera that the policy was not trained on, parts that do
@@ -88,7 +71,8 @@ def check(settings: RolloutSettings) -> None:
     check_stress(settings.world.stress, spec)
     if is_expert(settings):
         _check_expert(settings, spec)
-        return
+        experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
+        return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
     artifacts = artifacts_of(settings)
     target = artifacts.description
     target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
@@ -99,10 +83,14 @@ def check(settings: RolloutSettings) -> None:
     if settings.rollout.clock != WAITS:
         method.check_unwatched(f"rollout.clock={settings.rollout.clock}", "a look has no latency there")
     clock.check(settings, spec, target)
-    artifacts.check(method.needs)
+    hashes = artifacts.check(method.needs)
     method.check_levels(tasks, artifacts.load)
     if "certificate" in method.needs:
         artifacts.load("certificate").check_world(dataclasses.asdict(settings.world))
+    # every row of a table has it, so that a privileged policy is recognised
+    observation = str(target.settings.get(OBSERVATION, "vision"))
+    observation = PRIVILEGED if observation == "state" else observation
+    return {**hashes, **clock.profile_identity(settings), OBSERVATION: observation}
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
 from kerv_cli.lab.code import code_hash
-from kerv_cli.lab.identity import ENGINE, OBSERVATION, Identity, Plain, depends_on_order, effective, flat, work_of
+from kerv_cli.lab.identity import ENGINE, OBSERVATION, depends_on_order, effective, flat, work_of
 from kerv_cli.lab.plan import Cell, blocks_of, unique_cells
 from kerv_cli.lab.store import ROLLOUTS, StudyStore, new_rollout, stores, studies_of
 
@@ -27,14 +27,8 @@ class StockEntry:
     """A complete cell on disk, unchecked: its hashes are compared when it is used. engine: version that computed it;
     code: hash of the source that computed it, empty in cells older than that hash."""
 
-    id: str
+    cell: Cell
     store: StudyStore
-    label: str
-    task: str
-    repeat: int
-    seeds: tuple[int, ...]
-    settings: Plain
-    identity: Identity
     started: str
     run: str
     engine: int
@@ -43,7 +37,7 @@ class StockEntry:
     @property
     def work(self) -> tuple[str, str, int]:
         """Setting, task and repeat; equal to a planned cell's `work` where that cell means the same."""
-        return work_of(self.settings, self.identity, self.engine), self.task, self.repeat
+        return work_of(self.cell.settings, self.cell.identity, self.engine), self.cell.task, self.cell.repeat
 
 
 class Stock:
@@ -55,7 +49,7 @@ class Stock:
         self.by_label: dict[str, list[StockEntry]] = {}
         self.names: set[str] = set()  # of the study's own cells
         for entry in _entries(store):
-            self.names.add(entry.id)
+            self.names.add(entry.cell.id)
             self._add(entry)
         for other in studies_of(store) if others else ():
             for entry in _entries(other):
@@ -65,20 +59,20 @@ class Stock:
 
     def _add(self, entry: StockEntry) -> None:
         self.by_work.setdefault(entry.work, []).append(entry)
-        self.by_label.setdefault(entry.label, []).append(entry)
+        self.by_label.setdefault(entry.cell.label, []).append(entry)
 
     def of(self, cell: Cell) -> list[StockEntry]:
         """Cells that hold results of the same work for some of its seeds."""
         entries = self.by_work.get(cell.work, [])
         if depends_on_order(cell.settings):
-            return [entry for entry in entries if entry.seeds == cell.seeds]
-        return [entry for entry in entries if not set(entry.seeds).isdisjoint(cell.seeds)]
+            return [entry for entry in entries if entry.cell.seeds == cell.seeds]
+        return [entry for entry in entries if not set(entry.cell.seeds).isdisjoint(cell.seeds)]
 
     def block(self, entry: StockEntry, seed: int) -> str:
         """Name of the attempt at a block that measured the episode; in the oldest cells, which lack it, their run."""
-        name = str(entry.store.cells / entry.id)
+        name = str(entry.store.cells / entry.cell.id)
         if name not in self._blocks:
-            episodes = entry.store.read_cell(entry.id).episodes
+            episodes = entry.store.read_cell(entry.cell.id).episodes
             self._blocks[name] = dict(zip(episodes["seed"], episodes["block"], strict=True))
         return self._blocks[name].get(seed) or entry.run
 
@@ -87,20 +81,10 @@ def _entries(store: StudyStore) -> Iterator[StockEntry]:
     for folder in store.folders():
         try:
             config, status = store.described(folder.name)
-            yield StockEntry(
-                folder.name,
-                store,
-                str(config["label"]),
-                str(config["task"]),
-                int(config["repeat"]),
-                tuple(config["seeds"]),
-                config["settings"],
-                config["identity"],
-                str(status.get("started", "")),
-                str(status["run"]),
-                int(status.get("engine", 1)),
-                str(status.get("code", "")),
-            )
+            values = {key: config[key] for key in ("label", "task", "settings", "identity", "repeat")}
+            cell = Cell(folder.name, overrides="", seeds=tuple(config["seeds"]), **values)
+            origin = str(status.get("started", "")), str(status["run"]), int(status.get("engine", 1))
+            yield StockEntry(cell, store, *origin, str(status.get("code", "")))
         except (CheckpointError, KeyError, TypeError, ValueError, AttributeError):
             continue  # damaged: it is named where it is read
 
@@ -165,7 +149,7 @@ def _pieces(group: Sequence[Cell], stock: Stock, accepts: Callable[[StockEntry],
         {
             seed: entry
             for entry in sorted(entries, key=lambda e: (runs[e.run], e.store.name == stock.store.name, e.started))
-            for seed in entry.seeds
+            for seed in entry.cell.seeds
             if seed in cell.seeds
         }
         for cell, entries in zip(group, choices, strict=True)
@@ -205,7 +189,7 @@ def _append(
     by_cell: dict[str, list[int]] = {}
     for seed in cell.seeds:
         if seed in pieces:
-            by_cell.setdefault(pieces[seed].id, []).append(seed)
+            by_cell.setdefault(pieces[seed].cell.id, []).append(seed)
     for name, seeds in by_cell.items():
         covered.cells.append(cell.part(seeds, name))
         source = pieces[seeds[0]].store
@@ -221,7 +205,7 @@ def _append(
 
 def _reason(cell: Cell, stock: Stock, rerun: str) -> str:
     """Why a cell is to run, in a few words."""
-    seeds = {seed for entry in stock.of(cell) for seed in entry.seeds}
+    seeds = {seed for entry in stock.of(cell) for seed in entry.cell.seeds}
     if seeds.issuperset(cell.seeds):
         return {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
     if cell.work in stock.by_work:
@@ -237,12 +221,12 @@ def _differences(entry: StockEntry, cell: Cell) -> str:
     changes = [f"engine {entry.engine} → {ENGINE}"] if entry.engine != ENGINE else []
     weights = [
         kind
-        for kind in dict.fromkeys([*cell.identity, *entry.identity])
-        if kind != OBSERVATION and cell.identity.get(kind) != entry.identity.get(kind)
+        for kind in dict.fromkeys([*cell.identity, *entry.cell.identity])
+        if kind != OBSERVATION and cell.identity.get(kind) != entry.cell.identity.get(kind)
     ]
     names = {"target": f"weights of {cell.settings['policy']['target']}"}
     changes += [f"{names.get(kind, kind)} changed" for kind in weights]
-    old, new = flat(effective(entry.settings)), flat(effective(cell.settings))
+    old, new = flat(effective(entry.cell.settings)), flat(effective(cell.settings))
     keys = [key for key in dict.fromkeys([*new, *old]) if old.get(key) != new.get(key)]
     changes += [f"{key} {old.get(key)} → {new.get(key)}" for key in keys]
     return ", ".join(changes[:3]) or "new setting"
@@ -279,23 +263,21 @@ def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], 
 def disagreements(cells: Iterable[Cell], stock: Stock) -> list[str]:
     """A sentence for every cell that was measured twice with other results: other tokens of the same work."""
     sentences = []
-    for cell in {cell.id: cell for cell in cells}.values():
-        entries = [entry for entry in stock.of(cell) if entry.store.name == stock.store.name]
-        for other in entries if len(entries) > 1 else ():
-            if other.id == cell.id:
-                continue
-            differ = _differ(stock.store, cell, other)
+    for cell in unique_cells(cells):
+        for other in (entry.cell.id for entry in stock.of(cell) if entry.store.name == stock.store.name):
+            differ = _differ(stock.store, cell, other) if other != cell.id else []
             if differ:
                 sentences.append(
-                    f"cells {other.id} and {cell.id} are the same work ({cell.label} on {cell.task}) and differ in "
+                    f"cells {other} and {cell.id} are the same work ({cell.label} on {cell.task}) and differ in "
                     f"{len(differ)} episodes, e.g. seed {differ[0]}: {cell.id} counts; code that changes tokens raises "
                     "ENGINE"
                 )
     return sentences
 
 
-def _differ(store: StudyStore, cell: Cell, other: StockEntry) -> list[int]:
-    first, second = (store.read_cell(name).episodes.set_index("seed") for name in (cell.id, other.id))
+def _differ(store: StudyStore, cell: Cell, other: str) -> list[int]:
+    """Seeds of a cell whose episodes have other results in another one."""
+    first, second = (store.read_cell(name).episodes.set_index("seed") for name in (cell.id, other))
     shared = [seed for seed in cell.seeds if seed in first.index and seed in second.index]
     columns = ["success", "steps", "forwards", "tokens"]
     return [s for s in shared if list(first.loc[s, columns]) != list(second.loc[s, columns])]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,100 +17,122 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
+from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
-_PHASE_FIELDS = [(f"seconds.{phase}", pa.float64()) for phase in PHASES]
+INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
+Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
+"""Column -> its type, and its value: of an episode's record, or of a decode's."""
 
-EPISODE_SCHEMA = pa.schema(
-    [
-        ("task", pa.string()),
-        ("seed", pa.int64()),
-        ("success", pa.bool_()),
-        ("steps", pa.int64()),  # control steps executed
-        ("decodes", pa.int64()),
-        ("seconds", pa.float64()),  # inference time
-        *_PHASE_FIELDS,
-        ("forwards", pa.int64()),
-        ("verifications", pa.int64()),
-        ("tokens", pa.int64()),  # committed, by whatever round
-        ("committed", pa.int64()),  # committed by verifications, bonus included
-        ("accepted", pa.int64()),  # draft tokens accepted by verifications
-        ("bonus", pa.int64()),
-        ("first_rejected_sum", pa.int64()),  # over chunks that had a verification
-        ("first_rejected_count", pa.int64()),
-        ("compensated_tokens", pa.int64()),
-        ("compensated_decodes", pa.int64()),
-        ("skipped_decodes", pa.int64()),
-        ("unverified_tokens", pa.int64()),  # executed without a target token on their accepted path
-        ("executed_tokens", pa.int64()),  # numbers handed over for execution: steps times DoFs
-        ("retrieval_decodes", pa.int64()),
-        ("deviation_sum", pa.float64()),  # normalised action units, over sampled decodes
-        ("deviation_count", pa.int64()),
-        ("delay_decodes", pa.int64()),  # decodes during which the world went on
-        ("delay_seconds", pa.float64()),  # of those: latency that the world felt
-        ("delay_steps", pa.int64()),  # the same in control steps
-        ("carried_steps", pa.int64()),  # control steps during decodes that executed the chunk before
-        ("held_steps", pa.int64()),  # … that held the last action
-        ("dropped_steps", pa.int64()),  # actions of new chunks that were left out as stale
-        ("path_length", pa.float64()),  # of the end effector, metres
-        ("jerk", pa.float64()),  # of the end effector, root mean square, m/s³
-        ("gripper_switches", pa.int64()),
-        ("wall_seconds", pa.float64()),
-        ("initial_state", pa.list_(pa.float64())),
-        ("repeat", pa.int64()),
-        ("block", pa.string()),  # which run of which block; empty where it is not known
-        ("order", pa.int64()),  # episodes that the block ran before it
-        ("started", pa.string()),  # ISO 8601
-        ("gauge_seconds", pa.float64()),  # of the reference decode just before the episode: the machine's load
-        ("worker_pid", pa.int64()),
-    ]
-)
+
+def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], Any]:
+    """The sum over an episode's decodes; None counts as 0."""
+    return lambda episode: sum(value(decode) or 0 for decode in episode.decodes)
+
+
+def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
+    """The sum over an episode's verifications."""
+    return _summed(lambda decode: sum(value(one) for one in decode.rounds if one.is_verification))
+
+
+def _delays(value: Callable[[Delay], Any]) -> Callable[[EpisodeRecord], Any]:
+    """The sum over the decodes during which the world went on."""
+    return _summed(lambda decode: 0 if decode.delay is None else value(decode.delay))
+
+
+def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
+    return lambda decode: decode.phases.get(phase)
+
+
+def _attributes(*names: str, kind: pa.DataType = INT) -> Fields:
+    """Columns that are attributes of the record."""
+    return {name: (kind, attrgetter(name)) for name in names}
+
+
+_EPISODE: Fields = {
+    **_attributes("task", kind=TEXT),
+    **_attributes("seed"),
+    **_attributes("success", kind=FLAG),
+    **_attributes("steps"),  # control steps executed
+    "decodes": (INT, lambda episode: len(episode.decodes)),
+    **_attributes("seconds", kind=FLOAT),  # inference time
+    **{f"seconds.{phase}": (FLOAT, _summed(_phase(phase))) for phase in PHASES},
+    **_attributes("forwards"),
+    "verifications": (INT, _judged(lambda one: 1)),
+    "tokens": (INT, _summed(lambda decode: len(decode.tokens))),  # committed, by whatever round
+    "committed": (INT, _judged(lambda one: one.committed)),  # by verifications, bonus included
+    "accepted": (INT, _judged(lambda one: one.accepted)),  # draft tokens, by verifications
+    "bonus": (INT, _judged(lambda one: one.committed - one.accepted)),
+    "first_rejected_sum": (INT, _summed(lambda decode: decode.first_rejected)),  # over chunks that had a verification
+    "first_rejected_count": (INT, _summed(lambda decode: decode.first_rejected is not None)),
+    "compensated_tokens": (INT, _summed(lambda decode: decode.compensated)),
+    "compensated_decodes": (INT, _summed(lambda decode: decode.compensated > 0)),
+    "skipped_decodes": (INT, _summed(lambda decode: decode.skipped)),
+    "unverified_tokens": (INT, _summed(lambda decode: decode.unverified)),  # executed without a target token
+    "executed_tokens": (INT, _summed(lambda decode: int(decode.actions.size))),  # steps times DoFs handed over
+    "retrieval_decodes": (INT, _summed(lambda decode: any(r.proposer == "retrieval" for r in decode.rounds))),
+    "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
+    "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),
+    "delay_decodes": (INT, _delays(lambda delay: 1)),  # decodes during which the world went on
+    "delay_seconds": (FLOAT, _delays(lambda delay: delay.seconds)),  # of those: latency that the world felt
+    "delay_steps": (INT, _delays(lambda delay: delay.steps)),  # the same in control steps
+    "carried_steps": (INT, _delays(lambda delay: delay.carried)),  # of those: on the chunk before
+    "held_steps": (INT, _delays(lambda delay: delay.held)),  # … on the last action
+    "dropped_steps": (INT, _delays(lambda delay: delay.dropped)),  # actions of new chunks left out as stale
+    **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; root mean square, m/s³
+    **_attributes("gripper_switches"),
+    **_attributes("wall_seconds", kind=FLOAT),
+    "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
+}
+_CIRCUMSTANCES = {
+    "repeat": INT,
+    "block": TEXT,  # which run of which block; empty where it is not known
+    "order": INT,  # episodes that the block ran before it
+    "started": TEXT,  # ISO 8601
+    "gauge_seconds": FLOAT,  # of the reference decode just before the episode: the machine's load
+    "worker_pid": INT,
+}
+EPISODE_SCHEMA = pa.schema({**{name: kind for name, (kind, _) in _EPISODE.items()}, **_CIRCUMSTANCES}.items())
 
 _TOKENS = pa.list_(pa.int32())
+_COUNTS = ("start", "accepted", "committed", "tree_size")
 _ROUND = pa.struct(
     [
-        ("mode", pa.string()),
-        ("proposer", pa.string()),
-        ("start", pa.int32()),
-        ("drafted", _TOKENS),
-        ("target_tokens", _TOKENS),
-        ("accepted", pa.int32()),
-        ("committed", pa.int32()),
-        ("tree_size", pa.int32()),
-        ("threshold", _TOKENS),
+        (field.name, TEXT if field.name in ("mode", "proposer") else pa.int32() if field.name in _COUNTS else _TOKENS)
+        for field in fields(Round)
     ]
 )
-_OF_DELAY = ("observed", "carried", "held", "dropped", "predicted")  # fields of Delay
-_MEASURES = ("variability", "similarity", "metric", "deviation")
-_MOTION = ("path_length", "jerk", "gripper_switches")
-_OF_EPISODE = ("task", "seed", "success", "steps", "seconds", "forwards", "wall_seconds", *_MOTION)  # of EpisodeRecord
-_COUNTS = ("compensated", "looks", "abandoned")
-_OF_DECODE = ("mode", "forwards", "seconds", "skipped", "reason", *_COUNTS, *_MEASURES)  # fields of DecodeRecord
 
-DECODE_SCHEMA = pa.schema(
-    [
-        ("task", pa.string()),
-        ("seed", pa.int64()),
-        ("index", pa.int64()),  # decode of the episode
-        ("step", pa.int64()),  # control step at which its actions begin
-        ("mode", pa.string()),
-        ("forwards", pa.int64()),
-        ("seconds", pa.float64()),
-        *_PHASE_FIELDS,
-        ("tokens", _TOKENS),
-        ("actions", pa.list_(pa.list_(pa.float32()))),  # (steps, D)
-        ("rounds", pa.list_(_ROUND)),
-        ("compensated", pa.int64()),
-        ("skipped", pa.bool_()),
-        ("looks", pa.int64()),  # at the world while it was executed
-        ("abandoned", pa.int64()),  # control steps that were given up after the last look
-        *[(name, pa.float64()) for name in _MEASURES],
-        ("reason", pa.string()),  # of a skip rule: trusted, streak; null without one that says so
-        ("delay_seconds", pa.float64()),  # these: null where the world waited
-        ("delay_steps", pa.int64()),
-        *[(name, pa.int64()) for name in _OF_DELAY],
-    ]
-)
+
+def _delay(name: str) -> Callable[[DecodeRecord], Any]:
+    return lambda decode: getattr(decode.delay, name, None)
+
+
+_DECODE: Fields = {
+    **_attributes("mode", kind=TEXT),
+    **_attributes("forwards"),
+    **_attributes("seconds", kind=FLOAT),
+    **{f"seconds.{phase}": (FLOAT, _phase(phase)) for phase in PHASES},
+    "tokens": (_TOKENS, lambda decode: list(decode.tokens)),
+    "actions": (pa.list_(pa.list_(pa.float32())), lambda decode: np.asarray(decode.actions, np.float32).tolist()),
+    "rounds": (pa.list_(_ROUND), lambda decode: [asdict(one) for one in decode.rounds]),
+    **_attributes("compensated"),
+    **_attributes("skipped", kind=FLAG),
+    **_attributes(
+        "looks", "abandoned"
+    ),  # at the world while it was executed; control steps given up after the last of them
+    **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),
+    **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null without one that says so
+    "delay_seconds": (FLOAT, _delay("seconds")),  # these: null where the world waited
+    "delay_steps": (INT, _delay("steps")),
+    **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped", "predicted")},
+}
+_PLACE = {
+    "task": TEXT,
+    "seed": INT,
+    "index": INT,
+    "step": INT,
+}  # decode of the episode, control step at which its actions begin
+DECODE_SCHEMA = pa.schema({**_PLACE, **{name: kind for name, (kind, _) in _DECODE.items()}}.items())
 _DECODE_TIMES = pa.schema([DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
@@ -129,81 +152,20 @@ def episode_row(record: EpisodeRecord, at: Circumstances, repeat: int = 0) -> di
     Raises:
         ValueError: a decode names a phase that is not in PHASES.
     """
-    decodes = record.decodes
-    judged = [r for d in decodes for r in d.rounds if r.is_verification]
-    first = [d.first_rejected for d in decodes if d.first_rejected is not None]
-    deviations = [d.deviation for d in decodes if d.deviation is not None]
-    accepted, committed = sum(r.accepted for r in judged), sum(r.committed for r in judged)
-    phases = [_phase_seconds(d) for d in decodes]
-    return {
-        **{name: getattr(record, name) for name in _OF_EPISODE},
-        "decodes": len(decodes),
-        **{name: sum(p[name] or 0.0 for p in phases) for name, _ in _PHASE_FIELDS},
-        "verifications": len(judged),
-        "tokens": sum(len(d.tokens) for d in decodes),
-        "committed": committed,
-        "accepted": accepted,
-        "bonus": committed - accepted,
-        "first_rejected_sum": sum(first),
-        "first_rejected_count": len(first),
-        "compensated_tokens": sum(d.compensated for d in decodes),
-        "compensated_decodes": sum(d.compensated > 0 for d in decodes),
-        "skipped_decodes": sum(d.skipped for d in decodes),
-        "unverified_tokens": sum(d.unverified for d in decodes),
-        "executed_tokens": sum(int(d.actions.size) for d in decodes),
-        "retrieval_decodes": sum(any(r.proposer == "retrieval" for r in d.rounds) for d in decodes),
-        "deviation_sum": float(sum(deviations)),
-        "deviation_count": len(deviations),
-        **_delay_sums(record),
-        "initial_state": np.asarray(record.initial_state, dtype=np.float64).ravel().tolist(),
-        "repeat": repeat,
-        **asdict(at),
-        "worker_pid": os.getpid(),
-    }
-
-
-def _delay_sums(record: EpisodeRecord) -> dict[str, float]:
-    delays = [d.delay for d in record.decodes if d.delay is not None]
-    return {
-        "delay_decodes": len(delays),
-        "delay_seconds": float(sum(d.seconds for d in delays)),
-        "delay_steps": sum(d.steps for d in delays),
-        "carried_steps": sum(d.carried for d in delays),
-        "held_steps": sum(d.held for d in delays),
-        "dropped_steps": sum(d.dropped for d in delays),
-    }
-
-
-def _phase_seconds(decode: DecodeRecord) -> dict[str, float | None]:
-    unknown = set(decode.phases) - set(PHASES)
+    unknown = {phase for decode in record.decodes for phase in decode.phases} - set(PHASES)
     if unknown:
         raise ValueError(f"phases {sorted(unknown)} are not in PHASES")
-    return {f"seconds.{phase}": decode.phases.get(phase) for phase in PHASES}
+    values = {name: value(record) for name, (_, value) in _EPISODE.items()}
+    return {**values, "repeat": repeat, **asdict(at), "worker_pid": os.getpid()}
 
 
 def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
     """The rows of decodes.parquet of one episode, in order."""
     return [
-        {
-            "task": record.task,
-            "seed": record.seed,
-            "index": index,
-            "step": step,
-            **{name: getattr(decode, name) for name in _OF_DECODE},
-            **_phase_seconds(decode),
-            "tokens": list(decode.tokens),
-            "actions": np.asarray(decode.actions, dtype=np.float32).tolist(),
-            "rounds": [_round_row(r) for r in decode.rounds],
-            "delay_seconds": None if decode.delay is None else decode.delay.seconds,
-            "delay_steps": decode.delay_steps,
-            **{name: getattr(decode.delay, name, None) for name in _OF_DELAY},
-        }
+        {"task": record.task, "seed": record.seed, "index": index, "step": step}
+        | {name: value(decode) for name, (_, value) in _DECODE.items()}
         for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
     ]
-
-
-def _round_row(r: Round) -> dict[str, Any]:
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(r).items()}
 
 
 def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +23,14 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.methods.certified.betting import more_to_decide, p_value
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
-from kerv_cli.report.tables import load_study, rows_of
+from kerv_cli.report.measures import paired
+from kerv_cli.report.tables import load_study
 from kerv_cli.worlds import resolve_tasks, spec_of
 
 POINTS = 100.0
-Outcomes = Mapping[tuple[str, int], bool]  # (task, seed) -> success
 
 
-def place_of(resolved: ResolvedStudy, name: str | None) -> Path:
+def folder_of(resolved: ResolvedStudy, name: str | None) -> Path:
     """The certificate's folder.
 
     Raises:
@@ -59,15 +59,15 @@ def certify(
     """Tests the study's settings in their order, each at delta, up to the first that is not shown to lose at most
     `margin` points (fixed-sequence testing: the probability that any certified one loses more is delta at most)."""
     baseline, first = _settings(resolved)[:2]
-    outcomes = _outcomes(store, cells)
-    ar = outcomes[resolved.study.baseline]
+    episodes = load_study(store, cells).episodes
+    ar = episodes[episodes["label"] == resolved.study.baseline]
     candidates: list[Candidate] = []
     chosen, testing = None, True
     for label, settings in resolved.settings.items():
         if label == resolved.study.baseline:
             continue
-        pairs = sorted(ar.keys() & outcomes[label].keys())
-        both = np.array([(ar[pair], outcomes[label][pair]) for pair in pairs], dtype=float)
+        pairs = paired(episodes[episodes["label"] == label], ar)
+        both = pairs[["success_baseline", "success_method"]].to_numpy(float)
         p = p_value(_values(both), _bound(margin), delta) if testing else None
         candidates.append(
             Candidate(
@@ -111,9 +111,9 @@ _VARIED = ("prefill_draft", "skip")
 """Kinds in which candidates may differ."""
 
 
-def write(place: Path, certificate: Certificate) -> Path:
+def write(folder: Path, certificate: Certificate) -> Path:
     """Writes the certificate -> its file."""
-    path = CertificateArtifact().json(place)
+    path = CertificateArtifact().json(folder)
     write_json(path, {**dataclasses.asdict(certificate), "actions": certificate.actions.as_dict()})
     return path
 
@@ -160,12 +160,3 @@ def _settings(resolved: ResolvedStudy) -> list[RolloutSettings]:
     """The baseline's settings, then the candidates' in their order."""
     others = [settings for label, settings in resolved.settings.items() if label != resolved.study.baseline]
     return [resolved.settings[resolved.study.baseline], *others]
-
-
-def _outcomes(store: StudyStore, cells: Iterable[Cell]) -> dict[str, dict[tuple[str, int], bool]]:
-    """Setting -> successes of its episodes."""
-    episodes = load_study(store, list(cells)).episodes
-    return {
-        str(label): {(row["task"], row["seed"]): bool(row["success"]) for row in rows_of(rows)}
-        for label, rows in episodes.groupby("label", sort=False)
-    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
 from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import Cell, seeds_text
 from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
 
 _MEASURES = ("AL", "forwards_per_step", "time_per_step_ms", "skip_rate", "unverified_share")
@@ -133,8 +135,7 @@ def _circumstances(side: Side, cells: list[Cell]) -> dict[str, Any]:
 
 
 def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[dict[str, Any]]:
-    baseline = first.episodes[first.episodes["label"] == ours]
-    episodes = second.episodes[second.episodes["label"] == theirs]
+    baseline, episodes = _episodes(first, ours), _episodes(second, theirs)
     if baseline.empty or episodes.empty:
         raise UsageError("one of the two settings has no complete cell: run it to the end first")
     a, b = measure(baseline, baseline, MICRO), measure(episodes, baseline, MICRO, apart=True)
@@ -143,6 +144,7 @@ def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str
         _row("speed per episode", 1.0, b["episode_speedup"], b, "episode_speedup", "ratio of times per episode"),
         _row("speedup", 1.0, b["speedup"], b, "speedup", "ratio of times per step"),
     ]
+    rows += _speedups(first, ours, second, theirs)
     rows += [
         {"measure": name, "first": a[name], "second": b[name], "change": b[name] - a[name]}
         for name in _MEASURES
@@ -150,6 +152,24 @@ def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str
     ]
     rows.append({"measure": "pairs", "first": len(baseline), "second": len(episodes), "change": b["pairs"]})
     return rows
+
+
+def _episodes(data: StudyData, label: str) -> pd.DataFrame:
+    return data.episodes[data.episodes["label"] == label]
+
+
+def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> Iterator[dict[str, Any]]:
+    """The speedups of both settings against the baselines of their runs, and how far they differ: of two runs of one
+    study, how far these agree."""
+    a, b = (
+        measure(_episodes(data, label), _episodes(data, data.references[label]), MICRO)
+        for data, label in ((first, ours), (second, theirs))
+    )
+    names = list(dict.fromkeys((first.references[ours], second.references[theirs])))
+    for column, unit in SPEEDS.items():
+        if names not in ([ours], [theirs]) and is_number(a[column]) and is_number(b[column]):
+            yield {"measure": f"{unit} against {' and '.join(names)}", "first": a[column], "second": b[column],
+                   "change": b[column] / a[column], "what": "ratio of the speedups"}  # fmt: skip
 
 
 def _row(name: str, first: float, second: float, measured: dict[str, Any], column: str, what: str) -> dict[str, Any]:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from kerv_cli.base.files import atomic_path
@@ -41,7 +46,9 @@ STYLE: Any = {
     "svg.hashsalt": "kerv",  # ids in the file do not change from run to run
     "svg.fonttype": "path",
 }
-DASHES: Any = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
+_ANGLES = (45, -45, 135, -135, 90, -90, 20, -20, 160, -160, 65, -65, 115, -115)  # of a label from its point, degrees
+_DISTANCES = (9.0, 14.0, 21.0, 30.0, 40.0, 52.0, 66.0, 82.0, 100.0)  # of its nearest edge or corner, points
+_MARKER, _CLEAR = 5.0, 2.0  # points around a marker and around a label
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -61,18 +68,69 @@ def entitle(figure: Figure, title: str, about: str) -> None:
     figure.text(0.012, 1.0 - 0.54 * inch, about, fontsize=9, color=MUTED, va="center")
 
 
-def shared_legend(figure: Figure, panels: Iterable[Axes], columns: int) -> None:
-    """One legend below the panels, each label once."""
+def shared_legend(figure: Figure, panels: Iterable[Axes]) -> None:
+    """One legend below the panels, each label once, in as many columns as the figure is wide for."""
     entries = [pair for panel in panels for pair in zip(*panel.get_legend_handles_labels(), strict=True)]
     handles = {label: handle for handle, label in entries}
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=max(1, min(columns, len(handles)))
-    )
+    columns = int(figure.get_figwidth() / (0.7 + 0.08 * max(map(len, handles))))
+    columns = max(1, min(6, columns, len(handles)))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 
-def colour(number: int) -> str:
-    """Colour of the n-th series. The palette repeats after seven; use `DASHES` too where there can be more."""
-    return COLOURS[number % len(COLOURS)]
+def place_labels(
+    figure: Figure, panel: Axes, labels: Sequence[tuple[float, float, str]], shades: Sequence[str]
+) -> list[Annotation]:
+    """Writes every label near its point (x, y in data units), clear of other labels, markers and the frame; a thin line
+    joins a distant one to its point.
+
+    Greedy, the most crowded point first: of the places around the point, from near to far, the one that covers least.
+    """
+    figure.draw_without_rendering()  # places the panels
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    pixels = figure.dpi / 72.0
+    spots = panel.transData.transform([(x, y) for x, y, _ in labels]) if labels else np.empty((0, 2))
+    covered = [_box(spot, 2 * _MARKER * pixels, 2 * _MARKER * pixels) for spot in spots]
+    covered += [text.get_window_extent(renderer) for text in panel.texts]
+    frame = panel.get_window_extent(renderer)
+    notes = []
+    apart = np.sort(np.linalg.norm(spots[:, None] - spots[None], axis=-1), axis=1)[:, 1:4].mean(1)
+    for number in np.argsort(apart, kind="stable"):
+        x, y, text = labels[number]
+        shade, centred = shades[number], dict[str, Any](ha="center", va="center")
+        line = {"arrowstyle": "-", "color": shade, "linewidth": 0.7, "shrinkA": 0, "shrinkB": 3}
+        note = panel.annotate(
+            *(text, (x, y), (0, 0)), textcoords="offset points", fontsize=9, color=shade, arrowprops=line, **centred
+        )
+        note.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+        note.set_in_layout(False)
+        size = Annotation.get_window_extent(note, renderer).padded(_CLEAR * pixels)
+        boxes = [
+            _box(spots[number] + offset, size.width, size.height)
+            for offset in _offsets(size.width, size.height, pixels)
+        ]
+        box = min(boxes, key=lambda box: sum(_area(box, other) for other in covered) - 4 * _area(box, frame))
+        note.set_position(tuple((box.get_points().mean(0) - spots[number]) / pixels))
+        covered.append(box)
+        notes.append(note)
+    return notes
+
+
+def _offsets(width: float, height: float, pixels: float) -> Iterator[np.ndarray]:
+    """From a point to the centres of a label around it, pixels, from near to far."""
+    for distance in _DISTANCES:
+        for angle in np.radians(_ANGLES):
+            way = np.array([math.cos(angle), math.sin(angle)])
+            yield way * distance * pixels + way.round(1) * [width / 2, height / 2]
+
+
+def _box(centre: np.ndarray, width: float, height: float) -> Bbox:
+    return Bbox.from_bounds(centre[0] - width / 2, centre[1] - height / 2, width, height)
+
+
+def _area(a: Bbox, b: Bbox) -> float:
+    """Area that two boxes share, whole pixels²."""
+    both = Bbox.intersection(a, b)
+    return 0.0 if both is None else round(both.width * both.height)
 
 
 _COLOUR_COLUMNS = {"policy.kind": "policy", "prefill_draft.kind": "proposer", "proposer.kind": "proposer"}
@@ -91,7 +149,7 @@ def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
         entries = [parts(_COLOUR_COLUMNS[column]).get(name) for column, name in names.items() if name != "none"]
         preferred = [f"#{part.colour:06x}" for part in entries if part is not None and part.colour is not None]
         free = [shade for shade in (*preferred, *COLOURS) if shade not in colours]
-        colours.append(free[0] if free else colour(len(colours)))
+        colours.append(free[0] if free else COLOURS[len(colours) % len(COLOURS)])
     return colours
 
 
@@ -113,6 +171,8 @@ def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
     Raises:
         StorageError: the disk refused.
     """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # it is laid out: not again for each of the files
     contents = {kind: figure_bytes(figure, kind) for kind in ("png", "svg")}
     small = len(contents["svg"]) <= SVG_LIMIT
     if not small:

@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.lab.catalogue import TRAINED, RunEntry, description_of, store_of
+from kerv_cli.lab.catalogue import RunEntry, description_of, store_of
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.tables import flatten, load_study, rows_of, study_table, write_csv
@@ -68,7 +68,7 @@ def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
 
 
 def _training(run: RunEntry) -> Tracked:
-    log = read_log(run.folder) if run.kind in TRAINED else pd.DataFrame()
+    log = read_log(run.folder) if run.is_training else pd.DataFrame()
     history = [
         (int(row["step"]), {name: float(value) for name, value in row.items() if name != "step" and _is_measure(value)})
         for row in rows_of(log)

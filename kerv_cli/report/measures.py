@@ -21,6 +21,9 @@ MARGIN = 0.03  # of success: a method is non-inferior where the difference's low
 COMPARABLE = ("device", "device_name", "dtype", "threads")  # columns that must be equal for times to be comparable
 _SAME = (*COMPARABLE, "initial_state")  # columns that must be equal in the two episodes of a pair
 
+MOTION = {"steps_to_success": "steps", "path_m": "path_length", "jerk": "jerk", "gripper_switches": "gripper_switches"}
+"""Measure of an episode besides inference -> column of rows.EPISODE_SCHEMA."""
+
 _RATIOS = {
     "AL": ("committed", "verifications"),
     "accepted_per_round": ("accepted", "verifications"),
@@ -70,15 +73,47 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
         **_columns("AL", _averaged(episodes, macro, _acceptance_length)),
         **(_columns("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
         **paired_columns(
-            _counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(_counts(part)))
+            pair_counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(pair_counts(part)))
         ),
-        "pairs_to_settle": stats.pairs_to_settle(_counts(worlds), MARGIN),
+        "pairs_to_settle": stats.pairs_to_settle(pair_counts(worlds), MARGIN),
         "same_run": bool(len(pairs) and pairs["same_run"].all()),
         "same_block": float(pairs["same_block"].mean()) if len(pairs) else math.nan,
         "steps": int(episodes["steps"].sum()),
         "decodes": int(episodes["decodes"].sum()),
         "deviation_samples": int(episodes["deviation_count"].sum()),
+        **_motion(episodes, pairs, macro),
     }
+
+
+def _motion(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool) -> dict[str, float]:
+    """Of the successful episodes: the mean of every measure of `MOTION`, and its ratio to the baseline's over the pairs
+    in which both succeeded, with its interval. NaN where cells are older than a measure, without such pairs, and where
+    the baseline's mean is 0."""
+    successes = episodes[episodes["success"].astype(bool)]
+    both = pairs[pairs["success_method"].astype(bool) & pairs["success_baseline"].astype(bool)]
+    columns: dict[str, float] = {}
+    for name, column in MOTION.items():
+        values = successes[column].astype(float)
+        groups = values.groupby(successes["difficulty"]).mean() if macro else values
+        columns[name] = math.nan if values.empty or values.isna().any() else float(groups.mean())
+        columns |= _columns(f"{name}_ratio", _motion_ratio(both, column, macro))
+    return columns
+
+
+def _motion_ratio(pairs: pd.DataFrame, column: str, macro: bool) -> Estimate:
+    method, baseline = (
+        pairs[f"{column}_{side}"].to_numpy(dtype=float, na_value=np.nan) for side in ("method", "baseline")
+    )
+    if not len(method) or np.isnan([*method, *baseline]).any() or not baseline.sum():
+        return stats.NO_ESTIMATE
+    groups = list(pairs["difficulty"]) if macro else None
+    with np.errstate(divide="ignore", invalid="ignore"):  # the method's mean may be 0
+        ratio = stats.speedup(method, baseline, list(pairs["task"]), groups, _blocks(pairs).tolist())
+    return ratio if math.isfinite(ratio.low + ratio.high) else Estimate(ratio.value, math.nan, math.nan)
+
+
+def _blocks(pairs: pd.DataFrame) -> pd.Series:
+    return pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
 
 
 def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame], Estimate]) -> Estimate:
@@ -115,7 +150,8 @@ def _per_world(
     return estimate(above.to_numpy(), below.to_numpy(), list(episodes["task"]), list(episodes["seed"]))
 
 
-def _counts(pairs: pd.DataFrame) -> stats.PairedCounts:
+def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
+    """Pairs of `paired` by their two successes."""
     return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
 
 
@@ -142,11 +178,11 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     """Pairs of equal task, seed, repeat, initial state and device, sorted by task, seed and repeat.
 
     Columns: task, difficulty, seed, repeat; with the suffixes _baseline and _method: time (seconds per step), seconds
-    (of the episode), success, block; same_run, same_block; in_turn: same_block, and where the oldest episodes name no
-    block the same run.
+    (of the episode), success, block and the columns of `MOTION`; same_run, same_block; in_turn: same_block, and where
+    the oldest episodes name no block the same run.
     """
     keys = ["task", "seed", "repeat"]
-    columns = [*keys, "difficulty", "run", "block", "success", "seconds", *_SAME]
+    columns = [*keys, "difficulty", "run", "block", "success", "seconds", *MOTION.values(), *_SAME]
     method = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
     other = baseline[columns].assign(time=baseline["seconds"] / baseline["steps"])
     both = method.merge(other, on=keys, suffixes=("_method", "_baseline"))
@@ -172,8 +208,9 @@ def is_timed(episodes: pd.DataFrame, column: str = "seconds") -> bool:
 
 
 def _speedup(pairs: pd.DataFrame, time: str, macro: bool) -> Estimate:
-    blocks = pairs["block_method"].astype(str) + "|" + pairs["block_baseline"].astype(str)
-    blocks = blocks.groupby([pairs["task"], pairs["seed"]]).transform("first")  # repeats of a world belong together
+    blocks = (
+        _blocks(pairs).groupby([pairs["task"], pairs["seed"]]).transform("first")
+    )  # repeats of a world belong together
     return stats.speedup(
         pairs[f"{time}_baseline"].to_numpy(),
         pairs[f"{time}_method"].to_numpy(),
@@ -192,8 +229,8 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
         "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
     }
     values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
-    sums = {name: float(episodes[name].sum()) for pair in _RATIOS.values() for name in pair}
-    values |= {name: sums[a] / sums[b] if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
+    sums = episodes[list({name: 0 for pair in _RATIOS.values() for name in pair})].sum().to_dict()
+    values |= {name: float(sums[a] / sums[b]) if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
     values |= _alarms(episodes) if "audits" in episodes else {}
     return values | {name: float(part.built(episodes)) for name, part in own_columns().items()}

@@ -15,12 +15,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report import stressed
-from kerv_cli.report.choose import choices, sentence
-from kerv_cli.report.decided import read_verdicts
+from kerv_cli.report.decide import choices, read_verdicts, sentence
 from kerv_cli.report.measures import MACRO, MICRO
-from kerv_cli.report.motion import differences
 from kerv_cli.report.reprice import machine_columns
-from kerv_cli.report.summary import SPEEDS, motion_frame, summary_frame
+from kerv_cli.report.summary import SPEEDS, differences, motion_frame, summary_frame
 from kerv_cli.report.tables import StudyData, is_number, rows_of
 
 LOSS = 3.0

@@ -1,10 +1,12 @@
-"""Figures of a study from its table: measures along an axis or by setting, and time by phase."""
+"""Figures of a study from its tables: measures by setting, along an axis, under stress and at latencies; success
+against speed; time by phase; success task by task."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib as mpl
@@ -14,29 +16,61 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from kerv_cli.engine.record import PHASES
-from kerv_cli.report.drawing import COLOURS, INK, MUTED, STYLE, entitle, new_figure, setting_colours, shared_legend
+from kerv_cli.report.drawing import (
+    COLOURS,
+    INK,
+    MUTED,
+    STYLE,
+    entitle,
+    new_figure,
+    place_labels,
+    setting_colours,
+    shared_legend,
+)
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.scatter import limit_success, tradeoff_figure
-from kerv_cli.report.stressed import is_stressed, stress_figure
-from kerv_cli.report.summary import SPEEDS
-from kerv_cli.report.tables import is_number, rows_of
+from kerv_cli.report.stressed import by_kind, is_stressed
+from kerv_cli.report.tables import Row, is_baseline, is_number, rows_of
 
 _PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
-_PANELS = (
-    ("episode_speedup", "Speed per episode", "time per episode, baseline ÷ setting", 1.0),
-    ("speedup", "Speed per control step", "time per step, baseline ÷ setting", 1.0),
-    ("success", "Success", "episodes, % and 95 % interval", 100.0),
-    ("AL", "Acceptance length", "tokens committed per verification", 1.0),
+_DASHES: Any = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
+_DODGE = 0.012  # of an axis, between the points of two methods
+_NARROWEST = 0.05  # of an axis, between two ticks
+_ACROSS = 4  # panels beside one another
+_MOST_SETTINGS = 20  # columns of a map that can still be read
+_UNKNOWN = "#f4f6f8"  # the baseline itself, and fields without a pair
+_FAR = 50.0  # points of difference at which a map's colours end
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A column of a study's table on a figure's axis. level: the baseline's value where it is none of its own
+    column's."""
+
+    column: str
+    title: str
+    unit: str
+    scale: float = 1.0
+    level: float | None = None
+
+    def of(self, row: Row, end: str = "") -> float:
+        """A row's value in the axis's unit, or that of its interval's end, `_low` or `_high`; NaN where it has none."""
+        value = row.get(f"{self.column}{end}")
+        return math.nan if value is None else self.scale * float(value)
+
+
+SUCCESS = Measure("success", "Success", "success, % of episodes and 95 % interval", 100.0)
+SPEED = Measure("episode_speedup", "Speed per episode", "time per episode, baseline ÷ setting", level=1.0)
+MEASURES = (
+    SPEED,
+    Measure("speedup", "Speed per control step", "time per step, baseline ÷ setting", level=1.0),
+    SUCCESS,
+    Measure("AL", "Acceptance length", "tokens committed per verification", level=1.0),  # AR: a token per forward
 )
-
-
-_CONTINUES = "… "
-"""In front of a label that adds something to the one above it."""
 
 
 def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
     """Name suffix -> figure: measures against the axis, and inference time by phase where it was measured; without an
-    axis the measures by setting, and success against speedup. A study of stress has one figure, `stress_figure`.
+    axis the measures by setting, and success against speed. A study of stress has one figure, of success.
 
     Args:
         table: `study_table`.
@@ -46,17 +80,15 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
         averaging: the rows that are drawn; named in the figure.
     """
     rows = table[table["averaging"] == averaging].reset_index(drop=True)
+    heading = title, about(rows, averaging)
     if is_stressed(rows):
-        return {"": stress_figure(rows, title, about(rows, averaging), averaging)}
+        return {"": lines_figure(by_kind(table, averaging), "stress_level", "level", *heading)}
     numbers = any(len(group) > 1 for group in series_of(rows, axis).values())
-    with mpl.rc_context(STYLE):
-        figures = {"": _against_axis(rows, axis)} if numbers else {"": _by_setting(rows)}
-        if rows["time_per_step_ms"].notna().any():
-            figures["_phases"] = _phases(rows)
-        for figure in figures.values():
-            entitle(figure, title, about(rows, averaging))
-        if not numbers:
-            figures["_tradeoff"] = tradeoff_figure(rows, title, about(rows, averaging))
+    figures = {"": _against_axis(rows, axis, *heading) if numbers else _by_setting(rows, *heading)}
+    if rows["time_per_step_ms"].notna().any():
+        figures["_phases"] = _phases(rows, *heading)
+    if not numbers:
+        figures["_tradeoff"] = _tradeoff(rows_of(rows), *heading)
     return figures
 
 
@@ -69,8 +101,26 @@ def about(rows: pd.DataFrame, averaging: str) -> str:
     return f"{names} · {counts} · {averaging} · {first['device_name']}, {first['dtype']}"
 
 
-def _is_baseline(rows: pd.DataFrame) -> pd.Series:
-    return rows["label"] == rows["baseline"]
+def draw(
+    panel: Axes,
+    at: Sequence[float],
+    rows: Sequence[Row],
+    measure: Measure,
+    shade: str,
+    along_x: bool = False,
+    **style: Any,
+) -> None:
+    """Draws the rows' values at these positions, joined by the style's line, and bars for their 95 % intervals. A value
+    that does not exist is left out. along_x: the measure is on the x axis."""
+    points = [(x, row) for x, row in zip(at, rows, strict=True) if is_number(row[measure.column])]
+    for x, row in points:
+        ends = [measure.of(row, "_low"), measure.of(row, "_high")]
+        bar = (ends, [x, x]) if along_x else ([x, x], ends)
+        panel.plot(*bar, color=shade, linewidth=2.0, alpha=0.4)
+    if points:
+        positions, values = [x for x, _ in points], [measure.of(row) for _, row in points]
+        line: Any = {"color": shade, "marker": "o", "markersize": 5, "linewidth": 1.8} | style
+        panel.plot(*((values, positions) if along_x else (positions, values)), **line)
 
 
 def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
@@ -79,7 +129,8 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
     A row without a number on the axis is a series of its own. The baseline is only included where it is a point of
     another series.
     """
-    methods = rows[~_is_baseline(rows)]
+    reference = rows["label"] == rows["baseline"]
+    methods = rows[~reference]
     varying = _varying(methods, axis)
     numbers = axis_numbers(methods, axis)
     series: dict[str, pd.DataFrame] = {}
@@ -91,7 +142,7 @@ def series_of(rows: pd.DataFrame, axis: str) -> dict[str, pd.DataFrame]:
             shared = [f"{key.split('.')[-1]} {group[key].iloc[0]}" for key in varying if "sha256" not in key]
             name = ", ".join([str(group["method"].iloc[0]), *shared])
         if len(group) > 1:
-            group = pd.concat([group, rows[_is_baseline(rows) & (rows["label"].map(lambda x: _stem(x, axis)) == name)]])
+            group = pd.concat([group, rows[reference & (rows["label"].map(lambda x: _stem(x, axis)) == name)]])
         series[name] = group.assign(x=axis_numbers(group, axis)).sort_values("x")
     return series
 
@@ -114,172 +165,228 @@ def _stem(label: str, axis: str) -> str:
     return re.sub(rf"\s+{re.escape(axis.rsplit('.', 1)[-1])}=\S+", "", label)
 
 
-def _against_axis(rows: pd.DataFrame, axis: str) -> Figure:
+def _against_axis(rows: pd.DataFrame, axis: str, title: str, about: str) -> Figure:
+    """A panel per measure: a line per series, and to the right of the last tick the settings without a number."""
     series = series_of(rows, axis)
-    names = [*(name for name, group in series.items() if len(group) > 1), str(rows["baseline"].iloc[0])]
-    columns = max(1, min(6, int(15.0 / (0.7 + 0.08 * max(map(len, names))))))
-    longest = max((len(name) for name, group in series.items() if len(group) == 1), default=0)
-    figure = new_figure(15.0, 4.4 + 0.21 * math.ceil(len(names) / columns) + min(1.6, 0.075 * longest))
-    axes = figure.subplots(1, len(_PANELS))
     ticks = sorted({float(x) for group in series.values() if len(group) > 1 for x in group["x"]})
-    beside = _positions_beside(ticks, [label for label, group in series.items() if len(group) == 1])
-    others = [group[~_is_baseline(group)].iloc[0] for group in series.values()]
-    shades = setting_colours(rows_of(pd.DataFrame(others)))
-    for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
-        for number, (label, group) in enumerate(series.items()):
-            if len(group) > 1:
-                _draw_series(panel, group, measure, scale, shades[number], label)
-            else:
-                _draw_beside(panel, beside[label], rows_of(group)[0], measure, scale, shades[number])
-        _draw_baseline(panel, rows, measure, scale)
-        panel.set(title=name, ylabel=unit, xlabel=axis)
-        _name_ticks(panel, ticks, beside)
-        if measure == "success":
-            limit_success(panel, rows)
-        else:
+    gap = (ticks[-1] - ticks[0]) / max(2, min(11, len(ticks) - 1))
+    apart = [name for name, group in series.items() if len(group) == 1]
+    beside = {name: ticks[-1] + gap * (0.8 + 0.55 * number) for number, name in enumerate(apart)}
+    shades = setting_colours([next(row for row in rows_of(group) if not is_baseline(row)) for group in series.values()])
+    numbers = ticks[:: math.ceil(len(ticks) / 9)]
+    with mpl.rc_context(STYLE):
+        figure = new_figure(15.0, 4.8 + min(1.6, 0.075 * max(map(len, apart), default=0)))
+        panels = figure.subplots(1, len(MEASURES))
+        for panel, measure in zip(panels, MEASURES, strict=True):
+            for shade, (name, group) in zip(shades, series.items(), strict=True):
+                if name in beside:
+                    draw(panel, [beside[name]], rows_of(group), measure, shade, marker="D")
+                else:
+                    draw(panel, list(group["x"]), rows_of(group), measure, shade, label=name)
+            panel.set(title=measure.title, ylabel=measure.unit, xlabel=axis)
+            panel.set_xticks([*numbers, *beside.values()], [*(f"{value:g}" for value in numbers), *beside])
+            for label in panel.get_xticklabels()[len(numbers) :]:
+                label.set(rotation=90, fontsize=8, color=INK)
+            _mark_baseline(panel, rows, measure)
             panel.margins(y=0.12)
-    shared_legend(figure, axes, columns)
+            if measure is SUCCESS:
+                _limit_success(panel, rows_of(rows))
+        shared_legend(figure, panels)
+        entitle(figure, title, about)
     return figure
 
 
-def _positions_beside(ticks: Sequence[float], names: Sequence[str]) -> dict[str, float]:
-    """Setting without a number on the axis -> its x: to the right of the last tick, one after the other."""
-    span = (ticks[-1] - ticks[0]) or 1.0
-    gap = max(span / max(2, len(ticks) - 1), 0.09 * span)
-    return {name: ticks[-1] + gap * (0.8 + 0.55 * number) for number, name in enumerate(names)}
+def _mark_baseline(panel: Axes, rows: pd.DataFrame, measure: Measure, along_x: bool = False) -> None:
+    """A dotted line at the baseline's value."""
+    for row in filter(is_baseline, rows_of(rows)):
+        level = measure.of(row) if measure.level is None else measure.level
+        mark = panel.axvline if along_x else panel.axhline
+        mark(level, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
 
 
-def _name_ticks(panel: Axes, ticks: Sequence[float], beside: Mapping[str, float]) -> None:
-    """Ticks of the numbers, and upright names of the settings beside them, behind a thin line."""
-    numbers = list(ticks) if len(ticks) <= 9 else list(ticks[:: math.ceil(len(ticks) / 9)])
-    panel.set_xticks([*numbers, *beside.values()], [*(f"{value:g}" for value in numbers), *beside])
-    for label in panel.get_xticklabels()[len(numbers) :]:
-        label.set(rotation=90, fontsize=8, color=INK)
-    if beside:
-        panel.axvline((ticks[-1] + min(beside.values())) / 2, color=MUTED, linewidth=0.8, alpha=0.5)
+def _limit_success(panel: Axes, rows: Iterable[Row], axis: str = "y") -> None:
+    """Limits an axis of success: from a little below the lowest interval, so that differences show, to a little above
+    100 %, without a tick there."""
+    lows = [low for row in rows if is_number(low := SUCCESS.of(row, "_low"))]
+    floor = max(0.0, 5.0 * math.floor((min(lows, default=0.0) - 3.0) / 5.0))
+    panel.set(**{f"{axis}lim": (floor, 103)})
+    panel.set(**{f"{axis}ticks": [tick for tick in getattr(panel, f"get_{axis}ticks")() if floor <= tick <= 100]})
 
 
-def _draw_series(panel: Axes, group: pd.DataFrame, measure: str, scale: float, shade: str, label: str) -> None:
-    x, y = group["x"].to_numpy(float), group[measure].to_numpy(float) * scale
-    panel.plot(x, y, color=shade, marker="o", markersize=5, linewidth=1.8, label=label)
-    if f"{measure}_low" in group:
-        low, high = group[f"{measure}_low"].to_numpy(float) * scale, group[f"{measure}_high"].to_numpy(float) * scale
-        panel.fill_between(x, low, high, color=shade, alpha=0.15, linewidth=0)
-
-
-def _draw_beside(panel: Axes, x: float, row: dict[str, Any], measure: str, scale: float, shade: str) -> None:
-    if not is_number(row[measure]):
-        return
-    low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
-    if is_number(low):
-        panel.plot([x, x], [low * scale, high * scale], color=shade, linewidth=2.2, alpha=0.45)
-    panel.plot(x, row[measure] * scale, "D", color=shade, markersize=6)
-
-
-def _draw_baseline(panel: Axes, rows: pd.DataFrame, measure: str, scale: float) -> None:
-    reference = rows[_is_baseline(rows)]
-    if not len(reference):
-        return
-    row = reference.iloc[0]
-    value = 1.0 / scale if measure in (*SPEEDS, "AL") else row[measure]  # AR commits one token per forward
-    panel.axhline(value * scale, color=INK, linewidth=1.2, linestyle=":", label=str(row["label"]))
-    if measure == "success":
-        panel.axhspan(row["success_low"] * scale, row["success_high"] * scale, color=INK, alpha=0.06, linewidth=0)
-
-
-def _by_setting(rows: pd.DataFrame) -> Figure:
-    figure = new_figure(15.0, 2.0 + 0.38 * len(rows))
-    axes = figure.subplots(1, len(_PANELS), sharey=True)
-    for panel, (measure, name, unit, scale) in zip(axes, _PANELS, strict=True):
-        for number, row in enumerate(rows_of(rows)):
-            _draw_dot(panel, number, row, measure, scale)
-        reference = rows[_is_baseline(rows)]
-        if len(reference) and measure != "AL":
-            level = 1.0 if measure in SPEEDS else reference.iloc[0][measure] * scale
-            panel.axvline(level, color=INK, linewidth=1.2, linestyle=":")
-        panel.set(title=name, xlabel=unit)
-        panel.grid(axis="y", visible=False)
-        if measure == "speedup":
-            _draw_ceilings(panel, rows)
-        if measure == "success":
-            limit_success(panel, rows, "x")
-        else:
-            panel.set_xlim(0, 1.08 * panel.get_xlim()[1])
-        _separate(panel, rows)
-    _name_rows(axes[0], _grouped_names(rows))
+def _by_setting(rows: pd.DataFrame, title: str, about: str) -> Figure:
+    """A panel per measure, a row per setting, its value beside the point."""
+    with mpl.rc_context(STYLE):
+        figure = new_figure(15.0, 2.0 + 0.38 * len(rows))
+        panels = figure.subplots(1, len(MEASURES), sharey=True)
+        for panel, measure in zip(panels, MEASURES, strict=True):
+            for y, row in enumerate(rows_of(rows)):
+                draw(panel, [y], [row], measure, INK if is_baseline(row) else COLOURS[0], along_x=True)
+                _write_value(panel, y, measure.of(row), measure)
+            if measure.column != "AL":
+                _mark_baseline(panel, rows, measure, along_x=True)
+            panel.set(title=measure.title, xlabel=measure.unit)
+            ceilings = rows["ceiling"].dropna()
+            if measure.column == "speedup" and len(ceilings):
+                panel.plot(ceilings, ceilings.index, "|", color=MUTED, markersize=13, markeredgewidth=1.6)
+                panel.set_xlabel(f"{measure.unit}; | ceiling")
+            if measure is SUCCESS:
+                _limit_success(panel, rows_of(rows), "x")
+            else:
+                panel.set_xlim(0, 1.08 * panel.get_xlim()[1])
+            _name_rows(panel, rows["label"])
+        entitle(figure, title, about)
     return figure
 
 
-def _grouped_names(rows: pd.DataFrame) -> pd.Series:
-    """Labels; one that continues the label above, as `kerv, fixed r = 9` does `kerv`, shows what it adds, indented."""
-    names: list[str] = []
-    stem = ""
-    for label in map(str, rows["label"]):
-        if stem and label.startswith(f"{stem}, "):
-            names.append(f"{_CONTINUES}{label.removeprefix(stem + ', ')}")
-        else:
-            stem = label
-            names.append(label)
-    return pd.Series(names)
+def _write_value(panel: Axes, y: float, value: float, measure: Measure) -> None:
+    if math.isnan(value):
+        return
+    text = f"{value:.1f}".removesuffix(".0") if measure is SUCCESS else f"{value:.2f}"
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 0.4}
+    panel.annotate(text, (value, y), (0, 8), textcoords="offset points", ha="center", fontsize=8, bbox=box)
 
 
-def _separate(panel: Axes, rows: pd.DataFrame) -> None:
-    """A thin line above every setting that begins a group, where some setting continues another."""
-    names = list(_grouped_names(rows))
-    starts = [y for y, name in enumerate(names) if not name.startswith(_CONTINUES)]
-    for y in starts[1:] if len(starts) < len(names) else ():
-        panel.axhline(y - 0.5, color=MUTED, linewidth=0.7, alpha=0.5)
-
-
-def _name_rows(panel: Axes, names: pd.Series) -> None:
+def _name_rows(panel: Axes, names: Iterable[str]) -> None:
     """Names along y, the first on top."""
-    panel.set_yticks(range(len(names)), list(names), color=INK)
+    names = list(names)
+    panel.set_yticks(range(len(names)), names, color=INK)
     panel.set_ylim(len(names) - 0.5, -0.5)
     panel.grid(axis="y", visible=False)
 
 
-def _draw_ceilings(panel: Axes, rows: pd.DataFrame) -> None:
-    ceilings = rows["ceiling"].dropna()
-    if len(ceilings):
-        panel.plot(ceilings, ceilings.index, "|", color=MUTED, markersize=13, markeredgewidth=1.6)
-        panel.set_xlabel(f"{panel.get_xlabel()}; | ceiling")
+def _phases(rows: pd.DataFrame, title: str, about: str) -> Figure:
+    with mpl.rc_context(STYLE):
+        figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
+        panel = figure.subplots()
+        y, left = np.arange(len(rows)), np.zeros(len(rows))
+        for phase, shade in zip(PHASES, _PHASE_COLOURS, strict=True):
+            widths = rows[f"ms.{phase}"].fillna(0.0).to_numpy()
+            if widths.any():
+                panel.barh(y, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
+            left = left + widths
+        for number, total in enumerate(rows["time_per_step_ms"]):
+            text = f"  {total:.3g}" if is_number(total) else "  not timed"
+            panel.text(total if is_number(total) else 0.0, number, text, va="center", fontsize=9)
+        _name_rows(panel, rows["label"])
+        panel.set(title="Inference time by phase", xlabel="ms per control step")
+        panel.margins(x=0.08)
+        figure.legend(loc="outside lower center", ncols=len(PHASES))
+        entitle(figure, title, about)
+    return figure
 
 
-def _draw_dot(panel: Axes, y: int, row: dict[str, Any], measure: str, scale: float) -> None:
-    if not is_number(row[measure]):
-        return
-    colour = INK if row["label"] == row["baseline"] else COLOURS[0]
-    value = row[measure] * scale
-    low, high = row.get(f"{measure}_low", math.nan), row.get(f"{measure}_high", math.nan)
-    if is_number(low):
-        panel.plot([low * scale, high * scale], [y, y], color=colour, linewidth=2.2, alpha=0.45)
-    panel.plot(value, y, "o", color=colour, markersize=7)
-    text = f"{value:.1f}".removesuffix(".0") if measure == "success" else f"{value:.2f}"
-    panel.annotate(
-        text,
-        (value, y),
-        xytext=(0, 8),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.4},
+def _tradeoff(rows: Sequence[Row], title: str, about: str) -> Figure:
+    """Speed per episode on x, success on y, every setting a labelled point. A setting without a speed, such as the
+    scripted expert, is a dashed level of success."""
+    # the baseline's speed is 1 by definition
+    points = [row | {"episode_speedup": 1.0} if is_baseline(row) else row for row in rows]
+    points = [row for row in points if is_number(row["episode_speedup"])]
+    shades = setting_colours(points)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(11.0, 6.4)
+        panel = figure.subplots()
+        for row, shade in zip(points, shades, strict=True):
+            draw(panel, [SPEED.of(row)], [row], SUCCESS, shade, markersize=7)
+            draw(panel, [SUCCESS.of(row)], [row], SPEED, shade, along_x=True, marker="")
+        for row in rows:
+            if not any(row["label"] == point["label"] for point in points):
+                panel.axhline(SUCCESS.of(row), color=MUTED, linewidth=1.1, linestyle=_DASHES[1])
+                corner: Any = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+                panel.annotate(str(row["label"]), (1.0, SUCCESS.of(row)), (-4, 3), ha="right", color=MUTED, **corner)
+        panel.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
+        panel.set(title="Success against speed per episode", xlabel=f"speed: {SPEED.unit}", ylabel=SUCCESS.unit)
+        panel.margins(x=0.14)
+        panel.set_xlim(left=max(0.0, panel.get_xlim()[0]))
+        _limit_success(panel, rows)
+        entitle(figure, title, about)  # before the labels: it moves the panel
+        labels = [(SPEED.of(row), SUCCESS.of(row), str(row["label"])) for row in points]
+        place_labels(figure, panel, labels, shades)
+    return figure
+
+
+def lines_figure(
+    panels: Mapping[str, Mapping[str, Sequence[Row]]], x: str, xlabel: str, title: str, about: str, log: bool = False
+) -> Figure:
+    """Success over a number, a line per method.
+
+    Args:
+        panels: title of a panel -> method -> its rows along x.
+        x: column of the number. log: its axis is logarithmic.
+        xlabel: its name.
+    """
+    first: dict[str, Row] = {}
+    for name, rows in ((name, rows) for lines in panels.values() for name, rows in lines.items()):
+        first.setdefault(name, rows[0])
+    shades = setting_colours(first.values())
+    across = min(_ACROSS, len(panels))
+    down = -(-len(panels) // across)
+    every = [row for lines in panels.values() for rows in lines.values() for row in rows if is_number(row[x])]
+    position = math.log if log else float
+    ticks = sorted({float(row[x]) for row in every})
+    span = position(ticks[-1]) - position(ticks[0])
+    for value in ticks[::-1][:-1]:  # none beside another whose label it would touch
+        below = ticks[ticks.index(value) - 1]
+        if position(value) - position(below) < _NARROWEST * span:
+            ticks.remove(value)
+    with mpl.rc_context(STYLE):
+        figure = new_figure(max(8.0, 3.3 * across), 1.8 + 2.7 * down)
+        axes = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
+        for panel, (head, lines) in zip(axes, panels.items(), strict=False):
+            for number, (name, shade) in enumerate(zip(first, shades, strict=True)):
+                aside = _DODGE * span * (number - (len(first) - 1) / 2)
+                rows = [row for row in lines.get(name, ()) if is_number(row[x])]
+                at = [float(row[x]) * math.exp(aside) if log else float(row[x]) + aside for row in rows]
+                draw(panel, at, rows, SUCCESS, shade, label=name, linestyle=_DASHES[number % len(_DASHES)])
+            panel.set(title=head, xlabel=xlabel, **({"xscale": "log"} if log else {}))
+            panel.set_xticks([], minor=True)
+            panel.set_xticks(ticks, [f"{value:.3g}" for value in ticks])
+            _limit_success(panel, every)
+        for panel in axes[len(panels) :]:
+            panel.set_visible(False)
+        axes[0].set_ylabel(SUCCESS.unit)
+        entitle(figure, title, about)
+        shared_legend(figure, axes)
+    return figure
+
+
+def latency_figure(table: pd.DataFrame, title: str, about: str) -> Figure:
+    """Success over the time that AR's decode takes, a panel per compensation of the delay. table: `latency_table`'s."""
+    panels: dict[str, dict[str, list[Row]]] = {}
+    for row in rows_of(table[table["ar_latency_ms"] > 0].sort_values("ar_latency_ms", kind="stable")):
+        lines = panels.setdefault(f"delay compensation: {row['rollout.delay_compensation']}", {})
+        lines.setdefault(row["method"], []).append({**row, "baseline": row["ar"]})
+    return lines_figure(panels, "ar_latency_ms", "an autoregressive decode takes, ms", title, about, log=True)
+
+
+def has_task_map(per_task: pd.DataFrame) -> bool:
+    """Whether a study's table by task makes a map: two tasks or more, and few settings, under one stress."""
+    several = per_task["task"].nunique() > 1 and 1 < per_task["label"].nunique() <= _MOST_SETTINGS
+    return several and not is_stressed(per_task)
+
+
+def task_map(per_task: pd.DataFrame, title: str, about: str) -> Figure:
+    """Tasks down, settings across: successes of episodes in each field, coloured by the difference to the baseline in
+    points over the same worlds. per_task: `per_task_table`."""
+    tasks, labels = (list(dict.fromkeys(per_task[name])) for name in ("task", "label"))
+    points = 100.0 * per_task.pivot(index="task", columns="label", values="difference").loc[tasks, labels].to_numpy(
+        float
     )
-
-
-def _phases(rows: pd.DataFrame) -> Figure:
-    figure = new_figure(10.0, 2.0 + 0.36 * len(rows))
-    panel = figure.subplots()
-    y, left = np.arange(len(rows)), np.zeros(len(rows))
-    for phase, shade in zip(PHASES, _PHASE_COLOURS, strict=True):
-        widths = rows[f"ms.{phase}"].fillna(0.0).to_numpy()
-        if widths.any():
-            panel.barh(y, widths, 0.66, left, color=shade, label=phase, edgecolor="white", linewidth=0.6)
-        left = left + widths
-    for number, total in enumerate(rows["time_per_step_ms"]):
-        text = f"  {total:.3g}" if is_number(total) else "  not timed"
-        panel.text(total if is_number(total) else 0.0, number, text, va="center", fontsize=9)
-    _name_rows(panel, rows["label"])
-    panel.set(title="Inference time by phase", xlabel="ms per control step")
-    panel.margins(x=0.08)
-    figure.legend(loc="outside lower center", ncols=len(PHASES))
+    with mpl.rc_context(STYLE):
+        figure = new_figure(3.4 + 0.95 * len(labels), 2.2 + 0.27 * len(tasks))
+        panel = figure.subplots()
+        colours = mpl.colormaps["RdBu"].with_extremes(bad=_UNKNOWN)
+        image = panel.imshow(points, cmap=colours, vmin=-_FAR, vmax=_FAR, aspect="auto")
+        for row in rows_of(per_task):
+            y, x = tasks.index(row["task"]), labels.index(row["label"])
+            shade = "white" if abs(points[y, x]) > 0.7 * _FAR else INK
+            text = f"{int(row['successes'])}/{int(row['episodes'])}"
+            panel.text(x, y, text, ha="center", va="center", fontsize=8, color=shade)
+        panel.set_yticks(range(len(tasks)), tasks, color=INK)
+        panel.set_xticks(range(len(labels)), labels, rotation=35, ha="right", color=INK)
+        panel.tick_params(length=0)
+        panel.grid(visible=False)
+        panel.spines[:].set_visible(False)
+        bar = figure.colorbar(image, ax=panel, shrink=0.8, pad=0.02, label="points, against the baseline")
+        bar.outline.set_visible(False)
+        entitle(figure, title, about)
     return figure

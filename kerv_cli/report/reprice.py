@@ -3,7 +3,6 @@ same tokens in the same control steps (docs/measuring.md)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,9 @@ from kerv_cli.engine.cost import FORMAT, READ_PHASES, Profile, Work, missing, pr
 from kerv_cli.lab.identity import batch_of
 from kerv_cli.lab.plan import Cell
 from kerv_cli.report.measures import MICRO, measure
-from kerv_cli.report.tables import StudyData, rows_of
+from kerv_cli.report.summary import SPEEDS
+from kerv_cli.report.tables import StudyData, is_baseline, rows_of
+from kerv_cli.report.text import compared, interval, intervals
 
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
@@ -30,7 +31,6 @@ ASSUMES = (
 _COLUMNS = ("seed", "index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
 _SHIPPED = "-profile.json"
 _ROUND = ("mode", "proposer", "start", "tree_size", "accepted")
-_SPEEDS = ("episode_speedup", "speedup")
 _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
 
 
@@ -45,8 +45,8 @@ class Machine:
     def title(self) -> str:
         """Target and device; of a projection, that nobody measured it."""
         about = self.profile.about
-        known = [str(about[key]) for key in ("target", "device_name") if about.get(key)]
-        return ", ".join(known or [self.name]) + (", projected" if about.get("projected") else "")
+        names = [str(about[key]) for key in ("target", "device_name") if about.get(key)]
+        return ", ".join(names or [self.name]) + (", projected" if about.get("projected") else "")
 
 
 def open_machines(results: Path | str, names: Iterable[str]) -> list[Machine]:
@@ -58,13 +58,13 @@ def open_machines(results: Path | str, names: Iterable[str]) -> list[Machine]:
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     machines = []
     for name in names:
-        places = (as_path(name), *(folder / f"{name}{end}" for folder in folders for end in (".json", _SHIPPED)))
-        path = next((place for place in places if place.is_file()), None)
+        paths = (as_path(name), *(folder / f"{name}{end}" for folder in folders for end in (".json", _SHIPPED)))
+        path = next((path for path in paths if path.is_file()), None)
         if path is None:
-            known = sorted({p.name.removesuffix(_SHIPPED) for folder in folders for p in folder.glob(f"*{_SHIPPED}")})
+            shipped = sorted({p.name.removesuffix(_SHIPPED) for folder in folders for p in folder.glob(f"*{_SHIPPED}")})
             raise UsageError(
                 f"on={name}: no such profile, make one with 'kerv bench target=TARGET'"
-                + (f", or take one of {', '.join(known)}" if known else "")
+                + (f", or take one of {', '.join(shipped)}" if shipped else "")
             )
         try:
             machines.append(Machine(name, read_profile(path, FORMAT)))
@@ -123,7 +123,7 @@ def _same(about: Mapping[str, Any], cell: Cell, episodes: pd.DataFrame) -> bool:
 
 
 def _speeds(values: Mapping[str, Any], prefix: str) -> dict[str, float]:
-    return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in _SPEEDS for end in ("", "_low", "_high")}
+    return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
 
 
 def _decodes(episodes: pd.DataFrame) -> bool:
@@ -149,14 +149,14 @@ def _recorded(data: StudyData, label: str) -> Recorded:
     tables, owners, first = [], [], 0
     for cell in cells:
         stored = data.cells[cell.id]
-        own = stored.of(cell)["seed"].tolist()
+        seeds = stored.of(cell)["seed"].tolist()
         table = _read(stored.folder / "decodes.parquet")
-        row_of = {seed: first + number for number, seed in enumerate(own)}
-        keep = pc.is_in(table["seed"], pa.array(own, pa.int64()))
+        row_of = {seed: first + number for number, seed in enumerate(seeds)}
+        keep = pc.is_in(table["seed"], pa.array(seeds, pa.int64()))
         table = table.filter(keep)
         owners.append(np.array([row_of[seed] for seed in table["seed"].to_pylist()]))
         tables.append(table)
-        first += len(own)
+        first += len(seeds)
     whole = pa.concat_tables(tables, promote_options="default").combine_chunks()
     proposer = cells[0].settings.get("proposer", {})
     drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
@@ -221,10 +221,9 @@ def repriced_summary(table: pd.DataFrame) -> pd.DataFrame:
     rows: dict[str, dict[str, str]] = {}
     for row in rows_of(table):
         cells = rows.setdefault(row["label"], {"setting": row["label"]})
-        is_baseline = row["label"] == row["baseline"]
         for head, prefix in ((f"measured, {row['measured_on']}", "measured_"), (row["machine"], "")):
-            for name, unit in (("episode_speedup", "per episode"), ("speedup", "per step")):
-                cells[f"{head}: {unit}"] = "1" if is_baseline else _interval(row, f"{prefix}{name}")
+            for name, unit in SPEEDS.items():
+                cells[f"{head}: {unit}"] = compared(intervals(f"{prefix}{name}"), "1")(row)
     return pd.DataFrame(rows.values())
 
 
@@ -233,14 +232,6 @@ def machine_columns(table: pd.DataFrame) -> dict[str, dict[str, str]]:
     else priced, marked `≈`."""
     columns: dict[str, dict[str, str]] = {}
     for row in rows_of(table):
-        prefix, mark = ("measured_", "") if row["same"] else ("", "≈ ")
-        text = "1" if row["label"] == row["baseline"] else mark + _interval(row, f"{prefix}episode_speedup")
-        columns.setdefault(f"per episode, {row['machine']}", {})[row["label"]] = text
+        text = interval(row, "measured_episode_speedup") if row["same"] else f"≈ {interval(row, 'episode_speedup')}"
+        columns.setdefault(f"per episode, {row['machine']}", {})[row["label"]] = "1" if is_baseline(row) else text
     return columns
-
-
-def _interval(row: Mapping[str, Any], name: str) -> str:
-    value, low, high = (row[f"{name}{end}"] for end in ("", "_low", "_high"))
-    if math.isnan(value):
-        return "–"
-    return f"{value:.2f}" if math.isnan(low) else f"{value:.2f} ({low:.2f}–{high:.2f})"

@@ -170,8 +170,8 @@ def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     if (counts.only_method - counts.only_baseline) / pairs <= -margin:
         return math.inf
 
-    def shows(wanted: float) -> bool:
-        more = PairedCounts(*(count * wanted / pairs for count in counts))
+    def shows(number: float) -> bool:
+        more = PairedCounts(*(count * number / pairs for count in counts))
         return paired_difference(more).low > -margin
 
     low, high = 0.0, 1.0
@@ -191,8 +191,8 @@ def mcnemar(counts: PairedCounts) -> float:
         return 1.0
     # whole numbers until the last division: exact
     fewer, ways, tail = min(lost, won), 1, 1
-    for chosen in range(fewer):
-        ways = ways * (discordant - chosen) // (chosen + 1)
+    for number in range(fewer):
+        ways = ways * (discordant - number) // (number + 1)
         tail += ways
     return min(1.0, 2 * tail / 2**discordant)
 

@@ -5,28 +5,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Any
 
-import matplotlib as mpl
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.drawing import DASHES, STYLE, entitle, new_figure, setting_colours, shared_legend
 from kerv_cli.report.measures import MICRO, paired_columns
-from kerv_cli.report.scatter import limit_success
-from kerv_cli.report.tables import is_number, rows_of
-
-Row = dict[str, Any]
-"""A setting's row of `study_table`."""
+from kerv_cli.report.tables import Row, rows_of
 
 BEHIND = 0.10
 """A method falls behind where its success is lower than the baseline's, under the same stress, by this or more."""
 NONE = "none"
-
-_COLUMNS = 4  # panels beside one another
-_DODGE = 0.05  # levels between the points of two methods
 
 
 def is_stressed(table: pd.DataFrame) -> bool:
@@ -54,51 +42,6 @@ def by_kind(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, dict[str, 
         }
         for kind, methods in kinds.items()
     }
-
-
-def stress_figure(table: pd.DataFrame, title: str, about: str, averaging: str = MICRO) -> Figure:
-    """One panel per kind: success over the level, one line per method, bars for the 95 % intervals."""
-    kinds = by_kind(table, averaging)
-    names = list(dict.fromkeys(name for methods in kinds.values() for name in methods))
-    first = {name: row for methods in kinds.values() for name, group in methods.items() for row in group[:1]}
-    shades = dict(zip(names, setting_colours(first[name] for name in names), strict=True))
-    across = min(_COLUMNS, len(kinds))
-    down = -(-len(kinds) // across)
-    averaged = table[table["averaging"] == averaging]
-    with mpl.rc_context(STYLE):
-        figure = new_figure(max(8.0, 3.1 * across), 1.4 + 2.7 * down)
-        panels = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
-        for index, (panel, (kind, methods)) in enumerate(zip(panels, kinds.items(), strict=False)):
-            for number, name in enumerate(names):
-                shift = _DODGE * (number - (len(names) - 1) / 2)
-                _draw(panel, methods.get(name, []), shades[name], _dashes(number), name, shift)
-            levels = sorted({int(row["stress_level"]) for group in methods.values() for row in group})
-            panel.set(title=kind, xlabel="level", xticks=levels)
-            limit_success(panel, averaged)
-            if index % across == 0:
-                panel.set_ylabel("success, % of episodes")
-        for panel in panels[len(kinds) :]:
-            panel.set_visible(False)
-        entitle(figure, title, about)
-        shared_legend(figure, panels, 6)
-    return figure
-
-
-def _dashes(number: int) -> Any:
-    return "-" if number == 0 else DASHES[(number - 1) % len(DASHES)]
-
-
-def _draw(panel: Axes, rows: list[Row], shade: str, dashes: Any, name: str, shift: float) -> None:
-    rows = [row for row in rows if is_number(row["success"])]
-    if not rows:
-        return
-    x = [int(row["stress_level"]) + shift for row in rows]
-    y = [100 * row["success"] for row in rows]
-    for at, row in zip(x, rows, strict=True):
-        panel.plot(
-            [at, at], [100 * row["success_low"], 100 * row["success_high"]], color=shade, linewidth=1.4, alpha=0.4
-        )
-    panel.plot(x, y, color=shade, linestyle=dashes, linewidth=1.8, marker="o", markersize=4.5, label=name)
 
 
 def summed_table(table: pd.DataFrame) -> pd.DataFrame:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 from rich import box
@@ -14,8 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from kerv_cli.report.measures import MICRO, own_columns
-from kerv_cli.report.motion import differences
-from kerv_cli.report.tables import is_number, rows_of
+from kerv_cli.report.tables import Row, is_baseline, is_number, rows_of
+from kerv_cli.report.text import Column, TextOf, compared, interval, intervals, numbers, p_value, shares, text_frame
 
 APART = "*"
 WIDE = 130
@@ -30,17 +30,60 @@ _MOTION = {
     "jerk": "jerk, m/s³",
     "gripper_switches": "switches",
 }
-_ALWAYS = {"AL": "AL", "AFEP": "AFEP", "forwards_per_step": "forwards / step"}
-_WHERE_USED = {
+_SHARES = {
     "skip_rate": "skipped",
     "unverified_share": "unverified",
     "compensation_rate": "compensated",
     "retrieval_share": "retrieved",
-    "deviation": "deviation",
-    "felt_latency_ms": "felt ms",
-    "held_share": "held",
 }
-_PERCENT = frozenset({"skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "held_share"})
+_ALIKE = 0.02
+"""Lengths of episodes that differ by a smaller share are alike."""
+
+_NARROW_LACKS = ["AL", "AFEP", "ms / step", "p95 ms", "ceiling", "lost/won", "deviation"]
+
+
+def _speed(name: str) -> TextOf:
+    """A speedup, marked where it is of some of the pairs; 1 for the baseline, where it has a time at all."""
+
+    def text(row: Row) -> str:
+        if is_baseline(row):
+            return "1" if is_number(row["time_per_step_ms"]) else "–"
+        apart = is_number(row["speedup"]) and row["same_block"] < 1 and not row["same_run"]
+        return interval(row, name) + (APART if apart else "")
+
+    return text
+
+
+def _lost_won(row: Row) -> str:
+    return f"{row['only_baseline']}/{row['only_method']}" if row["pairs"] else ""
+
+
+def _columns() -> list[Column]:
+    return [
+        Column("setting", lambda row: str(row["label"])),
+        Column("success %", intervals("success", 100.0, 0)),
+        *(Column(title, _speed(name)) for name, title in SPEEDS.items()),
+        Column("ceiling", numbers("ceiling"), needs="ceiling"),
+        Column("p95 ms", numbers("latency_p95_ms")),
+        Column("ms / step", numbers("time_per_step_ms")),
+        Column("AL", numbers("AL")),
+        Column("AFEP", numbers("AFEP")),
+        Column("forwards / step", numbers("forwards_per_step")),
+        *(Column(title, shares(name), needs=name) for name, title in _SHARES.items()),
+        Column("deviation", numbers("deviation"), needs="deviation"),
+        Column("felt ms", numbers("felt_latency_ms"), needs="felt_latency_ms"),
+        Column("held", shares("held_share"), needs="held_share"),
+        *(Column(name.replace("_", " "), numbers(name), needs=name) for name in own_columns()),
+        Column("lost/won", compared(_lost_won)),
+        Column("p", compared(p_value)),
+    ]
+
+
+def _motion_columns() -> Iterator[Column]:
+    yield Column("setting", lambda row: str(row["label"]))
+    for name, title in _MOTION.items():
+        yield Column(title, numbers(name))
+        yield Column(f"{title}: ratio", compared(intervals(f"{name}_ratio")))
 
 
 @dataclass(frozen=True)
@@ -92,63 +135,24 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
 
 def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
     """Fewer columns, for a terminal, and the shares of decodes in one."""
-    dropped = ["AL", "AFEP", "ms / step", "p95 ms", "ceiling", "lost/won", "deviation"]
-    frame = frame.drop(columns=dropped, errors="ignore")
-    shares = [name for key, name in _WHERE_USED.items() if key in _PERCENT and name in frame]
-    if shares:
-        together = frame[shares].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
-        frame.insert(list(frame.columns).index(shares[0]), " / ".join(shares) + " %", together)
-    return frame.drop(columns=shares)
+    frame = frame.drop(columns=_NARROW_LACKS, errors="ignore")
+    names = [name for name in (*_SHARES.values(), "held") if name in frame]
+    if names:
+        together = frame[names].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
+        frame.insert(list(frame.columns).index(names[0]), " / ".join(names) + " %", together)
+    return frame.drop(columns=names)
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     """The rows of one averaging as text: 95 % intervals in brackets, `–` for missing values; columns that no row uses
     are left out."""
-    rows = rows_of(table, averaging)
-    optional = {**_WHERE_USED, **{name: name.replace("_", " ") for name in own_columns()}}
-    used = {key: name for key, name in optional.items() if any(is_number(row[key]) and row[key] for row in rows)}
-    limited = any(is_number(row["ceiling"]) for row in rows)
-    return pd.DataFrame([_cells(row, _ALWAYS | used, limited) for row in rows])
-
-
-def _cells(row: Mapping[str, Any], columns: Mapping[str, str], limited: bool) -> dict[str, str]:
-    reference = row["label"] == row["baseline"]
-    return {
-        "setting": str(row["label"]),
-        "success %": _interval(row, "success", 100.0, 0),
-        **{name: _one(row) if reference else _interval(row, key, 1.0, 2) + _apart(row) for key, name in SPEEDS.items()},
-        **({"ceiling": number(row["ceiling"])} if limited else {}),
-        "p95 ms": number(row["latency_p95_ms"]),
-        "ms / step": number(row["time_per_step_ms"]),
-        **{name: _percent(row[key]) if key in _PERCENT else number(row[key]) for key, name in columns.items()},
-        "lost/won": "" if reference or not row["pairs"] else f"{row['only_baseline']}/{row['only_method']}",
-        "p": "" if reference or not row["pairs"] else _p(row["mcnemar_p"]),
-    }
+    return text_frame(rows_of(table, averaging), _columns())
 
 
 def motion_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame | None:
-    """The measures of `motion` as text, each with its ratio to the baseline's; None where no row has them."""
+    """The measures of `measures.MOTION` as text, each with its ratio to the baseline's; None where no row has them."""
     rows = rows_of(table, averaging)
-    if not any(is_number(row[key]) for row in rows for key in _MOTION):
-        return None
-    frame = []
-    for row in rows:
-        cells = {"setting": str(row["label"])}
-        for key, name in _MOTION.items():
-            cells[name] = number(row[key])
-            cells[f"{name}: ratio"] = "" if row["label"] == row["baseline"] else _interval(row, f"{key}_ratio", 1.0, 2)
-        frame.append(cells)
-    return pd.DataFrame(frame)
-
-
-def _one(row: Mapping[str, Any]) -> str:
-    """The speedup of the baseline, where it has a time at all."""
-    return "1" if is_number(row["time_per_step_ms"]) else "–"
-
-
-def _apart(row: Mapping[str, Any]) -> str:
-    """The mark of a speedup of some of the pairs."""
-    return APART if is_number(row["speedup"]) and row["same_block"] < 1 and not row["same_run"] else ""
+    return text_frame(rows, _motion_columns()) if any(is_number(row[key]) for row in rows for key in _MOTION) else None
 
 
 def not_in_turn(table: pd.DataFrame) -> list[str]:
@@ -159,33 +163,39 @@ def not_in_turn(table: pd.DataFrame) -> list[str]:
     return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
 
 
-def _p(value: float) -> str:
-    return "<0.001" if value < 0.001 else f"{value:.2g}"
-
-
-def _interval(row: Mapping[str, Any], name: str, scale: float, digits: int) -> str:
-    if not is_number(row[name]):
-        return "–"
-    value = row[name] * scale
-    # 99.5 % of success must not read as 100 %
-    text = f"{value:.1f}".removesuffix(".0") if name == "success" else f"{value:.{digits}f}"
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return f"{text} ({low * scale:.{digits}f}–{high * scale:.{digits}f})" if is_number(low) else text
-
-
-def number(value: float) -> str:
-    """Three significant digits without an exponent; `–` for a missing value."""
-    if not is_number(value):
-        return "–"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
-
-
-def _percent(value: float) -> str:
-    return f"{100 * value:.0f} %" if is_number(value) else "–"
-
-
 def _title(table: pd.DataFrame, averaging: str) -> str:
     rows = table[table["averaging"] == averaging]
     first = rows.iloc[0]
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes each"
     return f"{first['study']}: {counts}, {averaging}, {first['device_name']}, {first['dtype']}"
+
+
+def why_different(row: Row, reference: Row) -> str:
+    """Why a row's speed per episode differs from that per control step, in one line; empty where their intervals
+    overlap.
+
+    Args:
+        row, reference: a row of a study's table and its baseline's.
+    """
+    names = ("episode_speedup", "episode_speedup_low", "episode_speedup_high", "speedup", "speedup_low", "speedup_high")
+    episode, low, high, step, step_low, step_high = (float(row[name]) for name in names)
+    if math.isnan(low + high + step_low + step_high) or (low <= step_high and step_low <= high):
+        return ""
+    lengths = [r["steps"] / r["episodes"] for r in (row, reference)]
+    failures = [r["episodes"] / max(1, r["repeats"]) - r["successes"] for r in (row, reference)]
+    reasons = [f"{lengths[0]:.0f} control steps an episode instead of {lengths[1]:.0f}"]
+    if failures[0] != failures[1]:
+        more = "more" if failures[0] > failures[1] else "fewer"
+        reasons.append(f"{more} failures, which run to the horizon ({failures[0]:.0f} instead of {failures[1]:.0f})")
+    if abs(lengths[0] / lengths[1] - 1) < _ALIKE:
+        reasons.append("its time per step is lower in short episodes than in long ones" if episode < step
+                       else "its time per step is lower in long episodes than in short ones")  # fmt: skip
+    return f"{row['label']}: {episode:.2f} per episode, {step:.2f} per step: {', '.join(reasons)}"
+
+
+def differences(rows: Iterable[Row]) -> list[str]:
+    """`why_different` of all rows of a study's table, those without a reason left out."""
+    rows = list(rows)
+    by_label = {row["label"]: row for row in rows}
+    reasons = [why_different(row, by_label[row["baseline"]]) for row in rows if row["baseline"] in by_label]
+    return [reason for reason in reasons if reason]

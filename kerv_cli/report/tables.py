@@ -35,13 +35,15 @@ from kerv_cli.report.ceiling import (
     verifies_in_prefill,
 )
 from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, measure
-from kerv_cli.report.motion import motion
 from kerv_cli.worlds import specs
 
 _MACHINE = ("executor", "workers", "device_name", "host")
 _CODE = ("git_commit", "engine", "code", "run")
 _STATUS_COLUMNS = (*_MACHINE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
 
+
+Row = dict[str, Any]
+"""One row of a table by column."""
 
 _OLDER = {"engine": 1}
 """Values of the entries that the status of an older cell lacks."""
@@ -191,7 +193,7 @@ def _row(data: StudyData, label: str, episodes: pd.DataFrame, baseline: pd.DataF
         "baseline": data.references[label],
     }
     best = _ceiling(data, cells[0], episodes, averaging)
-    measures = {**measure(episodes, baseline, averaging), **motion(episodes, baseline, averaging), **best.columns()}
+    measures = {**measure(episodes, baseline, averaging), **best.columns()}
     return [head, measures, *_origin(data, cells)]
 
 
@@ -273,7 +275,12 @@ def is_number(value: Any) -> bool:
     return value is not None and not math.isnan(value)
 
 
-def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[dict[str, Any]]:
+def is_baseline(row: Mapping[str, Any]) -> bool:
+    """Whether the row of a table is that of the setting which it is compared with."""
+    return bool(row["label"] == row["baseline"])
+
+
+def rows_of(table: pd.DataFrame, averaging: str | None = None) -> list[Row]:
     """The table's rows, or those of one averaging, as dicts by column."""
     rows = table if averaging is None else table[table["averaging"] == averaging]
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
