@@ -207,7 +207,7 @@ def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> No
     from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
 
     data = load_study(store)
-    recordings = sorted(store.rollouts.glob("*.rrd"))
+    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     table = study_table(data)
     if as_json:
         per_task = rows_of(per_task_table(data))

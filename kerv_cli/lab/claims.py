@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.files import read_json, storage_errors, write_json
+from kerv_cli.base.files import read_json, read_text, storage_errors, write_json
 from kerv_cli.base.leftovers import is_alive, temporary_beside
 from kerv_cli.base.manifests import read
 from kerv_cli.lab.plan import Cell
@@ -60,10 +60,10 @@ def is_claimed(folder: Path, cell: Cell) -> bool:
 
 def void(folder: Path) -> list[Path]:
     """The claims whose process has ended or whose time is up, and the notes that belong to no claim."""
-    claims = sorted(folder.glob("*.json"))
+    claims = sorted(folder.glob("[!.]*.json"))
     held = {path for path in claims if _is_held(path)}
     blocks = {holder.block for path in held if (holder := _read(path)) is not None}
-    notes = [path for path in sorted(folder.glob("*.running")) if path.stem not in blocks]
+    notes = [path for path in sorted(folder.glob("[!.]*.running")) if path.stem not in blocks]
     return [path for path in claims if path not in held] + notes
 
 
@@ -95,8 +95,8 @@ def note_running(folder: Path, cell: Cell, block: str) -> None:
 def running_cell(folder: Path, cells: Sequence[Cell], block: str) -> Cell | None:
     """The cell that this attempt at the block noted last; None before its first episode."""
     try:
-        name = (folder / f"{block}.running").read_text(encoding="utf-8")
-    except OSError:
+        name = read_text(folder / f"{block}.running")
+    except (OSError, ValueError):
         return None
     return next((cell for cell in cells if cell.id == name), None)
 

@@ -33,6 +33,8 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import (
     atomic_path,
     read_json,
+    read_mapping,
+    read_text,
     read_yaml,
     sha256_of,
     storage_errors,
@@ -157,7 +159,7 @@ class StudyStore:
         """
         try:
             # a folder that was renamed by hand is the study of its new name
-            return replace(plan_from_text(self.plan_path.read_text(encoding="utf-8")), name=self.name)
+            return replace(plan_from_text(read_text(self.plan_path)), name=self.name)
         except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"no study '{self.name}' in {self.root.parent}: {self.how_to_run()}") from None
         except (OSError, ValueError, CheckpointError) as error:
@@ -225,7 +227,7 @@ class StudyStore:
         """
         folder = self.cells / name
         try:
-            status = read_json(folder / _STATUS)
+            status = read_mapping(folder / _STATUS)
             if status.get("format", FORMAT) > FORMAT:
                 raise NewerCell(f"cell {folder} is of a newer kerv (format {status['format']}): update kerv")
             # cells from before the seal have none
@@ -256,9 +258,9 @@ class StudyStore:
         """
         folder = self.cells / name
         try:
-            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
-            return config, dict(read_json(folder / _STATUS))
-        except (OSError, ValueError) as error:
+            config = _read_config(read_text(folder / "config.yaml"))
+            return config, read_mapping(folder / _STATUS)
+        except (OSError, ValueError, CheckpointError) as error:
             raise self._damaged(folder, error) from error
 
     def set_aside(self, name: str) -> Path:
@@ -350,7 +352,7 @@ class StudyStore:
                 raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
             status = self.status_of(folder.name)
             try:
-                config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+                config = _read_config(read_text(folder / "config.yaml"))
                 tables.append(rows.read_tables(folder))
             except (OSError, ValueError, pa.ArrowException) as error:
                 raise self._damaged(folder, error) from error

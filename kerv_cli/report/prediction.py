@@ -59,7 +59,10 @@ def read_predictions(results: Path, target: str) -> Predictions | None:
 
 def calibrated_targets(results: Path) -> list[str]:
     """Names of the targets that have a calibration in this results folder."""
-    paths = [*results.glob("artifacts/calibration/*/calibration.json"), *results.glob("pretrained/*/calibration.json")]
+    paths = [
+        *results.glob("artifacts/calibration/[!.]*/calibration.json"),
+        *results.glob("pretrained/[!.]*/calibration.json"),
+    ]
     return sorted({path.parent.name for path in paths})
 
 
