@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.leftovers import clean, temporary_beside
+from kerv_cli.base.leftovers import clean, older_beside, temporary_beside
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,6 +31,7 @@ MOST_BYTES = 2**36
 _REFUSALS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
+    errno.EIO: "the disk does not work",
     errno.EROFS: "the file system is read-only",
     errno.EACCES: "permission denied",
     errno.EPERM: "operation not permitted",
@@ -94,7 +95,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
             _put_back(folder)
             temporary.mkdir()
             fill(temporary)
-            for path in (*temporary.iterdir(), temporary):
+            for path in (*temporary.rglob("*"), temporary):
                 sync(path)
             placed = _rename_once(temporary, folder)
             if not placed and replace:
@@ -123,7 +124,7 @@ def _exchange(a: Path, b: Path) -> None:
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
         if libc.renameat2(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0:
             return
-    aside = _aside(b)
+    aside = older_beside(b)
     os.rename(b, aside)
     try:
         os.rename(a, b)
@@ -133,15 +134,13 @@ def _exchange(a: Path, b: Path) -> None:
     os.rename(aside, a)
 
 
-def _aside(folder: Path) -> Path:
-    """Where the older folder lies between the two renames; no temporary name, so that nothing removes it."""
-    return folder.with_name(f".{folder.name}.older")
-
-
 def _put_back(folder: Path) -> None:
-    """Puts the older folder back where a process ended between the two renames."""
-    if not folder.exists() and _aside(folder).is_dir():
-        os.rename(_aside(folder), folder)
+    """Puts the older folder back where a process ended between the two renames, or removes it after the second."""
+    aside = older_beside(folder)
+    if folder.exists():
+        shutil.rmtree(aside, ignore_errors=True)
+    elif aside.is_dir():
+        os.rename(aside, folder)
 
 
 def visible(folder: Path) -> list[Path]:

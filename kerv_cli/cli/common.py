@@ -78,6 +78,8 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except OSError as error:
         _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
     except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
+        if isinstance(error, MemoryError) or re.search("allocate memory|bad_alloc|start new thread", str(error)):
+            _refuse("out of memory: end other programs, or ask for less", 1, error)
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
 
 

@@ -146,8 +146,7 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     store, cells, done = begin(results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
-    store.write_plan(resolved.study, cells)
-    store.note_command(arguments)
+    store.begin(resolved.study, cells, arguments)
     runtime = next(iter(resolved.settings.values())).runtime
     with ProgressDisplay(console(stderr=True)) as display:
 

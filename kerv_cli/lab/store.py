@@ -142,13 +142,29 @@ class StudyStore:
         Raises:
             StorageError: the disk refused.
         """
-        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
+        new = _plan_of(study, cells)
         with write_lock(self.plan_path):
             with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
                 new = merge_plans(self.read_plan(), new)
             with atomic_path(self.plan_path) as temporary:
                 temporary.write_text(plan_text(new), encoding="utf-8")
         return new
+
+    def begin(self, study: StudySettings, cells: Sequence[Cell], arguments: Sequence[str]) -> None:
+        """Writes the plan and notes the command. The folder of a new run appears with both in it.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+
+        def fill(folder: Path) -> None:
+            run = asdict(_RunFile((Invocation(tuple(arguments), _now(), git_commit()),)))
+            (folder / self.plan_path.name).write_text(plan_text(_plan_of(study, cells)), encoding="utf-8")
+            (folder / self.run_path.name).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
+
+        if self.root.exists() or not write_folder(self.root, fill):
+            self.write_plan(study, cells)
+            self.note_command(arguments)
 
     def read_plan(self) -> StudyPlan:
         """The stored plan.
@@ -393,6 +409,11 @@ class StudyStore:
         """Removes the traceback of an earlier attempt that failed."""
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
+            self.failures.rmdir()  # refused where others are left
+
+
+def _plan_of(study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
+    return StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
 
 
 def _read_config(text: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_mapping, regular, write_json
+from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
@@ -117,11 +117,13 @@ def import_lerobot(
         UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
             episode is damaged. KervError: a video, and no package av.
     """
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
-    path = as_path(settings.source)
+    path, manifests = as_path(settings.source), list[dict[str, Any]]()
     try:
-        return _import(Source.open(path, settings.camera), settings, folder, progress)
+        source = Source.open(path, settings.camera)
+        write_folder(folder, lambda new: manifests.append(_import(source, settings, new, progress)))
+        return manifests[0]
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         why = " ".join(f"{type(error).__name__} {error}".split())[:120]
         raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
@@ -130,6 +132,7 @@ def import_lerobot(
 def _import(
     source: Source, settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
+    """Fills a new folder -> the manifest."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
     entries: dict[str, list[dict[str, Any]]] = {}
