@@ -1,11 +1,12 @@
-"""Kills kerv's commands at random moments and at every write, and feeds them strange settings and damaged files.
+"""Kills kerv's commands and lets their disk fail at every change of a file, and feeds them strange settings and files.
 
-    python scripts/torture.py [--short] [--minutes 15] [--jobs CORES] [--seed 0] [--only kills,requests,artifacts]
+    python scripts/torture.py [--short] [--minutes 15] [--jobs CORES] [--seed N] [--only faults,requests,files]
 
-What must hold: a killed command, started again, ends with the artifacts and tables of an undisturbed run and leaves no
-file and no process behind; a wrong request or a damaged file gives exit 1 or 2 and one line, or the same result;
-nothing hangs. The figures are printed; the exit code is 1 where something did not hold. Every command runs in a fork of
-this process, so that Python and torch load once; the trials of all parts are shared out among `--jobs` processes.
+What must hold: a command that was killed or whose disk failed, started again, ends with the artifacts and tables of an
+undisturbed run; before that, others work; no file and no process of it is left. A wrong request or a damaged file gives
+exit 1 or 2 and one line, or the same result; nothing hangs. The figures are printed; the exit code is 1 where something
+did not hold. Every command runs in a fork of this process, so that Python and torch load once; the trials of all parts
+are shared out among `--jobs` processes. Faults come from torture.c, preloaded where there is a compiler.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import json
 import multiprocessing
 import os
 import random
+import re
+import secrets
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -33,11 +35,13 @@ from typing import NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 warnings.simplefilter("ignore")
+from torture_runs import KINDS, Ended, Fault, learn, preload, run  # noqa: E402
+
+FAULTS = __name__ == "__main__" and preload()  # starts anew before anything large is loaded
 
 import pandas as pd  # noqa: E402
 import torch  # noqa: E402
 from torture_cases import PLANNED, TASK, damage, keys_for, wrong_request  # noqa: E402
-from torture_runs import NEVER, Ended, Kill, learn, run  # noqa: E402
 
 from kerv_cli.base.config import conf_dir  # noqa: E402
 from kerv_cli.base.provenance import stamp  # noqa: E402
@@ -46,75 +50,124 @@ from kerv_cli.worlds import spec_of  # noqa: E402
 from kerv_cli.worlds.camera import choose_backend  # noqa: E402
 
 LONGEST = 10.0  # seconds of CPU that a wrong request or a damaged file may take
+MEMORY = 1024.0  # MiB that it may take beyond what a fork begins with
 HANGS = 300.0  # seconds after which a command that waits for something is ended; a busy machine is slow, too
-TRIALS = {"kills": 60, "requests": 1000, "artifacts": 1000}  # kills: at random, besides those at every write
+TRIALS = {"requests": 2000, "files": 1000}
+WORKERS = 24  # trials of each command with worker processes, which start slowly
+PROBES = ("runs list", "doctor", "sweep study=tortured --plan")
 POLICY = "policy=state policy.target=mine"
 STUDY = f"""
 name: tortured
-common: task={TASK} episodes=3 world.horizon=8 record=0 {POLICY}
+common: task={TASK} episodes=2 world.horizon=8 record=0 {POLICY}
 block: 1
 settings:
   ar: method=ar
   spec_vla: method=spec_vla
 """
+CERTIFY = STUDY.replace("tortured", "certified").replace("episodes=2", "episodes=1 seed=50000")
 TRAIN = "train.batch=4 train.validate_every=2"
-NANO = "target=nano target.observation=state target.chunk=2 train.steps=6"
+NANO = "target=nano target.chunk=2 train.steps=4"
+SMALL = f"demos=few drafter.width=8 drafter.rank=2 train.steps=4 {TRAIN}"
+TWO = "runtime.workers=2"
+
+
+class Command(NamedTuple):
+    """A command that is tortured. makes: pattern of what it must make again byte for byte below the results; of cells
+    the columns that no clock decides. again: exit codes of the same command once it has done its work."""
+
+    words: str
+    makes: str
+    again: tuple[int, ...] = (0,)
+
+
+CELLS = "{}/*/cells/*/episodes.parquet"
 COMMANDS = {  # in the order in which each needs what the ones before it made
-    "demos": f"demos task={TASK} episodes=4 name=few frame_stride=16",
-    "train target": f"train target task={TASK} name=mine demos=few {NANO} {TRAIN}",
-    "train drafter": f"train drafter {POLICY} demos=few drafter.samples=12 train.steps=4 {TRAIN}",
-    "build": f"build datastore task={TASK} {POLICY} demos=few",
-    "calibrate": f"calibrate task={TASK} {POLICY} demos=few held_out=0.4 decodes=3",
-    "sweep": "sweep study=tortured",
-    "report": "report study=tortured",
+    "demos": Command(
+        f"demos task={TASK} episodes=4 name=few frame_stride=16 runtime.workers=1", "artifacts/demos/**/*"
+    ),
+    "demos, two workers": Command(
+        f"demos task={TASK} episodes=8 name=two frame_stride=16 {TWO}", "artifacts/demos/two/**/*"
+    ),
+    "demos export": Command("demos export demos=few", "lerobot/**/*"),
+    "demos import": Command("demos import source=results/lerobot/few name=read", "artifacts/demos/read/**/*"),
+    "train target": Command(
+        f"train target task={TASK} name=mine demos=few target.observation=state {NANO} {TRAIN}", "artifacts/target/**/*"
+    ),
+    "train drafter": Command(
+        f"train drafter {POLICY} demos=few drafter.samples=12 train.steps=4 {TRAIN}", "artifacts/drafter/**/*"
+    ),
+    "train early": Command(f"train drafter drafter=early {POLICY} {SMALL} drafter.samples=12", "artifacts/early/**/*"),
+    "train scout": Command(
+        f"train drafter drafter=scout policy.target=seeing {SMALL} train.scene_steps=2", "artifacts/scout/**/*"
+    ),
+    "build": Command(f"build datastore task={TASK} {POLICY} demos=few", "artifacts/datastore/**/*"),
+    "calibrate": Command(
+        f"calibrate task={TASK} {POLICY} demos=few held_out=0.4 decodes=3", "artifacts/calibration/**/*"
+    ),
+    "calibrate success": Command("calibrate success study=certified name=sure", "artifacts/certificate/**/*"),
+    "rollout": Command(
+        f"rollout task={TASK} world.horizon=8 {POLICY} episodes=2 record=1 method=ar", CELLS.format("rollouts")
+    ),
+    "sweep": Command("sweep study=tortured", CELLS.format("studies")),
+    "sweep, two workers": Command(f"sweep study=tortured episodes=4 {TWO}", CELLS.format("studies")),
+    "report": Command("report study=tortured", "report/**/*"),
+    "runs export": Command("runs export tortured", "exports/**/*"),
+    "runs rerun": Command("runs rerun certified", CELLS.format("studies")),
+    "runs rm": Command("runs rm tortured --yes", "studies/*/plan.yaml", again=(0, 2)),
 }
+NEEDED = {"train scout": f"train target task={TASK} name=seeing demos=few {NANO} {TRAIN}"}
+"""What is made, undisturbed, before a command."""
 READERS = {
     "rollout": f"rollout task={TASK} world.horizon=8 {POLICY} episodes=1 record=0 method=heisd",
-    "resume": COMMANDS["train target"],
-    "build": COMMANDS["build"] + " name=again",
-    "report": COMMANDS["report"],
-    "sweep": COMMANDS["sweep"] + " --plan",
-}
-FOLDERS = {  # command -> the folder of results whose files it must make again byte for byte
-    "demos": "artifacts/demos",
-    "train target": "artifacts/target",
-    "train drafter": "artifacts/drafter",
-    "build": "artifacts/datastore",
-    "calibrate": "artifacts/calibration",
-    "report": "report",
+    "resume": COMMANDS["train target"].words,
+    "record": COMMANDS["demos"].words,
+    "build": COMMANDS["build"].words + " name=again",
+    "import": COMMANDS["demos import"].words + "-again",
+    "success": COMMANDS["calibrate success"].words,
+    "report": COMMANDS["report"].words,
+    "sweep": COMMANDS["sweep"].words + " --plan",
+    "rerun": "runs rerun tortured --plan",
+    "list": "runs list",
+    "show": "runs show tortured",
+    "compare": "runs compare tortured:ar tortured:spec_vla",
+    "export": "runs export target/mine",
+    "repair": "doctor --repair",
+    "view": "view --summary results/rollouts",
 }
 NO_CLOCK = ["task", "seed", "success", "steps", "forwards", "tokens", "accepted"]
 
 
-def state(results: Path, command: str) -> dict[str, str]:
-    """What a command must make again after a kill: file -> hash. Of a sweep: the plan, and the columns that no clock
-    decides."""
-    if command in FOLDERS:
-        files = [path for path in (results / FOLDERS[command]).rglob("*") if path.is_file()]
-        contents = {str(path.relative_to(results)): path.read_bytes() for path in files}
-    else:
-        cells = sorted(results.glob("studies/tortured/cells/*/episodes.parquet"))
-        contents = {path.parent.name: pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() for path in cells}
-        contents["plan.yaml"] = (results / "studies/tortured/plan.yaml").read_bytes()
-    return {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+def state(command: str) -> dict[str, str]:
+    """What a command must make again: file -> hash; of a cell: the columns that no clock decides."""
+    results, made = Path("results"), {}
+    for path in (path for path in results.glob(COMMANDS[command].makes) if path.is_file()):
+        cell = path.name == "episodes.parquet"
+        content = pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() if cell else path.read_bytes()
+        made[_undated(str(path))] = hashlib.sha256(content).hexdigest()
+    return made
+
+
+def _undated(name: str) -> str:
+    return re.sub(r"\d{8}-\d{6}(?=-)", "DATE", name)
 
 
 def names_below(folder: Path) -> set[str]:
-    """Every file and folder below, relative; of a folder its name with a slash."""
-    return {f"{path.relative_to(folder)}{'/' if path.is_dir() else ''}" for path in folder.rglob("*")}
+    """Every file and folder below, relative, without the dates of rollouts; of a folder its name with a slash."""
+    return {_undated(f"{path.relative_to(folder)}{'/' if path.is_dir() else ''}") for path in folder.rglob("*")}
 
 
-def undisturbed(words: str, log: Path) -> int:
-    """Runs a command that must succeed, and loads what it loads -> its number of writes."""
+def undisturbed(words: str, log: Path) -> Ended:
+    """Runs a command that must succeed, and loads what it loads."""
     ended = run(words.split(), limit=HANGS, log=log)
     if ended.code:
         raise SystemExit(f"{words} does not run: {ended.text[-600:]}")
-    return learn(log)
+    learn(log)
+    return ended
 
 
 class Trial(NamedTuple):
     """One thing to try. number: its place among the trials of its part, which decides what is drawn at random.
-    command, at: of a kill, the command and the write before which it happens; 0: a random moment."""
+    command, at: of a fault, the command and the call that is struck first."""
 
     part: str
     number: int
@@ -137,7 +190,9 @@ class Tally:
         self.faults += other.faults
 
     def __str__(self) -> str:
-        return json.dumps({**self.counts, "slowest": round(self.slowest, 1), "faults": len(self.faults)})
+        return json.dumps(
+            {**dict(sorted(self.counts.items())), "slowest": round(self.slowest, 1), "wrong": len(self.faults)}
+        )
 
 
 class Torture:
@@ -145,15 +200,15 @@ class Torture:
 
     def __init__(self, folder: Path, seed: int, ends: float) -> None:
         self.folder, self.seed, self.ends, self.tally = folder, seed, ends, Tally()
-        self.writes, self.seconds = dict[str, int](), dict[str, float]()
+        self.calls, self.memory = dict[str, int](), 0.0
         self.expected = dict[str, tuple[dict[str, str], set[str]]]()  # command -> state, names of files
 
     def prepare(self) -> None:
         """Runs every command undisturbed, and loads what it loads; what lies in `results` before each is kept for its
-        trials. Then a second time, which must not change the results, and tells how long a command takes that finds
-        everything loaded."""
+        trials."""
         shutil.copytree(conf_dir(), self.folder / "conf")
         (self.folder / "conf/study/tortured.yaml").write_text(STUDY)
+        (self.folder / "conf/study/certified.yaml").write_text(CERTIFY)
         os.environ["KERV_CONF_DIR"] = str(self.folder / "conf")
         torch.set_num_threads(1)
         choose_backend()
@@ -162,30 +217,36 @@ class Torture:
         whole, log = self.folder / "whole", self.folder / "log"
         whole.mkdir()
         os.chdir(whole)
-        for command, words in COMMANDS.items():
+        for command, (words, _, _) in COMMANDS.items():
+            if command in NEEDED:
+                undisturbed(NEEDED[command], log)
+            if command == "runs rm":
+                shutil.copytree(whole, self.folder / "all")
             shutil.copytree(whole, self.folder / f"before {command}")
-            self.writes[command] = undisturbed(words, log)
-            self.expected[command] = state(Path("results"), command), names_below(whole)
-        for command, words in PLANNED.items():
-            undisturbed(words, log)
+            ended = undisturbed(words, log)
+            self.calls[command] = ended.calls
+            self.expected[command] = state(command), names_below(whole)
+            print(f"{command}: {ended.calls} calls, {ended.cpu:.1f} s of CPU", flush=True)
+        os.chdir(self.folder / "all")
+        for words in [*PLANNED.values(), *PROBES]:
+            self.memory = undisturbed(words, log).memory
+        for command in PLANNED:
             keys_for(command)
         with spec_of(TASK).open_world(TASK) as world:  # draws the placements of the first seeds
             for seeds in (world.spec.seeds.training, world.spec.seeds.evaluation):
                 world.reset(seeds.start)
-        for command in COMMANDS:
-            began = time.monotonic()
-            self.kill(command, [])
-            self.seconds[command] = time.monotonic() - began
-            print(f"{command}: {self.writes[command]} writes, {self.seconds[command]:.1f} s", flush=True)
 
     def trials(self, parts: list[str], share: int) -> list[Trial]:
         """All trials, in an order drawn at random, so that a run that ends early has tried some of everything. share:
         of so many takes one."""
-        kills = [(command, at) for command in COMMANDS for at in range(1, self.writes[command] + 1)]
-        kills += [([*COMMANDS][number % len(COMMANDS)], 0) for number in range(TRIALS["kills"])]
-        trials = [Trial("kills", number, *kill) for number, kill in enumerate(kills)]
-        trials += [Trial(part, number) for part in ("requests", "artifacts") for number in range(TRIALS[part])]
-        random.Random(self.seed).shuffle(trials)
+        order = random.Random(self.seed)
+        places = {command: range(1, calls + 1) for command, calls in self.calls.items()}
+        places |= {name: order.sample(at, min(WORKERS, len(at))) for name, at in places.items() if "workers" in name}
+        calls = [(command, at) for command, ats in places.items() for at in ats]
+        order.shuffle(calls)
+        trials = [Trial("faults", number, *call) for number, call in enumerate(calls)]
+        trials += [Trial(part, number) for part, most in TRIALS.items() for number in range(most)]
+        order.shuffle(trials)
         return [trial for trial in trials if trial.part in parts and trial.number % share == 0]
 
     def __call__(self, trial: Trial) -> Tally:
@@ -208,39 +269,54 @@ class Torture:
         os.chdir(place)
         return place
 
-    def kills(self, trial: Trial, draw: random.Random) -> None:
-        """A kill at a write, or up to three in a row at random moments: a command that goes on is killed, too."""
-        longest = self.seconds[trial.command]
-        random_ones = [Kill(after=draw.uniform(0.0, longest)) for _ in range(draw.choice((1, 1, 2, 3)))]
-        self.kill(trial.command, [Kill(at=trial.at)] if trial.at else random_ones)
+    def faults(self, trial: Trial, draw: random.Random) -> None:
+        """A fault at a call, and up to three more at random: a command that goes on is struck, too."""
+        calls = self.calls[trial.command]
+        further = [1 + int(calls ** draw.random()) for _ in range(draw.randrange(4))]
+        kinds = [*KINDS[1:7] * 4, *KINDS[7:]]  # mostly those that end a command
+        faults = [Fault(draw.choice(kinds), at) for at in (trial.at, *further)]
+        self.strike(trial.command, faults, draw.choice(PROBES))
 
-    def kill(self, command: str, moments: list[Kill]) -> None:
-        """Kills a command, starts it again, compares."""
-        place, words = self.place(f"before {command}"), COMMANDS[command].split()
-        ended = [run(words, HANGS, moment) for moment in [*moments, NEVER]]
-        killed = [moment for one, moment in zip(ended, moments, strict=False) if one.code == -signal.SIGKILL]
-        self.tally.counts.update(kills=len(killed), at_writes=sum(bool(moment.at) for moment in killed))
+    def strike(self, command: str, faults: list[Fault], probe: str) -> None:
+        """Strikes a command, runs another, starts it again, compares."""
+        place, (words, _, again) = self.place(f"before {command}"), COMMANDS[command]
+        what = f"{command}, {', '.join(f'{fault.kind} at {fault.at}' for fault in faults)}"
+        for fault in faults:
+            ended = run(words.split(), HANGS, fault)
+            self.tally.counts.update({"faults": ended.struck, f"faults, {fault.kind}": ended.struck})
+            self.judge_struck(what, fault.kind, ended, again)
+        ended = run(probe.split(), HANGS)
+        if ended.code not in (0, 1, 2) or "internal error" in ended.text or "Traceback" in ended.text:
+            self.fault(what, f"then {probe}: exit {ended.code}: {ended.text[-300:]}")
+        ended = run(words.split(), HANGS)
         expected, names = self.expected[command]
-        if ended[-1].code:
-            self.fault(f"{command}, {moments}", f"started again: exit {ended[-1].code}: {ended[-1].text[-300:]}")
-        elif (made := state(Path("results"), command)) != expected:
+        if ended.code not in again:
+            self.fault(what, f"started again: exit {ended.code}: {ended.text[-300:]}")
+        elif (made := state(command)) != expected:
             differing = sorted(name for name in {*made, *expected} if made.get(name) != expected.get(name))
-            self.fault(f"{command}, {moments}", f"other results: {', '.join(differing[:5])}")
+            self.fault(what, f"other results: {', '.join(differing[:5])}")
         else:
-            self.check_left(f"{command}, {moments}", names_below(place) ^ names)
-        if any(one.left for one in ended):
-            self.fault(f"{command}, {moments}", "processes outlived it")
+            self.check_left(what, names_below(place) ^ names)
+
+    def judge_struck(self, what: str, kind: str, ended: Ended, again: tuple[int, ...]) -> None:
+        """Notes a command that met a fault otherwise than by its end, one line or no harm, and processes it left."""
+        if ended.left:
+            self.fault(what, f"{ended.left} processes outlived it")
+        internal = "internal error" in ended.text or "Traceback" in ended.text
+        ends = {"slow": again, "clock": again, "memory": (-11, -6, 1, *again)}.get(kind, (-9, 1, *again))
+        if ended.code not in ends or internal:
+            self.fault(what, f"exit {ended.code}: {ended.text[-300:]}")
 
     def requests(self, trial: Trial, draw: random.Random) -> None:
         """A wrong or strange request."""
-        words, place = wrong_request(draw), self.place("whole")
+        words, place = wrong_request(draw), self.place("all")
         self.judge(trial.part, repr(" ".join(words)[:200]), run(words, limit=HANGS))
-        there = {"below/", "below/here/", *(f"below/here/{name}" for name in self.expected["report"][1])}
+        there = {"below/", "below/here/", *(f"below/here/{name}" for name in names_below(self.folder / "all"))}
         self.check_left(repr(" ".join(words)[:200]), names_below(place.parent.parent) ^ there)
 
-    def artifacts(self, trial: Trial, draw: random.Random) -> None:
+    def files(self, trial: Trial, draw: random.Random) -> None:
         """A damaged file, met by the command that reads it."""
-        place = self.place("whole")
+        place = self.place("all")
         what, reader = damage(draw, place / "results")
         self.judge(trial.part, what, run(READERS[reader].split(), limit=HANGS))
         temporary = {n for n in names_below(place) if n.endswith((".tmp", ".tmp/")) or "/claims/" in n[:-1]}
@@ -251,8 +327,8 @@ class Torture:
         self.tally.slowest = max(self.tally.slowest, ended.cpu)
         self.tally.counts.update({part: 1, "refused": int(ended.code in (1, 2)), "same": int(ended.code == 0)})
         lines = [line for line in ended.text.splitlines() if line.startswith("kerv: ")]
-        if ended.code not in (0, 1, 2) or ended.cpu > LONGEST or ended.left:
-            times = f"after {ended.cpu:.1f} s of CPU, {ended.wall:.1f} in all"
+        if ended.code not in (0, 1, 2) or ended.cpu > LONGEST or ended.left or ended.memory > self.memory + MEMORY:
+            times = f"after {ended.cpu:.1f} s of CPU, {ended.wall:.1f} in all, {ended.memory:.0f} MiB"
             self.fault(what, f"exit {ended.code} {times}: {ended.text[-200:]}")
         elif ended.code and (len(lines) != 1 or "internal error" in lines[0] or "Traceback" in ended.text):
             self.fault(what, f"exit {ended.code}: {(lines or [ended.text[-200:]])[0]}")
@@ -289,16 +365,27 @@ def main() -> None:
     parser.add_argument("--short", action="store_true", help="a tenth of everything")
     parser.add_argument("--minutes", type=float, default=15.0, help="longest time of all together")
     parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="processes that make the trials")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default=",".join(TRIALS))
+    parser.add_argument(
+        "--seed", type=int, default=secrets.randbelow(10**6), help="of what is drawn; a new one each run"
+    )
+    parser.add_argument("--only", default="faults,requests,files")
+    parser.add_argument("--commands", default="", help="faults of those commands alone whose names hold this")
     asked = parser.parse_args()
+    parts = [part for part in asked.only.split(",") if part != "faults" or FAULTS]
+    print(
+        f"seed {asked.seed}" if FAULTS else f"seed {asked.seed}; no faults: no compiler for torture.c here", flush=True
+    )
     with tempfile.TemporaryDirectory(prefix="kerv-torture-") as folder:
         torture = Torture(Path(folder), asked.seed, began + 60 * 0.98 * asked.minutes)  # what has begun must end, too
         torture.prepare()
         print(f"ready after {time.monotonic() - began:.0f} s", flush=True)
         tally = torture.tally
-        tally.add(share_out(torture, torture.trials(asked.only.split(","), 10 if asked.short else 1), asked.jobs))
+        trials = torture.trials(parts, 10 if asked.short else 1)
+        trials = [trial for trial in trials if asked.commands in trial.command]
+        tally.add(share_out(torture, trials, asked.jobs))
         os.chdir("/")
+    if FAULTS:
+        shutil.rmtree(Path(os.environ["LD_PRELOAD"]).parent)
     for fault in tally.faults:
         print(f"FAULT {' '.join(fault.split())}")
     print(f"{tally} in {(time.monotonic() - began) / 60:.1f} minutes, {asked.jobs} processes")

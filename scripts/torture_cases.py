@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import os
 import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,16 +25,19 @@ PLANNED = {  # command of conf/ -> its words; all are plans, so that nothing lon
     "build_datastore": f"build datastore --plan demos=few task={TASK}",
     "calibrate": f"calibrate --plan demos=few task={TASK}",
 }
+NAMED = ("runs list", "runs show", "runs compare", "runs diff", "runs rerun --plan", "runs export --to")
 STRANGE_KEYS = ("nothing", "threshold.", ".r", "", "a.b.c", "study.common", "study.settings", "study.repeats")
 _WORDS = """
+=cmd|x +x\tx kind=sweep last tortured tortured:ar certified mlflow csv
 0 -1 1 2 33 4294967296 99999999999999999999 1e400 nan inf -inf 0.5 true null reach MT10 ar spec_vla heisd kerv expert
 [] {} [[]] {a:1} [reach] [[reach]] [null] [1,[2]] glob(*) [glob(*)] 1,2 ar,spec_vla range(0,3) range(0,10,0)
-range(0,100000000) range(nan,3) range(0,1,1e-300) interval(0,1) choice(1,2) shuffle(1,2,3) sort(range(0,100000000))
+range(0,5,-1) range(0,100000000) range(nan,3) range(0,1,1e-300)
+interval(0,1) choice(1,2) shuffle(1,2,3) sort(range(0,100000000))
 .. . ../../x / /dev/null a/b ~ ' " \\ \\ ${x} ${oc.env:HOME} ${ $ %s ü 🤖 method=ar = == a=b # *a &a --- _target_
 int(3) float(x) str([1]) json_str({}) extend_list(1) {_target_:os.system} !!python/object:os.system
 """
-_LONG = ("a" * 300, "a" * 70000, "[" * 200, "{" * 3000, "{a:" * 50 + "1" + "}" * 50)
-VALUES = ("", "a b", "\n", *_LONG, *_WORDS.split())
+_LONG = ("a" * 300, "a" * 70000, "a" * 200_000, "[" * 200, "{" * 3000, "{a:" * 50 + "1" + "}" * 50)
+VALUES = ("", "a b", "a\tb", "\n", *_LONG, *_WORDS.split())
 PREFIXES = ("", "", "", "", "", "", "", "+", "++", "~", "@")
 
 
@@ -46,38 +50,67 @@ def keys_for(command: str) -> tuple[str, ...]:
 
 
 def wrong_request(draw: random.Random) -> list[str]:
-    """A command line with one to three strange overrides."""
+    """A command line with one to three strange overrides, or strange names."""
+    if draw.random() < 0.1:
+        return [*draw.choice(NAMED).split(), *draw.choices(VALUES, k=draw.choice((1, 2, 3)))]
     command = draw.choice([*PLANNED])
     prefixes = [draw.choice(PREFIXES) for _ in range(draw.choice((1, 1, 1, 2, 3)))]
     words = [f"{prefix}{draw.choice(keys_for(command))}={draw.choice(VALUES)}" for prefix in prefixes]
     return [*PLANNED[command].split(), *words]
 
 
-FILES = {  # what is damaged below the results -> the command that reads it
-    "artifacts/target/*/target.json": "rollout",
-    "artifacts/target/*/model.safetensors": "rollout",
-    "artifacts/drafter/*/drafter.json": "rollout",
-    "artifacts/drafter/*/model.safetensors": "rollout",
-    "artifacts/datastore/*/*": "rollout",
-    "artifacts/calibration/*/calibration.json": "rollout",
-    "artifacts/target/*/resume.safetensors": "resume",
-    "artifacts/demos/*/manifest.json": "build",
-    "artifacts/demos/*/episodes/*/*0.safetensors": "build",
-    "studies/*/plan.yaml": "report",
-    "studies/*/cells/*/*": "report",
-    "studies/*/cells/*/status.json": "sweep",
+FILES = {  # what is damaged below the results -> the commands that read it
+    "artifacts/target/mine/target.json": ("rollout", "list"),
+    "artifacts/target/mine/model.safetensors": ("rollout",),
+    "artifacts/target/mine/log.csv": ("list", "export"),
+    "artifacts/target/mine/resume.safetensors": ("resume",),
+    "artifacts/drafter/*/*": ("rollout", "list"),
+    "artifacts/early/*/early.json": ("list",),
+    "artifacts/datastore/*/*": ("rollout", "list"),
+    "artifacts/calibration/*/calibration.json": ("rollout", "list"),
+    "artifacts/certificate/*/*": ("list", "success"),
+    "artifacts/demos/few/manifest.json": ("build", "list"),
+    "artifacts/demos/few/recording.json": ("record",),
+    "artifacts/demos/few/episodes/*/*0.safetensors": ("build", "record"),
+    "lerobot/few/**/*.*": ("import",),
+    "studies/*/plan.yaml": ("report", "rerun", "list", "show"),
+    "studies/*/run.json": ("rerun", "list", "sweep"),
+    "studies/*/cells/*/*": ("report", "rerun", "compare"),
+    "studies/*/cells/*/status.json": ("sweep", "list", "repair"),
+    "rollouts/*/rollouts/*.rrd": ("view",),
 }
 
 
 def damage(draw: random.Random, results: Path) -> tuple[str, str]:
     """Damages a file, half of the time with renewed hashes -> what was done, and the command that reads the file."""
     pattern = draw.choice([*FILES])
-    path = draw.choice(sorted(results.glob(pattern)))
-    kind = draw.choice(TEXT if path.suffix in (".json", ".yaml") else BINARY)
+    path = draw.choice(sorted(path for path in results.glob(pattern) if path.is_file()))
+    what, reader = path.relative_to(results), draw.choice(FILES[pattern])
+    if draw.random() < 0.15:
+        kind = draw.choice([*PLACES])
+        path.unlink()
+        PLACES[kind](path)
+        return f"{what} {kind}, {reader}", reader
+    kind = draw.choice(TEXT if path.suffix in (".json", ".yaml", ".csv") else BINARY)
     content = KINDS[kind](draw, path.read_bytes())
     renewed = draw.random() < 0.5 and _renew(path, hashlib.sha256(content).hexdigest())
     path.write_bytes(content)
-    return f"{path.relative_to(results)} {kind}{', hashes renewed' if renewed else ''}", FILES[pattern]
+    return f"{what} {kind}{', hashes renewed' if renewed else ''}, {reader}", reader
+
+
+def _holes(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(3 * 2**30)
+
+
+PLACES: dict[str, Callable[[Path], Any]] = {
+    "a pipe": os.mkfifo,
+    "a folder": Path.mkdir,
+    "holes": _holes,
+    "a link to itself": lambda path: path.symlink_to(path.name),
+    "missing": lambda path: None,
+}
+"""What stands in a file's place."""
 
 
 def _renew(path: Path, digest: str) -> bool:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from studies_synthetic import run_cell, settings_of, threshold_settings, threshold_study
 
-from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_json, read_yaml
+from kerv_cli.base.config import method_of_file
+from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.files import read_json, read_mapping, read_table, read_yaml, sha256_of
+from kerv_cli.lab.catalogue import find_runs
 from kerv_cli.lab.store import StudyStore, is_result_of
 from kerv_cli.report.tables import load_study
+from kerv_cli.report.viewing.viewer import read_back
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 _LEVELS = zip("abcdefghij", "bcdefghijk", strict=True)
@@ -126,3 +131,48 @@ def test_deep_and_endless_files_are_refused(tmp_path: Path) -> None:
 def test_what_is_nested_without_end_is_refused_before_a_parser_sees_it(text: str) -> None:
     with pytest.raises(ValueError, match="nested more than 1000 deep"):
         read_yaml(text)
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Path:
+    os.mkfifo(tmp_path / "pipe")
+    return tmp_path / "pipe"
+
+
+def method_of(path: Path) -> object:
+    link = path.with_name("link.yaml")
+    link.unlink(missing_ok=True)
+    link.symlink_to(path)
+    return method_of_file([f"method={link}"])
+
+
+@pytest.mark.parametrize("read", [read_json, read_mapping, sha256_of, read_back])
+def test_nobody_waits_for_a_pipe_or_opens_a_folder(pipe: Path, tmp_path: Path, read: Callable[[Path], object]) -> None:
+    for path in (pipe, tmp_path, tmp_path / "absent"):
+        with pytest.raises(KervError) as refused:
+            read(path)
+        assert str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize("read", [read_json, read_mapping, method_of])
+def test_a_file_of_holes_is_not_read_whole(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    with (tmp_path / "a.json").open("wb") as file:
+        file.truncate(3 * 2**30)
+    with pytest.raises(KervError):
+        read(tmp_path / "a.json")
+
+
+def test_a_table_of_holes_or_of_another_kind_is_refused(tmp_path: Path, pipe: Path) -> None:
+    (tmp_path / "a.parquet").write_bytes(b"PAR1" * 3)
+    for path in (tmp_path / "a.parquet", tmp_path, pipe):
+        with pytest.raises((OSError, ValueError)):
+            read_table(path)
+
+
+def test_a_status_that_is_a_list_is_damaged(store: StudyStore) -> None:
+    cell = store.read_plan().cells[0]
+    (store.cells / cell.id / "status.json").write_text("[1]")
+    for look in (store.has_cell, store.described):
+        with pytest.raises(CheckpointError, match="is damaged"):
+            look(cell.id)
+    assert [run.state for run in find_runs(store.root.parent.parent)] == ["2 of 3 cells"]

@@ -7,17 +7,19 @@ from collections.abc import Iterator
 from dataclasses import Field, fields, is_dataclass
 from typing import Any, get_args, get_type_hints
 
+import pandas as pd
 import pytest
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base import settings as s
 from kerv_cli.base.config import MOST_POINTS, compose, expand
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.limits import check_settings
+from kerv_cli.base.limits import check_label, check_settings
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.registry import SETTINGS_GROUPS, parts
 from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.kinematics.prediction import MINIMUM
+from kerv_cli.report.tables import csv_text
 
 SCHEMAS = {name.replace(" ", "_"): part.settings for name, part in parts("command").items()}
 
@@ -99,6 +101,7 @@ def test_a_parts_numbers_have_ranges_too(override: str) -> None:
         "seed=glob(*)",
         "study.common=\\",
         "seed='1",
+        "seed=range(0,5,-1)",
     ],
 )
 def test_a_grid_is_counted_before_it_is_expanded(grid: str) -> None:
@@ -137,3 +140,14 @@ def test_a_plain_name_or_a_path_is_taken() -> None:
 def test_limits_that_repeat_a_constant_agree_with_it() -> None:
     window = next(at for at in fields(s.CalibrateSettings) if at.name == "window")
     assert window.metadata["limits"][0] == MINIMUM
+
+
+@pytest.mark.parametrize("label", ["=1+1", "+x", "@x", "-x", "a\nb", "a\tb", "", "a" * 2000])
+def test_a_label_is_one_line_and_no_formula(label: str) -> None:
+    with pytest.raises(UsageError):
+        check_label(label)
+
+
+def test_no_cell_of_a_csv_is_a_formula() -> None:
+    table = pd.DataFrame({"a": ["=cmd|' /C calc'!A0", "-1;2", "x"], "b": [-1, 2, 3]})
+    assert csv_text(table).splitlines() == ["a,b", "'=cmd|' /C calc'!A0,-1", "-1;2,2", "x,3"]

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import GONE, UnknownName, UsageError
-from kerv_cli.base.files import read_yaml
+from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.files import to_yaml as plain_yaml
 from kerv_cli.base.limits import check_settings, description
 from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, part_of
@@ -255,7 +255,7 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
         return list(overrides), None
     path = Path(files[-1].split("=", 1)[1]).expanduser()
     try:
-        value = read_yaml(path.read_text(encoding="utf-8"))
+        value = read_yaml_file(path)
         choices = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
         parts = {key.removeprefix("override /"): name for choice in choices for key, name in choice.items()}
         words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
@@ -292,6 +292,8 @@ def expand(overrides: str | Sequence[str]) -> list[list[str]]:
         points = math.prod(map(_count, parsed))
         if points > MOST_POINTS:
             raise UsageError(f"'{' '.join(words)}' is a grid of {points:.6g} points: at most {MOST_POINTS}")
+        if not points:
+            raise UsageError(f"'{' '.join(words)}' is a grid without a point: a range ends before it begins")
         axes = [list(_points(o)) for o in parsed]
     except HydraException as error:
         raise UsageError(f"cannot read '{' '.join(words)}': {_one_line(error)}") from error

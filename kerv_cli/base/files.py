@@ -1,4 +1,4 @@
-"""Atomic writes (a file or a folder is complete or absent), JSON and YAML, hashes."""
+"""Atomic writes (a file or a folder is complete or absent), the readers of text, JSON, YAML and tables, hashes."""
 
 from __future__ import annotations
 
@@ -11,16 +11,27 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
+import stat
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.leftovers import clean, temporary_beside
+from kerv_cli.base.leftovers import clean, older_beside, temporary_beside
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MOST_TEXT = 2**28
+"""Bytes of a JSON, YAML or CSV file; kerv's own are far smaller."""
+MOST_BYTES = 2**36
+"""Bytes of weights or of a table."""
 
 _REFUSALS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
+    errno.EIO: "the disk does not work",
     errno.EROFS: "the file system is read-only",
     errno.EACCES: "permission denied",
     errno.EPERM: "operation not permitted",
@@ -84,7 +95,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
             _put_back(folder)
             temporary.mkdir()
             fill(temporary)
-            for path in (*temporary.iterdir(), temporary):
+            for path in (*temporary.rglob("*"), temporary):
                 sync(path)
             placed = _rename_once(temporary, folder)
             if not placed and replace:
@@ -113,7 +124,7 @@ def _exchange(a: Path, b: Path) -> None:
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
         if libc.renameat2(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0:
             return
-    aside = _aside(b)
+    aside = older_beside(b)
     os.rename(b, aside)
     try:
         os.rename(a, b)
@@ -123,15 +134,13 @@ def _exchange(a: Path, b: Path) -> None:
     os.rename(aside, a)
 
 
-def _aside(folder: Path) -> Path:
-    """Where the older folder lies between the two renames; no temporary name, so that nothing removes it."""
-    return folder.with_name(f".{folder.name}.older")
-
-
 def _put_back(folder: Path) -> None:
-    """Puts the older folder back where a process ended between the two renames."""
-    if not folder.exists() and _aside(folder).is_dir():
-        os.rename(_aside(folder), folder)
+    """Puts the older folder back where a process ended between the two renames, or removes it after the second."""
+    aside = older_beside(folder)
+    if folder.exists():
+        shutil.rmtree(aside, ignore_errors=True)
+    elif aside.is_dir():
+        os.rename(aside, folder)
 
 
 def visible(folder: Path) -> list[Path]:
@@ -169,20 +178,71 @@ def write_json(path: Path, value: Any) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
+def regular(path: Path, most: int = MOST_BYTES) -> Path:
+    """The path of a file that can be read to its end: every reader of kerv and of a library gets it from here.
+
+    Raises:
+        OSError: it is missing, or a folder, a pipe or a device, on which a reader would wait.
+        ValueError: it has more than `most` bytes.
+    """
+    status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    if status.st_size > most:
+        raise ValueError(f"{path} has {status.st_size} bytes, more than the {most} that kerv writes")
+    return Path(path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file of at most MOST_TEXT bytes; raises as `regular`, and ValueError: it is not UTF-8."""
+    return regular(path, MOST_TEXT).read_text(encoding="utf-8")
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """A parquet file, or those of `columns` that it has.
+
+    Raises:
+        OSError, ValueError: as `regular`, it is no parquet, or its columns would take more than MOST_BYTES.
+    """
+    import pyarrow.parquet as pq
+
+    # without pyarrow's dataset machinery, which costs several times the reading of a small file
+    with pq.ParquetFile(regular(path)) as file:
+        groups = (file.metadata.row_group(number) for number in range(file.metadata.num_row_groups))
+        if max(file.metadata.num_rows, sum(group.total_byte_size for group in groups)) > MOST_BYTES:
+            raise ValueError(f"{path} stands for more than {MOST_BYTES} bytes")
+        present = None if columns is None else [name for name in columns if name in file.schema_arrow.names]
+        return file.read(columns=present, use_threads=False)
+
+
 def read_json(path: Path) -> Any:
     """The value in a JSON file.
 
     Raises:
-        CheckpointError: the file is missing, unreadable, not JSON, or nested deeper than kerv's own files are.
+        CheckpointError: the file is missing, no regular one, too large, not JSON, or nested deeper than kerv's own
+            files are.
     """
     try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
+        value = json.loads(read_text(path))
         check_shape(value)
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing") from error
     except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} cannot be read as JSON: {error}") from error
     return value
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; raises as `read_json`, and CheckpointError: it holds something else."""
+    value = read_json(path)
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{path} cannot be read as JSON: it holds no object")
+    return value
+
+
+def read_yaml_file(path: Path) -> Any:
+    """The plain values in a YAML file; raises as `read_text` and `read_yaml`."""
+    return read_yaml(read_text(path))
 
 
 def read_yaml(text: str) -> Any:
@@ -255,13 +315,13 @@ def sha256_of(path: Path) -> str:
         CheckpointError: the file is missing or unreadable.
     """
     try:
-        stat = os.stat(path)
-        return _sha256(str(path), stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        status = os.stat(path)
+        return _sha256(str(path), status.st_ino, status.st_size, status.st_mtime_ns)
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
 
 
 @functools.lru_cache(maxsize=4096)
 def _sha256(path: str, inode: int, size: int, changed: int) -> str:
-    with open(path, "rb") as file:
+    with regular(Path(path), most=sys.maxsize).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

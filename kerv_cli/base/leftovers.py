@@ -1,4 +1,10 @@
-"""Temporary files and folders: their names say whose they are, so that what a dead process left can be removed."""
+"""The hidden names that kerv writes, all of them: no catalogue lists a name that begins with a dot.
+
+.<name>.<host>.<process>-<8 digits>.tmp   a file or a folder that is being written, or removed; its process is named, so
+                                          that what a dead one left can be removed
+.<name>.lock                              held while <name> is changed
+.<name>.older                             <name> between two renames, where folders cannot be exchanged in one step
+"""
 
 from __future__ import annotations
 
@@ -21,6 +27,16 @@ def temporary_beside(path: Path) -> Path:
     """A new hidden name in the folder of `path` that names this machine and process: `.<name>.<host>.<pid>-<8>.tmp`."""
     mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
     return path.with_name(f".{path.name[:150]}.{mark}.tmp")
+
+
+def lock_beside(path: Path) -> Path:
+    """The lock of `path`."""
+    return path.with_name(f".{path.name}.lock")
+
+
+def older_beside(path: Path) -> Path:
+    """Where an older folder lies between two renames; no temporary name, so that nothing removes it."""
+    return path.with_name(f".{path.name}.older")
 
 
 def is_left_over(path: Path) -> bool:

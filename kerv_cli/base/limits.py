@@ -66,6 +66,24 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
+def check_label(label: str) -> str:
+    """The name of a setting: one printable line, which no spreadsheet takes for a formula.
+
+    Raises:
+        UsageError: it is not.
+    """
+    if not 0 < len(label) <= 1000 or not label.isprintable() or is_formula(label):
+        raise UsageError(
+            f"'{' '.join(label[:80].split())}' names no setting: one line of text that begins with a letter"
+        )
+    return label
+
+
+def is_formula(text: str) -> bool:
+    """Whether a spreadsheet would compute a cell of this text."""
+    return re.match(r"[=+@\t\r]|-(?![\d.;]*$)", text) is not None
+
+
 def check_settings(settings: Any, what: str = "") -> None:
     """Checks a dataclass and those within it: types of list elements, limits, choices, then what each says about its
     fields together in a method `check_together`. what: the dotted key of `settings` in messages, empty for the root.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kerv_cli.base.errors import CheckpointError, KervError
-from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.limits import check_settings
 
 T = TypeVar("T")
@@ -81,10 +81,7 @@ _hints = functools.cache(get_type_hints)
 
 def read_file(kind: type[T], path: Path, what: str) -> T:
     """The JSON file at `path` as an instance of `kind`; errors as `read`, and a missing or unreadable file."""
-    value = read_json(path)
-    if not isinstance(value, Mapping):
-        raise CheckpointError(f"{path} is not {what}")
-    return read(kind, value, str(path), tolerant=True)
+    return read(kind, read_mapping(path), str(path), tolerant=True)
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:

@@ -81,8 +81,8 @@ def find_target(results: str, name: str) -> Path:
     for place in places:
         if (place / "target.json").is_file():
             return place
-    known = sorted({p.parent.parent.name for p in shipped_dir().glob("*/target/target.json")})
-    known += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("*/target.json")})
+    known = sorted({p.parent.parent.name for p in shipped_dir().glob("[!.]*/target/target.json")})
+    known += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json")})
     raise UsageError(
         f"no target '{name}' in {', '.join(map(str, places))}: train it with 'kerv train target name={name}'"
         + (f", or take one of {', '.join(dict.fromkeys(known))}" if known else "")

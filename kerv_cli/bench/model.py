@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.files import visible
 from kerv_cli.base.places import results_dir, shipped_dir
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.settings import (
@@ -179,7 +180,7 @@ def open_model(settings: BenchSettings) -> Model:
 
 def _policies(results: str) -> list[str]:
     folders = (results_dir(results) / "artifacts" / "target", shipped_dir())
-    return sorted(path.name for folder in folders for path in folder.glob("*") if path.is_dir())
+    return sorted(path.name for folder in folders for path in visible(folder) if path.is_dir())
 
 
 def _shape(settings: BenchSettings) -> Model:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
 from kerv_cli.lab.policy import check
 from kerv_cli.lab.run import CellRunner, reference_decode
-from kerv_cli.lab.store import STUDIES, StudyStore, new_rollout
+from kerv_cli.lab.store import STUDIES, StudyStore, new_rollout, stores
 from kerv_cli.report.viewing import save_recording
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Again:
 
 
 def plan_again(run: RunEntry, results: str) -> Again:
-    """The study, cells and store of a repetition; nothing is run.
+    """The study, cells and store of a repetition: a new one, or that of one which was interrupted; nothing is run.
 
     Raises:
         CheckpointError: the weights or the data that the run used are not there any more. UsageError: as
@@ -49,10 +50,27 @@ def plan_again(run: RunEntry, results: str) -> Again:
     plan = store_of(run).read_plan()
     cells = [_again(cell, results) for cell in plan.cells]
     study = StudySettings(plan.name, plan.title, plan.baseline, axis=plan.axis)
+    if (begun := _begun(run, results, cells)) is not None:
+        return Again(run, dataclasses.replace(study, name=begun.name), cells, begun)
     if run.kind == ROLLOUT:
         return Again(run, study, cells, new_rollout(results, cells))
     store = StudyStore(results, _free(Path(results).expanduser() / STUDIES, plan.name))
     return Again(run, dataclasses.replace(study, name=store.name), cells, store)
+
+
+def _begun(run: RunEntry, results: str, cells: list[Cell]) -> StudyStore | None:
+    """The repetition of these cells that was interrupted."""
+    for store in stores(Path(results).expanduser(), run.folder.parent.name):
+        with contextlib.suppress(KervError):
+            if store.interrupted_since(_words(run)) and {cell.id for cell in store.read_plan().cells} == {
+                cell.id for cell in cells
+            }:
+                return store
+    return None
+
+
+def _words(run: RunEntry) -> list[str]:
+    return ["runs", "rerun", run.id]
 
 
 def _again(cell: Cell, results: str) -> Cell:
@@ -74,12 +92,12 @@ def run_again(again: Again, results: str) -> RunEntry:
     Raises:
         KervError: a cell failed.
     """
-    again.store.write_plan(again.study, again.cells)
-    again.store.note_command(["runs", "rerun", again.run.id])
+    again.store.begin(again.study, again.cells, _words(again.run))
     runner = CellRunner(again.store.rollouts, save_recording, keep=True)
     outcome = execute(again.cells, runner, again.store, gauge=reference_decode)
     if outcome.failed:
         raise KervError(outcome.failed[0].reason)
+    again.store.note_finished()
     return find_run(results, again.store.name)
 
 

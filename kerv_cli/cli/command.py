@@ -230,11 +230,11 @@ def _field(schema: type, key: str) -> tuple[Field[Any], Any]:
 def _of_file(schema: type, key: str, default: Any) -> Any:
     """The value of a dotted key in the file of conf/ that its group chooses; `default` where that does not say."""
     from kerv_cli.base.config import conf_dir
-    from kerv_cli.base.files import read_yaml
+    from kerv_cli.base.files import read_yaml_file
 
     group, *path = key.split(".")
     file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
-    value = read_yaml(file.read_text(encoding="utf-8")) if path and file.is_file() else {}
+    value = read_yaml_file(file) if path and file.is_file() else {}
     for name in path:
         value = value.get(name, {}) if isinstance(value, dict) else {}
     return default if value == {} else value

@@ -78,9 +78,13 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except OSError as error:
         _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
     except Exception as error:  # noqa: BLE001 - the edge: whatever it is, the user gets one line
+        if isinstance(error, MemoryError) or re.search("allocate memory|bad_alloc|start new thread", str(error)):
+            _refuse("out of memory: end other programs, or ask for less", 1, error)
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
 
 
+_MOST_SHOWN = 2000
+"""Letters of a message."""
 _QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
 _CARRIED = {
     "results": None,  # None: every command takes it
@@ -117,7 +121,10 @@ def in_same(words: Iterable[str]) -> str:
 def _refuse(message: str, code: int, error: BaseException | None) -> None:
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
-    typer.echo(f"kerv: {' '.join(message.split())}", err=True)
+    message = " ".join(message.split())
+    if len(message) > _MOST_SHOWN:  # a word of the command line, which the user has seen
+        message = f"{message[: _MOST_SHOWN // 2]} … {message[-_MOST_SHOWN // 2 :]}"
+    typer.echo(f"kerv: {message}", err=True)
     raise typer.Exit(code)
 
 

@@ -148,11 +148,12 @@ def _torch(settings: DoctorSettings) -> Finding:
 
 def _policies(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.base.errors import KervError
+    from kerv_cli.base.files import visible
     from kerv_cli.base.places import find_target, shipped_dir
     from kerv_cli.targets.checkpoint import read_target
 
     findings = []
-    for name in sorted(p.name for p in shipped_dir().glob("*") if p.is_dir()):
+    for name in (path.name for path in visible(shipped_dir()) if path.is_dir()):
         try:
             described = read_target(find_target(settings.results, name))
             parameters = described.provenance.get("parameters")
@@ -170,18 +171,15 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
 def _disk(settings: DoctorSettings) -> Finding:
     import shutil
 
-    from kerv_cli.base.files import atomic_path
-    from kerv_cli.base.places import results_dir
+    from kerv_cli.base.places import check_writable, results_dir
 
     folder = results_dir(settings.results)
-    probe = folder / ".kerv-doctor"
     try:
-        with atomic_path(probe) as temporary:
-            temporary.write_text("probe")
-        probe.unlink()
+        check_writable(settings.results)
     except StorageError as error:
         return Finding("results", False, str(error))
-    free = shutil.disk_usage(folder).free / 1e9
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(there).free / 1e9
     return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
 
 
@@ -192,7 +190,7 @@ def _left_over(settings: DoctorSettings) -> list[Path]:
     from kerv_cli.lab.claims import void
 
     root = results_dir(settings.results)
-    claims = [path for folder in sorted(root.glob("*/*/claims")) for path in void(folder)]
+    claims = [path for folder in sorted(root.glob("[!.]*/[!.]*/claims")) for path in void(folder)]
     return [*left_over(root), *claims]
 
 

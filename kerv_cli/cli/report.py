@@ -26,7 +26,7 @@ Choose = Annotated[
 
 def studies_there() -> list[str]:
     """Names of the studies in ./results."""
-    return sorted(path.parent.name for path in Path("results/studies").glob("*/plan.yaml"))
+    return sorted(path.parent.name for path in Path("results/studies").glob("[!.]*/plan.yaml"))
 
 
 @command(

@@ -146,8 +146,7 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, argument
     store, cells, done = begin(results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
-    store.write_plan(resolved.study, cells)
-    store.note_command(arguments)
+    store.begin(resolved.study, cells, arguments)
     runtime = next(iter(resolved.settings.values())).runtime
     with ProgressDisplay(console(stderr=True)) as display:
 
@@ -207,7 +206,7 @@ def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> No
     from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
 
     data = load_study(store)
-    recordings = sorted(store.rollouts.glob("*.rrd"))
+    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     table = study_table(data)
     if as_json:
         per_task = rows_of(per_task_table(data))

@@ -99,14 +99,14 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore
 def _list_studies(as_json: bool) -> None:
     """Prints the studies of conf/ and how large each is."""
     from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
-    from kerv_cli.base.files import read_yaml
+    from kerv_cli.base.files import read_yaml_file
     from kerv_cli.base.manifests import read
     from kerv_cli.worlds import resolve_tasks
 
     rows, composer = [], Composer("rollout", RolloutSettings)
     for name in groups()["study"]:
         path = conf_dir() / "study" / f"{name}.yaml"
-        study = read(StudySettings, {"name": name, **read_yaml(path.read_text(encoding="utf-8"))}, str(path))
+        study = read(StudySettings, {"name": name, **read_yaml_file(path)}, str(path))
         common = composer.compose(split_words(study.common))
         settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(resolve_tasks(common.task))
         rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
@@ -244,7 +244,7 @@ def _tell(
 
     complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
     table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
-    recordings = sorted(store.rollouts.glob("*.rrd"))
+    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
         rows = [] if table is None else rows_of(table)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import fnmatch
+import io
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_json, sha256_of, storage_errors, sync, visible
+from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
@@ -172,8 +173,7 @@ def _weights(cells: Sequence[Cell]) -> dict[str, str]:
 def _status(store: StudyStore, cell: Cell) -> dict[str, Any] | None:
     """The sums in a complete cell's status.json, unchecked: a list must be quick."""
     with contextlib.suppress(CheckpointError):
-        entries: dict[str, Any] = read_json(store.cells / cell.id / "status.json")
-        return entries
+        return read_mapping(store.cells / cell.id / "status.json")
     return None
 
 
@@ -188,7 +188,7 @@ def description_of(run: RunEntry) -> dict[str, Any]:
 
 def _described(folder: Path, kind: str) -> dict[str, Any]:
     path = _description(folder, kind)
-    return dict(read_json(path)) if path.is_file() else {}
+    return read_mapping(path) if path.exists() else {}
 
 
 def _description(folder: Path, kind: str) -> Path:
@@ -237,8 +237,7 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
 def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
     if not (folder / LOG).is_file():
         return "complete"  # copied or imported: it has no log
-    with (folder / LOG).open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(io.StringIO(read_text(folder / LOG))))
     steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
     return "complete" if step >= steps else f"step {step:.0f} of {steps}"
 

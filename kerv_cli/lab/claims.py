@@ -17,8 +17,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.files import read_json, storage_errors, write_json
-from kerv_cli.base.leftovers import is_alive, temporary_beside
+from kerv_cli.base.files import read_json, read_text, storage_errors, write_json
+from kerv_cli.base.leftovers import is_alive, lock_beside, temporary_beside
 from kerv_cli.base.manifests import read
 from kerv_cli.lab.plan import Cell
 
@@ -60,10 +60,10 @@ def is_claimed(folder: Path, cell: Cell) -> bool:
 
 def void(folder: Path) -> list[Path]:
     """The claims whose process has ended or whose time is up, and the notes that belong to no claim."""
-    claims = sorted(folder.glob("*.json"))
+    claims = sorted(folder.glob("[!.]*.json"))
     held = {path for path in claims if _is_held(path)}
     blocks = {holder.block for path in held if (holder := _read(path)) is not None}
-    notes = [path for path in sorted(folder.glob("*.running")) if path.stem not in blocks]
+    notes = [path for path in sorted(folder.glob("[!.]*.running")) if path.stem not in blocks]
     return [path for path in claims if path not in held] + notes
 
 
@@ -95,8 +95,8 @@ def note_running(folder: Path, cell: Cell, block: str) -> None:
 def running_cell(folder: Path, cells: Sequence[Cell], block: str) -> Cell | None:
     """The cell that this attempt at the block noted last; None before its first episode."""
     try:
-        name = (folder / f"{block}.running").read_text(encoding="utf-8")
-    except OSError:
+        name = read_text(folder / f"{block}.running")
+    except (OSError, ValueError):
         return None
     return next((cell for cell in cells if cell.id == name), None)
 
@@ -126,25 +126,41 @@ def _changed(path: Path) -> float:
 
 @contextlib.contextmanager
 def write_lock(path: Path) -> Iterator[None]:
-    """Lets one process at a time change `path`; readers need no lock. The lock is an empty file beside `path`; a link
-    in its place is refused.
+    """Lets one process at a time change `path`; readers need no lock. The lock is an empty file beside `path`, which is
+    there as long as it is held; a link in its place is refused.
 
     Raises:
         StorageError: the disk refused, or the lock is a link.
     """
     import fcntl
 
-    lock = path.with_name(f".{path.name}.lock")
+    lock = lock_beside(path)
+    while True:
+        try:
+            with storage_errors(lock):
+                lock.parent.mkdir(parents=True, exist_ok=True)
+                descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            raise StorageError(f"{lock} is a link, which kerv does not write through: remove it") from None
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            if not _is_at(descriptor, lock):  # who held it before has removed it
+                continue
+            try:
+                yield
+            finally:
+                if not os.fstat(descriptor).st_size:  # else it is no lock of kerv's
+                    lock.unlink(missing_ok=True)
+            return
+        finally:
+            os.close(descriptor)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether an open file is still the one at `path`."""
     try:
-        with storage_errors(lock):
-            lock.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        if error.errno != errno.ELOOP:
-            raise
-        raise StorageError(f"{lock} is a link, which kerv does not write through: remove it") from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+        return os.path.samestat(os.fstat(descriptor), os.stat(path, follow_symlinks=False))
+    except FileNotFoundError:
+        return False

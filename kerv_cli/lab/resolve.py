@@ -10,7 +10,8 @@ from typing import Any
 
 from kerv_cli.base.config import MOST_POINTS, Composer, check_once, compose, expand, split_words, swept_keys
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.files import read_yaml
+from kerv_cli.base.files import read_yaml_file
+from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
@@ -93,7 +94,7 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
         composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
         values = _varied_values(point, varied)
         parts = [word for word in point if _key(word) in METHOD_KINDS and _key(word) not in varied]
-        label = " ".join([composed.method, *parts, *values])
+        label = check_label(" ".join([composed.method, *parts, *values]))
         settings[label], texts[label] = composed, " ".join(point)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
     study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
@@ -141,7 +142,7 @@ def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings |
 def _read_study(path: Path) -> dict[str, Any]:
     """The study file's values. Raises UsageError where it cannot be read or is no mapping."""
     try:
-        value = read_yaml(path.read_text(encoding="utf-8"))
+        value = read_yaml_file(path)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or "it is not YAML"
         raise UsageError(f"study={path} cannot be read: {why}") from error
@@ -177,7 +178,7 @@ def _points(study: StudySettings) -> dict[str, list[str]]:
     for label, text in study.settings.items():
         varied = swept_keys(text)
         for words in expand(text):
-            points[" ".join([label, *_varied_values(words, varied)])] = words
+            points[check_label(" ".join([label, *_varied_values(words, varied)]))] = words
         if len(points) > MOST_POINTS:
             raise UsageError(f"study '{study.name}' has more than {MOST_POINTS} settings: leave some out")
     return points

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.files import read_table
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
@@ -206,8 +207,8 @@ def read_tables(folder: Path) -> CellTables:
     Raises:
         OSError, ValueError, ArrowException: they are not what a kerv wrote.
     """
-    episodes = _with_columns(_parquet(folder / "episodes.parquet"), EPISODE_SCHEMA)
-    decodes = _with_columns(_parquet(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
+    episodes = _with_columns(read_table(folder / "episodes.parquet"), EPISODE_SCHEMA)
+    decodes = _with_columns(read_table(folder / "decodes.parquet", _DECODE_TIMES.names), _DECODE_TIMES)
     return CellTables(folder, episodes, _split_by_seed(decodes))
 
 
@@ -224,12 +225,6 @@ def frames_of(cells: Sequence[CellTables]) -> list[pd.DataFrame]:
         raise CheckpointError(f"a cell in {cells[0].folder.parent} has no decodes of seed {error}") from error
     stops = np.cumsum([cell.episodes.num_rows for cell in cells]).tolist()
     return [whole.iloc[stop - cell.episodes.num_rows : stop] for cell, stop in zip(cells, stops, strict=True)]
-
-
-def _parquet(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """Those columns of a parquet file, or all of them."""
-    # without pyarrow's dataset machinery, which costs several times the reading of so small a file
-    return pq.ParquetFile(path).read(columns=columns, use_threads=False)
 
 
 def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:

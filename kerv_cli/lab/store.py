@@ -33,6 +33,8 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import (
     atomic_path,
     read_json,
+    read_mapping,
+    read_text,
     read_yaml,
     sha256_of,
     storage_errors,
@@ -140,13 +142,29 @@ class StudyStore:
         Raises:
             StorageError: the disk refused.
         """
-        new = StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
+        new = _plan_of(study, cells)
         with write_lock(self.plan_path):
             with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
                 new = merge_plans(self.read_plan(), new)
             with atomic_path(self.plan_path) as temporary:
                 temporary.write_text(plan_text(new), encoding="utf-8")
         return new
+
+    def begin(self, study: StudySettings, cells: Sequence[Cell], arguments: Sequence[str]) -> None:
+        """Writes the plan and notes the command. The folder of a new run appears with both in it.
+
+        Raises:
+            StorageError: the disk refused.
+        """
+
+        def fill(folder: Path) -> None:
+            run = asdict(_RunFile((Invocation(tuple(arguments), _now(), git_commit()),)))
+            (folder / self.plan_path.name).write_text(plan_text(_plan_of(study, cells)), encoding="utf-8")
+            (folder / self.run_path.name).write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
+
+        if self.root.exists() or not write_folder(self.root, fill):
+            self.write_plan(study, cells)
+            self.note_command(arguments)
 
     def read_plan(self) -> StudyPlan:
         """The stored plan.
@@ -157,7 +175,7 @@ class StudyStore:
         """
         try:
             # a folder that was renamed by hand is the study of its new name
-            return replace(plan_from_text(self.plan_path.read_text(encoding="utf-8")), name=self.name)
+            return replace(plan_from_text(read_text(self.plan_path)), name=self.name)
         except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"no study '{self.name}' in {self.root.parent}: {self.how_to_run()}") from None
         except (OSError, ValueError, CheckpointError) as error:
@@ -225,7 +243,7 @@ class StudyStore:
         """
         folder = self.cells / name
         try:
-            status = read_json(folder / _STATUS)
+            status = read_mapping(folder / _STATUS)
             if status.get("format", FORMAT) > FORMAT:
                 raise NewerCell(f"cell {folder} is of a newer kerv (format {status['format']}): update kerv")
             # cells from before the seal have none
@@ -256,9 +274,9 @@ class StudyStore:
         """
         folder = self.cells / name
         try:
-            config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
-            return config, dict(read_json(folder / _STATUS))
-        except (OSError, ValueError) as error:
+            config = _read_config(read_text(folder / "config.yaml"))
+            return config, read_mapping(folder / _STATUS)
+        except (OSError, ValueError, CheckpointError) as error:
             raise self._damaged(folder, error) from error
 
     def set_aside(self, name: str) -> Path:
@@ -350,7 +368,7 @@ class StudyStore:
                 raise CheckpointError(f"cell {folder} is missing: {self.how_to_run()}")
             status = self.status_of(folder.name)
             try:
-                config = _read_config((folder / "config.yaml").read_text(encoding="utf-8"))
+                config = _read_config(read_text(folder / "config.yaml"))
                 tables.append(rows.read_tables(folder))
             except (OSError, ValueError, pa.ArrowException) as error:
                 raise self._damaged(folder, error) from error
@@ -391,6 +409,11 @@ class StudyStore:
         """Removes the traceback of an earlier attempt that failed."""
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
+            self.failures.rmdir()  # refused where others are left
+
+
+def _plan_of(study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
+    return StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
 
 
 def _read_config(text: str) -> dict[str, Any]:

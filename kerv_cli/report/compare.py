@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import read_table
 from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
 from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import Cell, seeds_text
@@ -204,7 +205,7 @@ def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
     complete, _ = store.read_cells(cells)
     tokens: dict[tuple[str, str, int, int], list[list[int]]] = {}
     for cell in (cell for cell in cells if cell.id in complete):
-        decodes = pd.read_parquet(store.cells / cell.id / "decodes.parquet", columns=["seed", "tokens"])
+        decodes = read_table(store.cells / cell.id / "decodes.parquet", ["seed", "tokens"]).to_pandas()
         for seed, group in decodes.groupby("seed"):
             tokens[cell.label, cell.task, int(str(seed)), cell.repeat] = [list(row) for row in group["tokens"]]
     return tokens

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import MOST_TEXT, atomic_path, regular
 from kerv_cli.report.drawing import COLOURS, MUTED, STYLE, entitle, figure_bytes, new_figure
 
 _COLUMNS = 3  # panels beside one another
@@ -23,7 +23,7 @@ def read_log(folder: Path) -> pd.DataFrame:
     """
     path = folder / "log.csv"
     try:
-        log = pd.read_csv(path)
+        log = pd.read_csv(regular(path, MOST_TEXT))
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} cannot be read: {error}") from error
     if "step" not in log or log.empty:

@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.files import read_table
 from kerv_cli.base.places import as_path, shipped_dir
 from kerv_cli.engine.cost import FORMAT, READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
 from kerv_cli.lab.identity import batch_of
@@ -150,7 +150,7 @@ def _recorded(data: StudyData, label: str) -> Recorded:
     for cell in cells:
         stored = data.cells[cell.id]
         seeds = stored.of(cell)["seed"].tolist()
-        table = _read(stored.folder / "decodes.parquet")
+        table = read_table(stored.folder / "decodes.parquet", _COLUMNS)
         row_of = {seed: first + number for number, seed in enumerate(seeds)}
         keep = pc.is_in(table["seed"], pa.array(seeds, pa.int64()))
         table = table.filter(keep)
@@ -162,12 +162,6 @@ def _recorded(data: StudyData, label: str) -> Recorded:
     drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
     work, size = _work(whole, drafter)
     return Recorded(work, np.concatenate(owners), size)
-
-
-def _read(path: Path) -> pa.Table:
-    file = pq.ParquetFile(path)
-    present = [name for name in _COLUMNS if name in file.schema_arrow.names]
-    return file.read(columns=present, use_threads=False)
 
 
 def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from kerv_cli.base.files import atomic_path
+from kerv_cli.base.limits import is_formula
 from kerv_cli.base.provenance import PACKAGES
 from kerv_cli.base.settings import MODEL
 from kerv_cli.lab.identity import (
@@ -255,7 +256,9 @@ def values_of(table: pd.DataFrame, column: str) -> set[str]:
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """CSV with six significant digits; empty where a value does not exist."""
+    """CSV with six significant digits; empty where a value does not exist, and an apostrophe before what a spreadsheet
+    would compute."""
+    table = table.map(lambda value: f"'{value}" if isinstance(value, str) and is_formula(value) else value)
     return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import atomic_path, read_json, sha256_of, write_json
+from kerv_cli.base.files import atomic_path, read_json, regular, sha256_of, write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -115,8 +115,8 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
     if not path.is_file():
         raise CheckpointError(f"no {what} at {path}: train it, or name another with its folder")
     try:
-        tensors = load_file(path)
-    except (SafetensorError, OSError) as error:
+        tensors = load_file(regular(path))
+    except (SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(
             f"{what} at {path} is damaged ({error}): move it aside and train or copy it again"
         ) from error

@@ -19,7 +19,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import atomic_path, regular
 from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
@@ -227,7 +227,7 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
     """
     again = f"move {path.parent} aside to begin again"
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(regular(path), "pt") as file:
             state = json.loads((file.metadata() or {})["state"])
         tensors, text = load_tensors(path, "training state"), state["progress"]
         intact, value = state["sha256"] == digest(tensors, text), json.loads(text)

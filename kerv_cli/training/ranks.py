@@ -16,6 +16,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.processes import end_with
 
 PATIENCE = timedelta(hours=3)
 """How long a rank waits for the others: the first one may validate in closed loop meanwhile."""
@@ -86,5 +87,6 @@ def join(device: str, batch: int) -> tuple[str, Ranks]:
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
         torch.cuda.set_device(device)
     if not dist.is_initialized():
+        end_with(os.getppid())
         dist.init_process_group("nccl" if cuda else "gloo", timeout=PATIENCE)
     return device, ranks

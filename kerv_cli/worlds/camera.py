@@ -26,7 +26,15 @@ if TYPE_CHECKING:
 _PACKAGES = "libegl1 libosmesa6 libgl1-mesa-dri libgl1"
 _HEADLESS = ("egl", "osmesa")
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
-_PROBE = "import mujoco; context = mujoco.GLContext(16, 16); context.make_current(); context.free()"
+_PROBE = """
+import ctypes, sys
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG: it ends with its parent
+import mujoco
+context = mujoco.GLContext(16, 16)
+context.make_current()
+context.free()
+"""
 _PROBE_SECONDS = 60.0
 
 _chosen: str | RenderingUnavailable | None = None

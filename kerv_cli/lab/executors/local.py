@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import os
 import re
-import signal
-import threading
-import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
+from kerv_cli.base.processes import begin_worker
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
 
 T = TypeVar("T")
-
-_WATCH_SECONDS = 1.0
 
 
 def build(options: Any, slots: int, threads: int, folder: Path) -> Executor:
@@ -83,7 +79,7 @@ class Processes:
         warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given", category=UserWarning)
         pool = ProcessPoolExecutor(
             max_workers=1,
-            initializer=_begin_worker,
+            initializer=begin_worker,
             initargs=(os.getpid(),),
             env=dict.fromkeys(THREAD_VARIABLES, str(self.threads)),
         )
@@ -94,15 +90,3 @@ class Processes:
         """Ends the workers; abandoned ones are killed."""
         for pool in list(self._all):
             pool.shutdown(wait=True, kill_workers=abandon)
-
-
-def _begin_worker(parent: int) -> None:
-    """Worker start-up: ignores SIGINT (the parent handles Ctrl-C) and exits when the parent process is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_WATCH_SECONDS)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

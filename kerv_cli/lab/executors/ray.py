@@ -5,6 +5,7 @@ The nodes must share the results folder.
 
 from __future__ import annotations
 
+import contextlib
 import socket
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.processes import guard
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
 from kerv_cli.lab.executors.registration import RayOptions
 
@@ -30,12 +32,16 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
 
     _check_reachable(options.address)
     started: dict[str, Any] = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
+    own = contextlib.ExitStack()
+    if not options.address:  # its agents would outlive this process
+        own.enter_context(guard())
     try:
         ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+    except Exception as error:  # noqa: BLE001 - Ray raises it bare where a machine is slow
+        own.close()
         why = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise UsageError(f"the Ray cluster {options.address or 'of this machine'} cannot be reached: {why}") from None
-    return Tasks(slots, threads, options.gpus)
+    return Tasks(slots, threads, options.gpus, own)
 
 
 def _check_reachable(address: str) -> None:
@@ -56,10 +62,10 @@ def _check_reachable(address: str) -> None:
 class Tasks:
     """Ray tasks without Ray's retries: `execute` decides about lost blocks."""
 
-    def __init__(self, slots: int, threads: int, gpus: float) -> None:
+    def __init__(self, slots: int, threads: int, gpus: float, own: contextlib.ExitStack) -> None:
         import ray
 
-        self.slots = slots
+        self.slots, self._own = slots, own
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
         self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
@@ -81,6 +87,7 @@ class Tasks:
             for reference in self._open:
                 ray.cancel(reference, force=True)
         ray.shutdown()
+        self._own.close()
 
 
 def _call(work: Callable[[], T]) -> T:

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import CheckpointError, UnknownName
+from kerv_cli.base.files import read_table, regular
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk
@@ -222,12 +223,12 @@ class Datastore:
 def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
     """Reads a datastore's files and checks them against its manifest."""
     try:
-        vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
+        vectors = np.load(regular(folder / VECTORS)).astype(np.float32, copy=False)
         payload = _read_payload(folder / PAYLOAD)
-        projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None
+        projection = np.load(regular(folder / PROJECTION)) if PROJECTION in manifest.files else None
         rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
         fits = vectors.shape == (rows, manifest.width) and payload["tokens"].shape == (rows, size)
-    except (OSError, KeyError, TypeError, ValueError) as error:  # pyarrow's errors are ValueErrors
+    except (OSError, KeyError, TypeError, ValueError, MemoryError) as error:  # pyarrow's errors are ValueErrors
         raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
     if not fits or not np.isfinite(vectors).all():
         raise CheckpointError(
@@ -238,9 +239,7 @@ def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(path)
+    table = read_table(path)
     columns = {name: table[column].to_numpy() for name, column in COLUMNS.items()}
     flat = table["tokens"].combine_chunks().flatten().to_numpy()
     return {"tokens": flat.reshape(len(table), -1), **columns}

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.files import regular
 
 if TYPE_CHECKING:
     from rerun.chunk import RrdReader
@@ -33,7 +34,7 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     modified: dict[Path, float] = {}
     for path in (Path(p).expanduser() for p in paths):
         if path.is_dir():
-            modified |= {file: file.stat().st_mtime for file in path.rglob("*.rrd") if file.is_file()}
+            modified |= {file: file.stat().st_mtime for file in path.rglob("[!.]*.rrd") if file.is_file()}
         elif not path.exists():
             raise UsageError(f"{path} does not exist: name a recording (.rrd) or a folder of them")
         elif path.suffix != ".rrd":
@@ -192,11 +193,11 @@ def _reader(path: Path) -> RrdReader:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a missing footer, which may also raise
         try:
-            reader = RrdReader(path)
+            reader = RrdReader(regular(path))
             recordings = reader.recordings()
-        except ValueError as error:
+        except FileNotFoundError as error:
             raise KervError(f"{path} is missing") from error
-        except (RuntimeError, OSError) as error:
+        except (RuntimeError, OSError, ValueError) as error:
             raise KervError(_damaged(path, error)) from error
     if not recordings:
         raise KervError(f"{path} holds no recording: record the episode again")

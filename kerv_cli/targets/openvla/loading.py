@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.files import read_json, regular, sha256_of
 from kerv_cli.targets.openvla.config import Shape
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
 from kerv_cli.targets.openvla.vision import Block, PoolingHead, Projector, VisionBackbone
@@ -61,9 +61,9 @@ class Shards:
 @contextlib.contextmanager
 def _open_tensors(path: Path) -> Iterator[Any]:
     try:
-        with safe_open(path, framework="pt", device="cpu") as handle:
+        with safe_open(regular(path), framework="pt", device="cpu") as handle:
             yield handle
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(f"{path} is missing, cut short or damaged ({error}): download it again") from error
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import atomic_path, regular
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 
@@ -107,7 +107,7 @@ def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, framework="numpy") as file:
+        with safe_open(regular(path), framework="numpy") as file:
             metadata = file.metadata() or {}
             if metadata.get("format") != str(FORMAT):
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")

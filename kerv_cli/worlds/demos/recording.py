@@ -11,6 +11,7 @@ On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:0
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -25,6 +26,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
+from kerv_cli.base.processes import begin_worker
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.camera import CameraConfig, choose_backend
@@ -316,7 +318,8 @@ def _run_jobs(
     from joblib import Parallel, delayed, parallel_config
 
     # loky starts fresh interpreters: a fork after this process has drawn would deadlock in the GL driver.
-    with parallel_config(backend="loky", n_jobs=min(config.workers, len(jobs)), inner_max_num_threads=1):
+    workers = {"n_jobs": min(config.workers, len(jobs)), "initializer": begin_worker, "initargs": (os.getpid(),)}
+    with parallel_config(backend="loky", inner_max_num_threads=1, **workers):
         work = (delayed(_record_seeds)(config, out, task, seeds, make_actor) for task, seeds in jobs)
         yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
 

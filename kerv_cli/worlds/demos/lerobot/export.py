@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import atomic_path, write_json
+from kerv_cli.base.files import atomic_path, visible, write_folder, write_json
 from kerv_cli.base.views import VIEWS
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -193,7 +193,7 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
     Raises:
         UsageError: `folder` holds something else. CheckpointError: an episode is damaged. StorageError: writing failed.
     """
-    if folder.exists() and any(folder.iterdir()) and not (folder / "meta").is_dir():
+    if visible(folder) and not (folder / "meta").is_dir():
         raise UsageError(f"{folder} exists and is no LeRobot dataset: name another folder")
     config = dataset.manifest.config
     rate = dataset.manifest.actions.control_hz / int(config["frame_stride"])
@@ -201,11 +201,15 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
     if len({_instruction(name) for name in names}) < len(names):
         raise UsageError("two tasks have the same instruction, which LeRobot tells tasks apart by: export them apart")
     tasks = {name: number for number, name in enumerate(names)}
-    (folder / layout.INFO).unlink(missing_ok=True)
-    result = Export(dataset, folder, config["camera"]["name"], rate, tasks)
-    result.write_data(progress)
-    result.write_meta()
-    return result
+    results: list[Export] = []
+
+    def fill(new: Path) -> None:
+        results.append(Export(dataset, new, config["camera"]["name"], rate, tasks))
+        results[0].write_data(progress)
+        results[0].write_meta()
+
+    write_folder(folder, fill, replace=True)
+    return results[0]
 
 
 def _instruction(task: str) -> str:

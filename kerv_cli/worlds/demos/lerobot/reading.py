@@ -16,7 +16,8 @@ import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_json, write_json
+from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
+from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
 from kerv_cli.worlds.demos.dataset import FORMAT, entry_of, episode_path, totals
@@ -39,8 +40,8 @@ class Source:
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
         """Raises CheckpointError: no dataset of version 3, or a damaged one. UnknownName: no such camera."""
-        info = read_json(folder / layout.INFO)
-        version = str(info.get("codebase_version")) if isinstance(info, dict) else "none"
+        info = read_mapping(folder / layout.INFO)
+        version = str(info.get("codebase_version"))
         if not version.startswith("v3."):
             raise CheckpointError(
                 f"{folder / layout.INFO} is of version {version}, v3.x is read: convert it with LeRobot's own "
@@ -52,7 +53,11 @@ class Source:
             raise CheckpointError(f"{folder} has no images or no {layout.ACTION}: it cannot be learned from")
         if camera and camera not in cameras:
             raise UnknownName("camera", camera, cameras)
-        rows = [row for path in sorted(folder.glob("meta/episodes/*/*.parquet")) for row in _table(path).to_pylist()]
+        rows = [
+            row for path in sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet")) for row in _table(path).to_pylist()
+        ]
+        if not rows:
+            raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
         named = _table(folder / layout.TASKS).to_pylist()
         tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in named}
         return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
@@ -103,9 +108,22 @@ def import_lerobot(
         UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
             episode is damaged. KervError: a video, and no package av.
     """
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
-    source = Source.open(Path(settings.source).expanduser(), settings.camera)
+    path, manifests = as_path(settings.source), list[dict[str, Any]]()
+    try:
+        source = Source.open(path, settings.camera)
+        write_folder(folder, lambda new: manifests.append(_import(source, settings, new, progress)))
+        return manifests[0]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        why = " ".join(f"{type(error).__name__} {error}".split())[:120]
+        raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
+
+
+def _import(
+    source: Source, settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None]
+) -> dict[str, Any]:
+    """Fills a new folder -> the manifest."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
     entries: dict[str, list[dict[str, Any]]] = {}
@@ -236,7 +254,7 @@ def _identifier(name: str) -> str:
 
 def _table(path: Path, **options: Any) -> pa.Table:
     try:
-        return pq.read_table(path, **options)
+        return pq.read_table(regular(path), **options)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
 
@@ -244,9 +262,9 @@ def _table(path: Path, **options: Any) -> pa.Table:
 def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
     data = cell.get("bytes")
     try:
-        with Image.open(io.BytesIO(data) if data else folder / str(cell.get("path"))) as image:
+        with Image.open(io.BytesIO(data) if data else regular(folder / str(cell.get("path")))) as image:
             return np.asarray(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError) as error:
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise CheckpointError(f"an image in {folder} cannot be read: {str(error)[:120]}") from error
 
 
@@ -257,7 +275,7 @@ def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator
     except ImportError as error:
         raise KervError("datasets with videos need the package av: pip install 'kerv[lerobot]'") from error
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(regular(path))) as container:
             stream = container.streams.video[0]
             if start > 0:
                 container.seek(int(start / float(stream.time_base)), stream=stream)

@@ -1,0 +1,87 @@
+"""Processes that kerv starts end with the one that started them, also where that is killed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+WATCH_SECONDS = 1.0
+"""Between two looks at whether the parent lives."""
+
+_GUARD = """
+import os, select, signal, sys
+def status(process):
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            fields = file.read().rpartition(")")[2].split()
+        return int(fields[1]), int(fields[19])  # parent, start
+    except OSError:  # it has ended
+        return None, None
+
+def look():
+    every = {process: status(process) for process in map(int, filter(str.isdigit, os.listdir("/proc")))}
+    before = 0
+    while before < len(below):
+        before = len(below)
+        here = {parent for parent, start in below.items() if every.get(parent, (0, 0))[1] == start}
+        below.update({process: start for process, (parent, start) in every.items() if parent in here})
+
+below = {int(sys.argv[1]): status(sys.argv[1])[1]}  # process -> its start; descendants, also those of ended parents
+while not select.select([sys.stdin], [], [], 1)[0]:
+    look()
+look()
+for process, start in below.items():
+    if process not in (os.getpid(), int(sys.argv[1])) and status(process)[1] == start:
+        os.kill(process, signal.SIGKILL)
+"""
+
+
+def end_with(parent: int) -> None:
+    """Ends this process within seconds of its parent's end. parent: the parent's process number."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(WATCH_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def begin_worker(parent: int) -> None:
+    """Start-up of a worker process: it ends with its parent, which alone handles Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with(parent)
+
+
+@contextlib.contextmanager
+def guard() -> Iterator[None]:
+    """What is started within the block, and what that starts, ends with the block or with this process: another process
+    sees to that. For servers that a library starts. Needs /proc."""
+    command = [sys.executable, "-S", "-c", _GUARD, str(os.getpid())]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True):  # either end closes the pipe
+        yield
+
+
+@contextlib.contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """SIGTERM, which schedulers and `timeout` send, is a Ctrl-C within the block: what was begun is cleared away."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)

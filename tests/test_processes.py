@@ -1,0 +1,127 @@
+"""No process of a command outlives it, however it ends."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+LONGEST = 5.0
+
+DEMOS = """
+import sys, time
+from joblib import delayed, Parallel, parallel_config
+from kerv_cli.worlds.demos import recording
+def sleep(*arguments):
+    open(sys.argv[1], "a").write(f"{__import__('os').getpid()}\\n")
+    time.sleep(60)
+class Config:
+    workers = 2
+recording._record_seeds = sleep
+list(recording._run_jobs(Config, None, [("a", range(1)), ("b", range(1))], None))
+"""
+RANK = """
+import os, sys, time
+from kerv_cli.training.ranks import join
+join("cpu", 2)
+open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
+time.sleep(60)
+"""
+GUARD = """
+import os, subprocess, sys, time
+from kerv_cli.base.processes import guard
+with guard():
+    server = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; sleep 1.5"], stdout=-1, text=True)
+    agent = int(server.stdout.readline())
+    time.sleep(2)  # its parent has ended
+    open(sys.argv[1], "a").write(f"{agent}\\n")
+    time.sleep(float(sys.argv[2]))
+"""
+SWEEP = """
+import time
+from kerv_cli.base.processes import sigterm_interrupts
+try:
+    with sigterm_interrupts():
+        print("here", flush=True)
+        time.sleep(60)
+except KeyboardInterrupt:
+    print("cleared", flush=True)
+"""
+
+
+def ends(pid: int) -> bool:
+    until = time.monotonic() + LONGEST
+    while time.monotonic() < until:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except FileNotFoundError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def pids(path: Path, count: int) -> list[int]:
+    until = time.monotonic() + 120
+    while time.monotonic() < until:
+        found = path.read_text().split() if path.exists() else []
+        if len(found) >= count:
+            return [int(pid) for pid in found]
+        time.sleep(0.05)
+    raise TimeoutError(f"{path} does not name {count} processes")
+
+
+def killed(script: str, path: Path, count: int, *arguments: str) -> list[int]:
+    """Starts a script whose processes write their numbers to `path`, and kills it -> those that they were."""
+    with subprocess.Popen([sys.executable, "-c", script, str(path), *arguments]) as process:
+        found = pids(path, count)
+        process.kill()
+    return found
+
+
+def test_workers_that_record_end_with_a_killed_command(tmp_path: Path) -> None:
+    assert all(map(ends, killed(DEMOS, tmp_path / "pids", 2)))
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_what_a_library_starts_ends_with_a_killed_command(tmp_path: Path) -> None:
+    assert all(map(ends, killed(GUARD, tmp_path / "pids", 1, "60")))
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_what_a_library_starts_ends_with_the_block(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "-c", GUARD, str(tmp_path / "pids"), "0"], check=True)
+    assert all(map(ends, pids(tmp_path / "pids", 1)))
+
+
+def test_a_rank_ends_with_what_started_it(tmp_path: Path) -> None:
+    starter = (
+        "import os, subprocess, sys\n"
+        "for rank in '01':\n"
+        "    at = {'RANK': rank, 'WORLD_SIZE': '2', 'MASTER_ADDR': '127.0.0.1', 'MASTER_PORT': sys.argv[3]}\n"
+        "    last = subprocess.Popen([sys.executable, '-c', sys.argv[2], sys.argv[1]], env={**os.environ, **at})\n"
+        "last.wait()"
+    )
+    assert all(map(ends, killed(starter, tmp_path / "pids", 2, RANK, str(free_port()))))
+
+
+def free_port() -> int:
+    import socket
+
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        port: int = bound.getsockname()[1]
+    return port
+
+
+def test_sigterm_clears_away(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", SWEEP], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "here\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout.read() == "cleared\n"
+    assert process.returncode == 0
