@@ -16,7 +16,7 @@ from kerv_cli.cli.common import one_line_errors
 
 # kerv's own commands register themselves, in the order of the help
 # isort: off
-from kerv_cli.cli import demos, train, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
+from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
 from kerv_cli.cli import bench, doctor, completion  # noqa: F401
 # isort: on
 

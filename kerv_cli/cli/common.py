@@ -84,8 +84,9 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
 _QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
 _CARRIED = {
     "results": None,  # None: every command takes it
-    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter"),
-    "demos": ("train target", "train drafter", "calibrate", "build datastore"),
+    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter", "prepare"),
+    "demos": ("train target", "train drafter", "calibrate", "build datastore", "prepare"),
+    "for": ("prepare",),
 }
 """Settings of the present command that a command in its messages needs too -> the commands that take them."""
 
@@ -96,8 +97,10 @@ def runnable(message: str, words: Sequence[str]) -> str:
 
     def completed(match: re.Match[str]) -> str:
         quote, name, rest = match.groups()
+        # what a rollout's method needs
+        given = [re.sub("^method=", "for=", word) for word in words] if name == "prepare" else words
         keys = {word.split("=", 1)[0] for word in shlex.split(rest)}
-        carried = [shlex.quote(word) for word in words if _carries(word, name) and word.split("=", 1)[0] not in keys]
+        carried = [shlex.quote(word) for word in given if _carries(word, name) and word.split("=", 1)[0] not in keys]
         return f"{quote}{' '.join([called(), name, *rest.split(), *carried])}{quote}"
 
     return _QUOTED.sub(completed, message)

@@ -101,14 +101,14 @@ def _list_studies(as_json: bool) -> None:
     from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
     from kerv_cli.base.files import read_yaml
     from kerv_cli.base.manifests import read
-    from kerv_cli.worlds import resolve_tasks
+    from kerv_cli.lab.resolve import tasks_of
 
     rows, composer = [], Composer("rollout", RolloutSettings)
     for name in groups()["study"]:
         path = conf_dir() / "study" / f"{name}.yaml"
         study = read(StudySettings, {"name": name, **read_yaml(path.read_text(encoding="utf-8"))}, str(path))
         common = composer.compose(split_words(study.common))
-        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(resolve_tasks(common.task))
+        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(tasks_of(common))
         rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
     columns = ("study", "settings", "tasks", "episodes", "in all", "")
     if as_json:

@@ -199,6 +199,11 @@ def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
             yield _artifact(path, kind)
 
 
+def state_of(folder: Path, kind: str) -> str:
+    """The `state` of the artifact in a folder."""
+    return _artifact(folder, kind).state
+
+
 _BEGUN = {"demos": ("recording.json",), **dict.fromkeys(TRAINED, ("log.csv",))}
 """Kind -> files that an unfinished one has."""
 

@@ -4,6 +4,7 @@ however many settings of a study share them."""
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,6 +92,12 @@ class Artifact(Generic[T]):
     made = "trained"
     again: str
     schema: type[T]
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """Words behind `kerv` that make one, as the remedy names them; none where it names no command."""
+        quoted = re.search(r"'kerv ([^']+)'", self.again)
+        return tuple(quoted[1].split()) if quoted else ()
 
     def place(self, results: str, name: str | None, target: Path) -> Path:
         """Its path; name None: the one beside the target in the folder `target`."""
@@ -241,6 +248,10 @@ class Artifacts:
                 one among `kinds`.
         """
         there = {kind: (kind_of(kind), self.place(kind)) for kind in kinds}
+        for own, place in there.values():
+            if own.command and not own.json(place).is_file():
+                remedy = f"run 'kerv prepare policy.target={self.policy.target}'"
+                raise CheckpointError(f"no {own.noun} in {place}: {remedy}, or name a folder that holds one")
         described = {kind: own.checked(place, self.description) for kind, (own, place) in there.items()}
         hashes = {TARGET: self.description.sha256}
         hashes |= {kind: own.digest(place, described[kind]) for kind, (own, place) in there.items()}
