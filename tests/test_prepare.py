@@ -1,4 +1,4 @@
-"""A policy of one's own: its tasks and demonstrations are those that it was trained on, and `kerv prepare` makes the rest."""
+"""A policy of one's own: tasks and demonstrations are those that it was trained on, `kerv prepare` makes the rest."""
 
 from __future__ import annotations
 

@@ -129,13 +129,9 @@ def kerv(
 
 
 def main() -> None:
-    """Entry point of the `kerv` script."""
+    """Runs the command line."""
     if "_KERV_COMPLETE" in os.environ:  # a shell asks; typer registers its shells with add_completion only
         from typer._completion_classes import completion_init
 
         completion_init()
     app()
-
-
-if __name__ == "__main__":
-    main()

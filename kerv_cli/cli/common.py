@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from kerv_cli.base.errors import KervError
+from kerv_cli.base.errors import Interrupted, KervError
 
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
@@ -71,7 +71,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
             raise
         _refuse(error.format_message(), error.exit_code, error)
     except KeyboardInterrupt:
-        _refuse("interrupted", 130, None)
+        _refuse("interrupted", Interrupted.exit_code, None)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
@@ -120,6 +120,9 @@ def in_same(words: Iterable[str]) -> str:
 def _refuse(message: str, code: int, error: BaseException | None) -> None:
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
+    if code == Interrupted.exit_code:
+        # objects in the making cannot clean up behind themselves, e.g. a GL context: no news to the user
+        sys.unraisablehook = lambda unraisable: None
     typer.echo(f"kerv: {' '.join(message.split())}", err=True)
     raise typer.Exit(code)
 
@@ -139,6 +142,7 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
         yield lambda done, total, text="": None
         return
     if not sys.stderr.isatty():
+        typer.echo(f"{title} …", err=True)
         yield _plain_lines(title)
         return
     from rich.progress import (

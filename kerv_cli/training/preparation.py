@@ -14,6 +14,7 @@ from kerv_cli.lab.catalogue import TRAINED, state_of
 from kerv_cli.methods.artifacts import Artifacts, kind_of
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
+from kerv_cli.worlds import specs
 
 ORDER = ("drafter", "early", "scout", "datastore", "calibration", "certificate")
 """A kind is made from those before it; kinds of parts that are not kerv's come last."""
@@ -44,7 +45,9 @@ def plan(settings: PrepareSettings) -> list[Step]:
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
-    kinds = needs(settings.methods, bool(description.cameras))
+    spec = specs().get(description.environment)
+    played = spec is not None and not spec.world_class.endswith(":NoWorld")
+    kinds = needs(settings.methods, bool(description.cameras), played)
     steps: list[Step] = []
     for kind in kinds:
         place, command = artifacts.place(kind), list(kind_of(kind).command)
@@ -59,9 +62,9 @@ def plan(settings: PrepareSettings) -> list[Step]:
     return steps
 
 
-def needs(methods: Sequence[str], sees: bool) -> list[str]:
+def needs(methods: Sequence[str], sees: bool, played: bool = True) -> list[str]:
     """Kinds of artifacts that methods need, in the order in which they are made. methods: none: all that the target can
-    have. sees: whether it has cameras.
+    have. sees: whether it has cameras. played: whether its environment can be run, and is not a recording alone.
 
     Raises:
         UnknownName: no such method. UsageError: one needs what a target without cameras cannot have.
@@ -77,7 +80,7 @@ def needs(methods: Sequence[str], sees: bool) -> list[str]:
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= own
     made = [kind for kind in dict.fromkeys((*ORDER, *parts("artifact"))) if kind in kinds and kind_of(kind).command]
-    return [kind for kind in made if sees or kind not in SEEING]
+    return [kind for kind in made if (sees or kind not in SEEING) and (played or kind != "certificate")]
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
