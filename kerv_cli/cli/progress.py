@@ -37,9 +37,7 @@ class ProgressDisplay:
         self._episodes = self._ended = 0  # episodes, of all cells and of the finished ones
         self._began = self._logged = 0.0
         self._running: dict[str, Block] = {}  # by name, without their ended cells
-        self._parts: dict[
-            str, float
-        ] = {}  # of unfinished cells, by id: their episodes, with the share of one that runs
+        self._parts: dict[str, float] = {}  # of unfinished cells, by id: episodes, one of them in part
 
     def __enter__(self) -> ProgressDisplay:
         return self
