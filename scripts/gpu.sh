@@ -59,7 +59,7 @@ step() {
 
 skip() { printf '%s\tskipped: %s\n' "$1" "$2" | tee -a "$OUT/steps.tsv"; }
 
-kerv() { local name=$1 most=$2; shift 2; step "$name" "$most" "$PYTHON" -m kerv_cli.cli.app "$@" "results=$OUT" "runtime.device=$DEVICE"; }
+kerv() { local name=$1 most=$2; shift 2; step "$name" "$most" "$PYTHON" -m kerv_cli "$@" "results=$OUT" "runtime.device=$DEVICE"; }
 
 missing=$("$PYTHON" - <<'PY'
 import importlib.util as found
@@ -88,7 +88,7 @@ if [ -d "$STUDY" ]; then
     # under a name of its own: the sweep below makes a study named main
     ln -sfn "$(cd "$STUDY" && pwd)" "$OUT/studies/recorded"
     profile=$(ls "$OUT/bench/$SCALE"-*.json 2>/dev/null | head -1)
-    step price 240 "$PYTHON" -m kerv_cli.cli.app report study=recorded "on=$profile" "results=$OUT"
+    step price 240 "$PYTHON" -m kerv_cli report study=recorded "on=$profile" "results=$OUT"
     rm -f "$OUT/studies/recorded"
 else
     skip price "no study in $STUDY: run 'kerv sweep study=main', or set STUDY"

@@ -7,8 +7,10 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pandas as pd
@@ -30,7 +32,7 @@ def kerv(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 def process(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
     """The command as a shell starts it."""
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *arguments]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, **env})
 
 
@@ -64,7 +66,7 @@ def test_help_is_fast(words: list[str]) -> None:
 
     typer = min(seconds([sys.executable, "-c", "import typer"]) for _ in range(3))
     # half a second on an idle machine; a loaded one is judged against the import of typer alone
-    asked = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words, "--help"]
+    asked = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *words, "--help"]
     assert min(seconds(asked) for _ in range(5)) < max(0.5, 6 * typer)
 
 
@@ -299,7 +301,7 @@ def test_bash_completes_behind_an_equals_sign_without_a_start_up_file(tmp_path: 
     assert run.stdout.split() == ["spec_vla", "spec_vla_paper"], run.stderr
 
 
-BE_KERV = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.cli.app import main; main()"
+BE_KERV = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.__main__ import main; main()"
 
 
 def test_doctor_repair_removes_what_a_killed_command_left(tmp_path: Path) -> None:
@@ -326,3 +328,36 @@ def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
     run = kerv("rollout", "--plan", "method=ar", "acceptance=relaxed", *words)
     assert run.returncode == 0
     assert run.stderr == "note: acceptance=relaxed has no effect: method ar drafts nothing\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("late", [False, True])
+def test_an_interrupted_command_says_so_in_one_line(
+    number: signal.Signals, late: bool, policies: Path, tmp_path: Path
+) -> None:
+    words = ["rollout", "task=reach", "episodes=50", "policy.target=nano-vision", f"results={tmp_path}/results"]
+    shutil.copytree(policies, tmp_path / "results")
+    # as early as there is a process of ours: the line says that it is
+    code = "import kerv_cli.__main__ as it; print(flush=True); it.main()"
+    begun = subprocess.Popen(
+        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert begun.stdout is not None
+    assert begun.stderr is not None
+    begun.stdout.readline()
+    if late:
+        assert begun.stderr.readline() == "ar of nano-vision on reach-v3: 50 episodes\n"
+    time.sleep(0.2)
+    begun.send_signal(number)
+    _, errors = begun.communicate(timeout=120)
+    assert begun.returncode == 130, errors
+    (line,) = errors.splitlines()
+    assert line.startswith("kerv: interrupted")
+
+
+def test_the_question_of_runs_rm_ends_in_one_line(policies: Path) -> None:
+    run = kerv("runs", "rm", "target/nano-state", f"results={policies}")  # nobody answers
+    assert run.returncode == 130
+    assert run.stderr.splitlines()[-1] == "kerv: nothing is removed; --yes asks no question"
+    assert (policies / "artifacts/target/nano-state").is_dir()

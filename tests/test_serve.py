@@ -279,7 +279,7 @@ def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path)
     words = ["serve", "policy.target=nano-state", f"results={policies}", "port=0"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen([sys.executable, "-m", "kerv_cli.cli.app", *words], stderr=log, env=environment)
+        process = subprocess.Popen([sys.executable, "-m", "kerv_cli", *words], stderr=log, env=environment)
         try:
             until_slow = time.monotonic() + 60
             while "listens on" not in (said := (tmp_path / "log").read_text()) and time.monotonic() < until_slow:

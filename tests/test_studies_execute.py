@@ -295,7 +295,7 @@ def test_progress_on_a_terminal_is_a_bar_that_goes_away(store: StudyStore) -> No
     written = io.StringIO()
     with ProgressDisplay(Console(file=written, width=100, force_terminal=True)) as display:
         execute(threshold_study(["reach-v3"]), run_cell, store, on_event=display)
-    assert "4/4" in written.getvalue()
+    assert "16/16 episodes" in written.getvalue()  # cells of a block end together
     assert written.getvalue().count("\x1b[?25h") == 1  # the cursor is shown again
 
 

@@ -275,7 +275,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
     settings += ["train.batch=4", "train.validate_every=4", "train.steps=16"]
     train(results, "target", "name=whole", *settings)
     words = ["train", "target", "name=cut", *settings, f"results={results}", "demos=few"]
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *words]
+    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *words]
     killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = results / "artifacts/target/cut"
     deadline = time.monotonic() + 100

@@ -387,8 +387,10 @@ def spoken(command: str) -> str:
 
 
 def _task_list(word: str) -> str:
-    """Adds the brackets that `task=reach` and `task=reach,push` leave out."""
+    """Adds the brackets that `task=reach` and `task=reach,push` leave out. Raises UsageError: no task at all."""
     key, value = word.split("=", 1)
+    if key == "task" and value.strip("[] ") == "":
+        raise UsageError("name at least one task or suite: task=NAME, or leave it out")
     return f"task=[{value}]" if key == "task" and not value.startswith("[") else word
 
 

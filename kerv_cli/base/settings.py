@@ -145,9 +145,11 @@ class RunSettings(CommandSettings):
 class TaskSettings(RunSettings):
     """Settings of every command that works on tasks."""
 
-    task: list[str] = setting(["MT10"], "tasks and suites: reach, drawer-open, MT10, …")
+    task: list[str] = setting([], "tasks and suites: reach, drawer-open, MT10, …; empty: those that the target knows")
 
 
+DEFAULT_TASKS = ["MT10"]
+"""Where neither a word nor a target names any."""
 MODEL, EXPERT = "model", "expert"
 _GONE_WITH_THE_GATE = ("risk", "score")
 """Settings of a policy that commit 72e42ef still had (docs/methods.md §4.6); stored settings have them."""
@@ -177,6 +179,7 @@ class PolicySettings:
 # descriptions of settings that several commands have
 POLICY = "what chooses the actions: vision, state, expert, … (conf/policy)"
 DEMOS = "demonstrations, by name"
+TARGET_DEMOS = f"{DEMOS}; empty: those that the target was trained on"
 STARTS = "half: of every task, the episodes that begin on one side"
 FIRST_EPISODES = "per task, the first ones by seed; 0: all"
 
@@ -328,7 +331,8 @@ class TrainTargetSettings(TaskSettings):
     groups: ClassVar = {"target": "small", "train": "target", "world": "default", "runtime": "auto"}
 
     name: str = setting("mt10-vision", "folder below <results>/artifacts/target, or a path")
-    demos: str = setting("mt10", DEMOS)
+    task: list[str] = setting([], "tasks and suites; empty: those of the demonstrations")
+    demos: str = setting("", f"{DEMOS}; empty: those that `kerv demos` makes of the same tasks")
     target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, small, base, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
@@ -340,6 +344,7 @@ class DemosSettings(MethodSettings, TaskSettings):
 
     groups: ClassVar = {"policy": "expert", "world": "default", "runtime": "workers", "method": "ar"}
 
+    task: list[str] = setting(DEFAULT_TASKS, "tasks and suites: reach, drawer-open, MT10, …")
     name: str | None = setting(None, "default: the tasks' names, in small letters")
     episodes: int = number(100, 1, 100_000, help="episodes per task")
     seed: int = number(0, 0, 2**31 - 1, help="first seed")
@@ -380,11 +385,24 @@ class TrainDrafterSettings(RunSettings):
     groups: ClassVar = {"policy": "vision", "cover": "all", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
-    demos: str = setting("mt10", DEMOS)
-    task: list[str] = setting([], "tasks and suites whose demonstrations are used; empty: all")
+    demos: str = setting("", TARGET_DEMOS)
+    task: list[str] = setting([], "tasks and suites whose demonstrations are used; empty: those that the target knows")
     starts: str = choice("all", "all", "half", help=STARTS)
     drafter: Any = setting(chosen("drafter", "eagle"), "its shapes and loss: eagle, early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
+
+
+@dataclass
+class PrepareSettings(RunSettings):
+    """`kerv prepare`: everything that methods need of policy.target."""
+
+    groups: ClassVar = {"policy": "vision", "runtime": "auto"}
+
+    policy: PolicySettings = setting(PolicySettings, POLICY)
+    methods: list[str] = setting([], "their names; empty: all")
+    demos: str = setting("", TARGET_DEMOS)
+    task: list[str] = setting([], "tasks and suites; empty: those that the target knows")
+    steps: int = number(0, 0, 10**9, help="optimisation steps of each drafter; 0: those of kerv train drafter")
 
 
 @dataclass
@@ -474,7 +492,7 @@ class BuildDatastoreSettings(TaskSettings):
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: datastore/ beside the target")
-    demos: str = setting("mt10", DEMOS)
+    demos: str = setting("", TARGET_DEMOS)
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     starts: str = choice("all", "all", "half", help=STARTS)
     stride: int = number(1, 1, 10_000, help="every so many of an episode's observations become entries")
@@ -491,7 +509,7 @@ class CalibrateSettings(TaskSettings):
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: beside the target")
-    demos: str = setting("mt10", DEMOS)
+    demos: str = setting("", TARGET_DEMOS)
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes that the errors are measured on")
     # labels: clean; executed: noisy in perturbed episodes

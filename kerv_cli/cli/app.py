@@ -16,7 +16,7 @@ from kerv_cli.cli.common import one_line_errors
 
 # kerv's own commands register themselves, in the order of the help
 # isort: off
-from kerv_cli.cli import demos, train, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
+from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, serve, report, runs, view  # noqa: F401
 from kerv_cli.cli import bench, doctor, completion  # noqa: F401
 # isort: on
 
@@ -129,13 +129,9 @@ def kerv(
 
 
 def main() -> None:
-    """Entry point of the `kerv` script."""
+    """Runs the command line."""
     if "_KERV_COMPLETE" in os.environ:  # a shell asks; typer registers its shells with add_completion only
         from typer._completion_classes import completion_init
 
         completion_init()
     app()
-
-
-if __name__ == "__main__":
-    main()

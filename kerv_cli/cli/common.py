@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from kerv_cli.base.errors import KervError
+from kerv_cli.base.errors import Interrupted, KervError
 
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
@@ -71,7 +71,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
             raise
         _refuse(error.format_message(), error.exit_code, error)
     except KeyboardInterrupt:
-        _refuse("interrupted", 130, None)
+        _refuse("interrupted", Interrupted.exit_code, None)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
@@ -88,8 +88,9 @@ _MOST_SHOWN = 2000
 _QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
 _CARRIED = {
     "results": None,  # None: every command takes it
-    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter"),
-    "demos": ("train target", "train drafter", "calibrate", "build datastore"),
+    "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter", "prepare"),
+    "demos": ("train target", "train drafter", "calibrate", "build datastore", "prepare"),
+    "for": ("prepare",),
 }
 """Settings of the present command that a command in its messages needs too -> the commands that take them."""
 
@@ -100,8 +101,10 @@ def runnable(message: str, words: Sequence[str]) -> str:
 
     def completed(match: re.Match[str]) -> str:
         quote, name, rest = match.groups()
+        # what a rollout's method needs
+        given = [re.sub("^method=", "for=", word) for word in words] if name == "prepare" else words
         keys = {word.split("=", 1)[0] for word in shlex.split(rest)}
-        carried = [shlex.quote(word) for word in words if _carries(word, name) and word.split("=", 1)[0] not in keys]
+        carried = [shlex.quote(word) for word in given if _carries(word, name) and word.split("=", 1)[0] not in keys]
         return f"{quote}{' '.join([called(), name, *rest.split(), *carried])}{quote}"
 
     return _QUOTED.sub(completed, message)
@@ -121,6 +124,9 @@ def in_same(words: Iterable[str]) -> str:
 def _refuse(message: str, code: int, error: BaseException | None) -> None:
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
+    if code == Interrupted.exit_code:
+        # objects in the making cannot clean up behind themselves, e.g. a GL context: no news to the user
+        sys.unraisablehook = lambda unraisable: None
     message = " ".join(message.split())
     if len(message) > _MOST_SHOWN:  # a word of the command line, which the user has seen
         message = f"{message[: _MOST_SHOWN // 2]} … {message[-_MOST_SHOWN // 2 :]}"
@@ -143,6 +149,7 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
         yield lambda done, total, text="": None
         return
     if not sys.stderr.isatty():
+        typer.echo(f"{title} …", err=True)
         yield _plain_lines(title)
         return
     from rich.progress import (

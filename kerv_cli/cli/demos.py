@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     """Record successful expert episodes, plain and perturbed, as a dataset; with policy=vision the states that a policy
     visits by its method, labelled by the expert."""
+    from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds import resolve_tasks, spec_of
 
     tasks = resolve_tasks(settings.task)
-    folder = artifact(settings.results, "demos", settings.name or "-".join(settings.task).lower())
+    folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     if plan:
         steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
         minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from types import TracebackType
 
 from rich.console import Console
@@ -19,18 +20,24 @@ from rich.progress import (
 from kerv_cli.lab import events
 from kerv_cli.lab.plan import Block, Cell
 
+LOG_SECONDS = 30.0
+"""Between two lines of progress where the output is no terminal."""
+
 
 class ProgressDisplay:
-    """The `on_event` callback of `execute`; a context manager that ends the bar. The bar counts cells; where episodes
-    run in this process, `on_step` moves it within a cell and within an episode too."""
+    """The `on_event` callback of `execute`; a context manager that ends the bar. The bar counts episodes, because the
+    cells of a block end together; where episodes run in this process, `on_step` moves it within a cell and within an
+    episode too."""
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self._bar: Progress | None = None
         self._task = TaskID(0)
-        self._total = self._finished = 0
+        self._total = self._finished = 0  # cells
+        self._episodes = self._ended = 0  # episodes, of all cells and of the finished ones
+        self._began = self._logged = 0.0
         self._running: dict[str, Block] = {}  # by name, without their ended cells
-        self._parts: dict[str, float] = {}  # of unfinished cells, by id: the share of their control steps
+        self._parts: dict[str, float] = {}  # of unfinished cells, by id: episodes, one of them in part
 
     def __enter__(self) -> ProgressDisplay:
         return self
@@ -59,16 +66,29 @@ class ProgressDisplay:
 
     def on_step(self, cell: Cell, seed: int, step: int) -> None:
         """Shows that `step` control steps of a seed's episode were executed; at most one episode runs at a time."""
-        if self._bar is None:
-            return
         horizon, seeds = int(cell.settings["world"]["horizon"]), list(cell.seeds)
         # half an episode's share for a step at half the horizon: successful episodes end early and then jump
-        self._parts[cell.id] = (seeds.index(seed) + min(1.0, step / max(1, horizon))) / len(seeds)
+        self._parts[cell.id] = seeds.index(seed) + min(1.0, step / max(1, horizon))
         now = f"{escape(cell.label)} on {cell.task}, seed {seed}: step {step}"
-        self._bar.update(self._task, completed=self._finished + sum(self._parts.values()), description=now)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self._done, count=self._count, description=now)
+        elif time.monotonic() - self._logged > LOG_SECONDS:
+            self._logged = time.monotonic()
+            left = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
+            self.console.print(f"{self._count}, about {left / 60:.0f} min left; {now}", soft_wrap=True, highlight=False)
+
+    @property
+    def _done(self) -> float:
+        return self._ended + sum(self._parts.values())
+
+    @property
+    def _count(self) -> str:
+        return f"{int(self._done)}/{self._episodes} episodes"
 
     def _start(self, event: events.SweepStarted) -> None:
         self._total, self._finished = event.total, 0
+        self._episodes, self._ended = event.episodes, 0
+        self._began = self._logged = time.monotonic()
         self._parts.clear()
         if self._bar is not None:
             self._bar.stop()
@@ -86,7 +106,7 @@ class ProgressDisplay:
             TimeRemainingColumn(),
         )
         self._bar = Progress(*columns, console=self.console, transient=True)
-        self._task = self._bar.add_task("preparing", total=event.total, count=f"0/{event.total}")
+        self._task = self._bar.add_task("preparing", total=event.episodes, count=self._count)
         self._bar.start()
 
     def _finish(self, cell: Cell, result: str) -> None:
@@ -97,6 +117,7 @@ class ProgressDisplay:
             else:
                 self._running[name] = left
         self._finished += 1
+        self._ended += len(cell.seeds)
         self._parts.pop(cell.id, None)
         count = f"[dim]{self._finished:{len(str(self._total))}}/{self._total}[/dim]"
         alone = f", seed {cell.seeds[0]}" if len(cell.seeds) == 1 else ""
@@ -109,9 +130,7 @@ class ProgressDisplay:
         names = [block.title for block in self._running.values()]
         more = f" +{len(names) - 1}" if len(names) > 1 else ""
         now = escape(names[0] + more if names else "cells")
-        done = self._finished + sum(self._parts.values())
-        count = f"{self._finished}/{self._total}"
-        self._bar.update(self._task, completed=done, description=now, count=count)
+        self._bar.update(self._task, completed=self._done, description=now, count=self._count)
 
 
 def _result(event: events.CellDone) -> str:

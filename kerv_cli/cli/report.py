@@ -19,6 +19,7 @@ Publish = Annotated[
 ]
 
 
+Files = Annotated[bool, typer.Option("--files", help="List every file that was written.")]
 Choose = Annotated[
     bool, typer.Option("--choose", help="Say which setting to take: the Pareto front, and the fastest safe one.")
 ]
@@ -44,6 +45,7 @@ def report(
     words: list[str],
     publish: Publish = False,
     choose: Choose = False,
+    files: Files = False,
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
@@ -51,7 +53,7 @@ def report(
 
     settings.only = settings.only and study_name(settings.only)
     from kerv_cli.base.places import results_dir
-    from kerv_cli.cli.sweep import tell_table
+    from kerv_cli.cli.sweep import tell_end, tell_table
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
     from kerv_cli.report.reprice import ASSUMES, repriced_summary
@@ -71,8 +73,12 @@ def report(
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
-    for path in output.files:
+    for path in output.files if files or not output.tables else ():
         typer.echo(str(path))
+    for name, table in output.tables.items():
+        if settings.only is None:
+            typer.echo(name)
+        tell_end(table, StudyStore(results_dir(settings.results), name), settings.loss)
 
 
 def _choose(settings: ReportSettings, as_json: bool) -> None:

@@ -96,7 +96,13 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
     from kerv_cli.worlds import resolve_tasks
 
     study = resolved.study
-    tasks = resolve_tasks(next(iter(resolved.settings.values())).task)
+    first = next(iter(resolved.settings.values()))
+    tasks = resolve_tasks(first.task)
+    # before anything heavy loads
+    what = next(iter(resolved.settings)) if len(resolved.settings) == 1 else f"{len(resolved.settings)} settings"
+    where = ", ".join(tasks) if len(tasks) < 4 else f"{len(tasks)} tasks"
+    count = len(resolved.settings) * len(tasks) * first.episodes * study.repeats
+    typer.echo(f"{what} of {first.policy.target} on {where}: {count} episodes", err=True)
     with at_work("loading the policy"):
         from kerv_cli.base.runtime import set_up
         from kerv_cli.lab.plan import plan as plan_cells

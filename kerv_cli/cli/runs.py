@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
@@ -238,7 +238,12 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
         check_removable(run)
     total = sum(disk_bytes(run.folder) for run in runs)
     what = f"{', '.join(run.id for run in runs)} ({total / 1e6:.1f} MB)"
-    if not yes and not typer.confirm(f"remove {what}?"):
+    try:
+        sure = yes or typer.confirm(f"remove {what}?", err=True)
+    except typer.Abort:  # Ctrl-C, or nobody to ask
+        typer.echo(err=True)
+        raise Interrupted("nothing is removed; --yes asks no question") from None
+    if not sure:
         raise typer.Exit(1)
     for run in runs:
         remove(run)

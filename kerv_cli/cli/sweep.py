@@ -13,9 +13,9 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
+    at_work,
     called,
     console,
-    in_same,
     print_json,
     print_notes,
     print_table,
@@ -101,14 +101,14 @@ def _list_studies(as_json: bool) -> None:
     from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
     from kerv_cli.base.files import read_yaml_file
     from kerv_cli.base.manifests import read
-    from kerv_cli.worlds import resolve_tasks
+    from kerv_cli.lab.resolve import tasks_of
 
     rows, composer = [], Composer("rollout", RolloutSettings)
     for name in groups()["study"]:
         path = conf_dir() / "study" / f"{name}.yaml"
         study = read(StudySettings, {"name": name, **read_yaml_file(path)}, str(path))
         common = composer.compose(split_words(study.common))
-        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(resolve_tasks(common.task))
+        settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(tasks_of(common))
         rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
     columns = ("study", "settings", "tasks", "episodes", "in all", "")
     if as_json:
@@ -237,6 +237,18 @@ def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
         typer.echo(f"\n{note}\n")
 
 
+def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
+    """Prints the last three lines of a study: the verdict, the page to open, the recording to watch."""
+    from kerv_cli.report.decide import choices, sentence
+
+    if (table["label"] != table["baseline"]).any():
+        typer.echo(f"verdict: {sentence(choices(table, None, loss)[0], loss, str(table['baseline'].iloc[0]))}")
+    typer.echo(f"page: {store.root / 'report.html'}")
+    recordings = sorted(store.rollouts.glob("*.rrd"))
+    if recordings:
+        typer.echo(f"watch: {called()} view {recordings[0]}")
+
+
 def _tell(
     outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
 ) -> None:
@@ -256,14 +268,13 @@ def _tell(
         episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
         if episodes and minutes:
             typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
-        typer.echo(
-            f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed; "
-            f"tables and plots: {called()} report study={store.name}{in_same(words)}"
-        )
-        if recordings:
-            typer.echo(
-                f"{len(recordings)} rollouts in {store.rollouts}; open one with: {called()} view {recordings[0]}"
-            )
+        typer.echo(f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed")
+        if table is not None and not outcome.failed:
+            with at_work("writing the page"):
+                from kerv_cli.report.report import report
+
+                report(store.root.parent.parent, store.name)
+            tell_end(table, store, resolved.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 )
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Behaviour-clone the target on demonstrations."""
+    typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.runs import TargetRun
 
     run_training(TargetRun(settings), plan, as_json, "reading demonstrations", "training the target")
@@ -41,6 +42,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 )
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter, or with drafter=early the early one, on the target's own greedy decodes."""
+    typer.echo(f"{settings.drafter.kind} drafter of {settings.policy.target}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.runs import drafter_run
 
     run_training(drafter_run(settings), plan, as_json, "the target's greedy decodes", "training the drafter")

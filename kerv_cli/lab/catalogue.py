@@ -205,6 +205,11 @@ def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
             yield _artifact(path, kind)
 
 
+def state_of(folder: Path, kind: str) -> str:
+    """The `state` of the artifact in a folder."""
+    return _artifact(folder, kind).state
+
+
 def _artifact(folder: Path, kind: str) -> RunEntry:
     changed = max((_changed(path) for path in visible(folder) if path.is_file()), default="")
     run = RunEntry(f"{kind}/{folder.name}", kind, folder, changed, "damaged")

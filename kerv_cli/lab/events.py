@@ -28,11 +28,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class SweepStarted:
-    """The sweep begins. total: cells to run. workers: blocks that run at the same time."""
+    """The sweep begins. total: cells to run. workers: blocks that run at the same time. episodes: of those cells."""
 
     total: int
     reused: int
     workers: int
+    episodes: int
 
 
 @dataclass(frozen=True)

@@ -104,8 +104,10 @@ def execute(
     blocks, damaged = sweep.split(cells)
     threads = max((cell.settings["runtime"]["threads"] for cell in cells), default=1)
     executor = open_executor(runtime, threads, store.jobs) if blocks else None
-    total = sum(len(block.cells) for block in blocks) + len(damaged)
-    on_event(events.SweepStarted(total, len(sweep.outcome.reused), runtime.workers))
+    to_run = [cell for block in blocks for cell in block.cells]
+    episodes = sum(len(cell.seeds) for cell in to_run)
+    total = len(to_run) + len(damaged)
+    on_event(events.SweepStarted(total, len(sweep.outcome.reused), runtime.workers, episodes))
     for cell, result in damaged:
         sweep.note(cell, result)
     if executor is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,9 +21,10 @@ from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder, Watcher
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
+from kerv_cli.lab.resolve import known_tasks, tasks_of
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
-from kerv_cli.worlds import resolve_tasks, spec_of
+from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.stress import check as check_stress
 
@@ -46,14 +47,8 @@ def is_expert(settings: RolloutSettings) -> bool:
 
 def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
     """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
-    if is_expert(settings):
-        return []
-    training = artifacts_of(settings).description.provenance.get("settings")
-    names = training.get("task") if isinstance(training, Mapping) else None
-    if not names or not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        return []
-    trained_on = set(resolve_tasks(names))
-    return [task for task in tasks if task not in trained_on]
+    trained_on = known_tasks(settings)
+    return [task for task in tasks if trained_on and task not in trained_on]
 
 
 def check(settings: RolloutSettings) -> dict[str, str]:
@@ -65,7 +60,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
             not belong together.
         CheckpointError: no such policy, a damaged one, an artifact of another target or another action space.
     """
-    tasks = resolve_tasks(settings.task)
+    tasks = tasks_of(settings)
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     check_stress(settings.world.stress, spec)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,11 @@ from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.manifests import read
+from kerv_cli.base.places import find_target
 from kerv_cli.base.registry import METHOD_KINDS
-from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.base.settings import DEFAULT_TASKS, EXPERT, RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.lab.identity import without_effect
+from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 EPISODES_PER_CELL = 1
@@ -68,8 +70,10 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
         )
     composer = Composer("rollout", RolloutSettings)
     settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
-    for setting in settings.values():
-        setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
+    first = settings[sweep.study.baseline]
+    if any(key.startswith("policy") for key in keys) and not keys & {"task", "cover"}:
+        _narrow(settings.values(), first)
+    _settle(settings.values(), first)
     texts = {label: " ".join(words) for label, words in points.items()}
     return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, sweep.rerun, tuple(theirs))
 
@@ -91,14 +95,56 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     texts: dict[str, str] = {}
     for point in expand(words) if multirun else [words]:
         composed = compose("rollout", [*shared, *point], RolloutSettings)
-        composed.world = settled(composed.world, spec_of(resolve_tasks(composed.task)[0]))
         values = _varied_values(point, varied)
         parts = [word for word in point if _key(word) in METHOD_KINDS and _key(word) not in varied]
         label = check_label(" ".join([composed.method, *parts, *values]))
         settings[label], texts[label] = composed, " ".join(point)
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
+    _settle(settings.values(), settings[baseline])
     study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
     return ResolvedStudy(study, settings, texts)
+
+
+def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
+    """Full names of a rollout's tasks; of tasks that are not named those that the target was trained on.
+
+    Raises:
+        UnknownName: no such task. CheckpointError: the target's description is damaged.
+    """
+    return resolve_tasks(settings.task or list(known_tasks(settings)) or DEFAULT_TASKS)
+
+
+def known_tasks(settings: RolloutSettings) -> tuple[str, ...]:
+    """Full names of the tasks that a rollout's target was trained on; none of the expert, and where it does not say or
+    is not there, which `policy.check` refuses.
+
+    Raises:
+        CheckpointError: its description is damaged.
+    """
+    if settings.policy.kind == EXPERT:
+        return ()
+    try:
+        folder = find_target(settings.results, settings.policy.target)
+    except UsageError:
+        return ()
+    names = described(folder, "target", TargetDescription).tasks
+    return resolve_tasks(names) if names else ()
+
+
+def _narrow(settings: Iterable[RolloutSettings], first: RolloutSettings) -> None:
+    """Of a study's tasks, for a policy that the command line names: those that the target of `first` was trained on,
+    or where that are none, all that it was trained on."""
+    known = known_tasks(first)
+    chosen = [task for task in tasks_of(first) if task in known] or list(known)
+    for setting in settings:
+        setting.task = chosen or setting.task
+
+
+def _settle(settings: Iterable[RolloutSettings], first: RolloutSettings) -> None:
+    """Fills what the settings leave open: tasks, all those of `first`, camera and horizon."""
+    for setting in settings:
+        setting.task = setting.task or list(tasks_of(first))
+        setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
 
 
 def _is_ar(settings: RolloutSettings) -> bool:

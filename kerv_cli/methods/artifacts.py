@@ -4,6 +4,7 @@ however many settings of a study share them."""
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,6 +92,12 @@ class Artifact(Generic[T]):
     made = "trained"
     again: str
     schema: type[T]
+
+    @property
+    def command(self) -> tuple[str, ...]:
+        """Words behind `kerv` that make one, as the remedy names them; none where it names no command."""
+        quoted = re.search(r"'kerv ([^']+)'", self.again)
+        return tuple(quoted[1].split()) if quoted else ()
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
         """Its path; name None: the one beside the target in the folder `target`."""
@@ -242,6 +249,9 @@ class Artifacts:
             if kind in hashes:
                 continue
             files, path = kind_of(kind), self.path(kind)
+            if files.command and not files.json(path).is_file():
+                remedy = f"run 'kerv prepare policy.target={self.policy.target}'"
+                raise CheckpointError(f"no {files.noun} in {path}: {remedy}, or name a folder that holds one")
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             todo += files.brings(description)

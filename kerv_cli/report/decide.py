@@ -56,15 +56,16 @@ class Choice:
         return {**asdict(self), "front": ";".join(self.front)}
 
 
-def choices(study: pd.DataFrame, per_task: pd.DataFrame, loss: float) -> list[Choice]:
+def choices(study: pd.DataFrame, per_task: pd.DataFrame | None, loss: float) -> list[Choice]:
     """The suite's choice, then each task's.
 
     Args:
-        study, per_task: the tables of `tables.study_table` and `tables.per_task_table`.
+        study, per_task: the tables of `tables.study_table` and `tables.per_task_table`; None: the suite alone.
         loss: bound on the loss of success, points.
     """
     suite = rows_of(study, MICRO)
-    tasks = {str(task): rows_of(rows) for task, rows in per_task.groupby("task", sort=True)}
+    groups = () if per_task is None else per_task.groupby("task", sort=True)
+    tasks = {str(task): rows_of(rows) for task, rows in groups}
     return [_choice(where, rows, loss) for where, rows in {"all tasks": suite, **tasks}.items()]
 
 

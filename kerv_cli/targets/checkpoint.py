@@ -67,6 +67,22 @@ class TargetDescription(Description):
         """Whether it decodes all tokens of a chunk at once, and only so."""
         return bool(self.settings.get("parallel"))
 
+    @property
+    def tasks(self) -> list[str]:
+        """Tasks and suites that it was trained on; empty where its provenance does not say."""
+        names = self._trained_with("task")
+        return names if isinstance(names, list) and all(isinstance(name, str) for name in names) else []
+
+    @property
+    def demos(self) -> str:
+        """Name of the demonstrations that it was trained on; empty where its provenance does not say."""
+        name = self._trained_with("demos")
+        return name if isinstance(name, str) else ""
+
+    def _trained_with(self, key: str) -> Any:
+        training = self.provenance.get("settings")
+        return training.get(key) if isinstance(training, Mapping) else None
+
     def check_world(self, name: str, environment: str, actions: ActionSpace, size: int) -> None:
         """Refuses a world that the target, called `name`, was not made for. actions, size: the environment's action
         space, and the pixels of the frames that it would be shown.

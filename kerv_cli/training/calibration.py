@@ -29,7 +29,7 @@ from kerv_cli.methods.calibration import (
 )
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.training.demonstrations import open_demos
+from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.observations import check_frames, check_shown, instruction_of
 from kerv_cli.training.predictor_fit import (
     Windows,
@@ -105,8 +105,8 @@ class CalibrationRun:
 
     def __init__(self, settings: CalibrateSettings) -> None:
         self.settings = settings
-        self.dataset = open_demos(settings.results, settings.demos)
-        self.tasks = resolve_tasks(settings.task)
+        self.dataset = demos_for(settings)
+        self.tasks = resolve_tasks(settings.task or list(self.dataset.manifest.tasks))
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.description = self.artifacts.description
         self.description.check_autoregressive("kerv calibrate", "there is no draft to calibrate")

@@ -2,17 +2,73 @@
 
 from __future__ import annotations
 
-from kerv_cli.base.places import artifact
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.places import artifact, find_target, results_dir
+from kerv_cli.base.settings import DEFAULT_TASKS, PolicySettings
+from kerv_cli.targets.checkpoint import TargetDescription, described
+from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 
-def open_demos(results: str, names: str) -> DemoDataset:
+class OfTarget(Protocol):
+    """Settings of what is made for a target from demonstrations."""
+
+    results: str
+    policy: PolicySettings
+    demos: str
+    task: list[str]
+
+
+def name_of(tasks: Sequence[str]) -> str:
+    """The name of demonstrations of these tasks and suites, where none is given."""
+    return "-".join(tasks or DEFAULT_TASKS).lower()
+
+
+def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: int = 0) -> DemoDataset:
     """The dataset of that name; several, e.g. `mt50+mt50-dagger`, are joined in that order. A folder of that very
-    name comes first.
+    name comes first. tasks, episodes: for the command that records what is missing; none and 0: its defaults.
 
     Raises:
         UsageError: no folder name. CheckpointError: one is missing, unfinished or damaged, or they do not add up.
     """
     whole = artifact(results, "demos", names)
     folders = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
+    for folder in folders:
+        if not folder.is_dir():
+            raise CheckpointError(f"no demonstrations in {folder}: {_remedy(results, folder, tasks, episodes)}")
     return DemoDataset.joined([DemoDataset.open(folder) for folder in folders])
+
+
+def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> str:
+    name = [] if folder.name == name_of(tasks) else [f"name={folder.name}"]
+    task = [f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]"] if tasks else []
+    words = [*name, *task, *([f"episodes={episodes}"] if episodes else [])]
+    there = sorted(path.parent.name for path in (results_dir(results) / "artifacts/demos").glob("*/manifest.json"))
+    others = f", or name others: demos={' or demos='.join(there)}" if there else ""
+    return f"record them with '{' '.join(['kerv demos', *words])}'{others}"
+
+
+def demos_for(settings: OfTarget) -> DemoDataset:
+    """The demonstrations that something is made from for a target: those that it was trained on, where none are named.
+    Fills what the settings leave open: their name, and, where they have tasks that the target does not know, the tasks
+    that it does; no task stands for all.
+
+    Raises:
+        UsageError: no such target. CheckpointError: as `open_demos`.
+    """
+    folder = find_target(settings.results, settings.policy.target)
+    target = described(folder, "target", TargetDescription)
+    tasks = settings.task or target.tasks
+    recorded = target.provenance.get("demos") if not settings.demos else None
+    config = recorded.get("config") if isinstance(recorded, dict) else None
+    episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
+    settings.demos = settings.demos or target.demos or name_of(())
+    dataset = open_demos(settings.results, settings.demos, tasks, episodes)
+    known = resolve_tasks(target.tasks) if target.tasks and not settings.task else ()
+    if set(dataset.manifest.tasks) - set(known):
+        settings.task = settings.task or [task for task in dataset.manifest.tasks if task in known]
+    return dataset

@@ -24,7 +24,7 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.coverage import subset
-from kerv_cli.training.demonstrations import open_demos
+from kerv_cli.training.demonstrations import demos_for, name_of, open_demos
 from kerv_cli.training.imitation import (
     Imitation,
     Samples,
@@ -141,6 +141,9 @@ class TargetRun(Run):
 
     def __init__(self, settings: TrainTargetSettings) -> None:
         self.settings = settings
+        settings.demos = settings.demos or name_of(settings.task)
+        self.dataset = open_demos(settings.results, settings.demos, settings.task)
+        settings.task = settings.task or list(self.dataset.manifest.tasks)
         self.tasks = resolve_tasks(settings.task)
         self.spec = spec_of(self.tasks[0])
         self.world = settled(settings.world, self.spec)
@@ -151,7 +154,6 @@ class TargetRun(Run):
             )
         self.folder = artifact(settings.results, "target", settings.name)
         self.init = self.find_init()
-        self.dataset = open_demos(settings.results, settings.demos)
         self.check_demos()
         self.samples: Samples | None = None
         self.init_target: CompactTarget | None = None
@@ -283,8 +285,7 @@ class DrafterRun(Run):
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
-        dataset = open_demos(settings.results, settings.demos)
-        self.dataset = subset(dataset, settings.task, settings.starts)
+        self.dataset = subset(demos_for(settings), settings.task, settings.starts)
         description = read_target(self.target_folder)
         check_shown(self.dataset, description)
         description.check_autoregressive(

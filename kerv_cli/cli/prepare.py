@@ -1,0 +1,66 @@
+"""`kerv prepare`: everything that methods need of a target, in order."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+
+import typer
+
+from kerv_cli.base.registry import parts
+from kerv_cli.base.settings import PrepareSettings
+from kerv_cli.cli.command import command, typer_command
+from kerv_cli.cli.common import ShowPlan, called, in_same, print_table
+
+OWN = ("for", "steps")
+"""Settings that the steps do not take; those of demonstrations are for all but the certificate."""
+
+
+@command(
+    "prepare",
+    PrepareSettings,
+    keys="policy.target for demos task steps runtime.device results",
+    examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine for=one_pass,kerv --plan"),
+    typed={"for": "methods"},
+    lists=("methods",),
+)
+def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False) -> None:
+    """Make everything that methods need of a target, in order: drafters, datastore, calibration, certificate. What is
+    there is skipped; the same command goes on where it was interrupted."""
+    from kerv_cli.training.preparation import THERE, Step
+    from kerv_cli.training.preparation import plan as planned
+
+    def line(step: Step) -> str:
+        """The step's command, as it can be typed alone."""
+        shared = [word for word in words if word.split("=")[0] not in OWN]
+        if step.command[-1] == "success":
+            shared = [word for word in shared if not word.startswith("demos=")]
+        return shlex.join([*step.command, *shared])
+
+    steps, name = planned(settings), settings.policy.target
+    rows = [(s.kind, s.state, _minutes(s.seconds) if s.seconds else "", f"{called()} {line(s)}") for s in steps]
+    title = f"{name}, about {_minutes(sum(step.seconds for step in steps))} (a guess)"
+    print_table(("what", "state", "about", "command"), rows, title)
+    if plan:
+        return
+    for kind in [step.kind for step in steps]:
+        # read anew: what was just made decides whether what is made from it is still good
+        step = next(step for step in planned(settings) if step.kind == kind)
+        if step.state != THERE:
+            typer.echo(f"\n{called()} {line(step)}")
+            run(shlex.split(line(step)))
+    typer.echo(f"\n{name} is ready: {called()} sweep study=own policy.target={name}{in_same(words)}")
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min"
+
+
+def run(line: Sequence[str]) -> None:
+    """Runs a command of kerv in this process.
+
+    Raises:
+        KervError: as that command. typer.Exit: it failed and said why.
+    """
+    name = max((name for name in parts("command") if " ".join(line).startswith(f"{name} ")), key=len)
+    typer_command(parts("command")[name]).main(list(line[len(name.split()) :]), standalone_mode=False)

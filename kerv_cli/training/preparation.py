@@ -1,0 +1,116 @@
+"""What a method needs of a target besides the target itself: which artifacts, in which order, made by which command."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kerv_cli.base.config import compose, groups
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.registry import parts
+from kerv_cli.base.settings import PrepareSettings, RolloutSettings, TrainDrafterSettings
+from kerv_cli.lab.catalogue import state_of
+from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of
+from kerv_cli.methods.compose import Method
+from kerv_cli.training.demonstrations import demos_for
+from kerv_cli.worlds import specs
+
+ORDER = ("drafter", "early", "scout", "datastore", "calibration", "certificate")
+"""A kind is made from those before it; kinds of parts that are not kerv's come last."""
+SEEING = ("scout", "certificate")
+"""Kinds that need a target with cameras: the certificate is of the scout's drafts."""
+THERE, MISSING = "there", "missing"
+
+
+@dataclass(frozen=True)
+class Step:
+    """An artifact that a target needs. state: `there`, `missing`, `step 300 of 4000`, …. command: words behind `kerv`
+    that make it, without those that every step shares. seconds: of making it, a guess; 0 where it is there."""
+
+    kind: str
+    place: Path
+    state: str
+    command: tuple[str, ...]
+    seconds: float
+
+
+def plan(settings: PrepareSettings) -> list[Step]:
+    """The steps in their order, those that are done among them; nothing is loaded or made.
+
+    Raises:
+        UsageError: no such target or method, a target that drafts nothing. CheckpointError: no such demonstrations, or
+            an artifact of another target lies where a new one is to be trained.
+    """
+    artifacts = Artifacts(settings.results, settings.policy)
+    description = artifacts.description
+    description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
+    spec = specs().get(description.environment)
+    played = spec is not None and not spec.world_class.endswith(":NoWorld")
+    kinds = needs(settings.methods, bool(description.cameras), played)
+    steps: list[Step] = []
+    for kind in kinds:
+        place, command = artifacts.path(kind), list(kind_of(kind).command)
+        if command[0] == "calibrate" and "drafter" not in kinds:
+            command.append("decodes=0")  # they are the drafter's
+        if command[0] == "train" and settings.steps:
+            command.append(f"train.steps={settings.steps}")
+        state = _state(artifacts, kind, kinds)
+        steps.append(Step(kind, place, state, tuple(command), 0.0 if state == THERE else _seconds(kind, command)))
+    if any(step.state != THERE and step.kind != "certificate" for step in steps):
+        demos_for(settings)
+    return steps
+
+
+def needs(methods: Sequence[str], sees: bool, played: bool = True) -> list[str]:
+    """Kinds of artifacts that methods need, in the order in which they are made. methods: none: all that the target can
+    have. sees: whether it has cameras. played: whether its environment can be run, and is not a recording alone.
+
+    Raises:
+        UnknownName: no such method. UsageError: one needs what a target without cameras cannot have.
+    """
+    names = groups()["method"]
+    for name in methods:
+        if name not in names:
+            raise UnknownName("method", name, names)
+    kinds: set[str] = set()
+    for name in methods or names:
+        own = set(Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs)
+        if not sees and own & set(SEEING) and methods:
+            raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
+        kinds |= own
+    made = [kind for kind in dict.fromkeys((*ORDER, *parts("artifact"))) if kind in kinds and kind_of(kind).command]
+    return [kind for kind in made if (sees or kind not in SEEING) and (played or kind != "certificate")]
+
+
+def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
+    """See `Step.state`.
+
+    Raises:
+        CheckpointError: a trained one is of another target.
+    """
+    own, place = kind_of(kind), artifacts.path(kind)
+    if not own.json(place).is_file():
+        return MISSING
+    try:
+        described = own.checked(place, artifacts.description)
+        made = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
+        artifacts.check(made[: made.index(kind) + 1])
+    except CheckpointError as error:
+        if isinstance(kind_of(kind), Weights):
+            name = f"{kind}/{place.name}"
+            raise CheckpointError(f"{str(error).split(': ')[0]}: remove it with 'kerv runs rm {name}'") from error
+        return "of other artifacts"
+    if kind == "calibration":
+        lacks = [name for name, part in (("variability", "drafter"), ("skip", "datastore")) if part in kinds]
+        return MISSING if any(not getattr(described, name) for name in lacks) else THERE
+    state = state_of(place, kind) if isinstance(kind_of(kind), Weights) else THERE
+    return THERE if state == "complete" else state
+
+
+def _seconds(kind: str, command: Sequence[str]) -> float:
+    """A guess, from nano and small targets on one core."""
+    if command[0] != "train":
+        return {"certificate": 120.0}.get(kind, 30.0)
+    train = compose("train_drafter", command[2:], TrainDrafterSettings).train
+    return train.steps * {"drafter": 0.05, "scout": 0.4}.get(kind, 0.05)

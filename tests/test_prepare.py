@@ -1,0 +1,120 @@
+"""A policy of one's own: tasks and demonstrations are those that it was trained on, `kerv prepare` makes the rest."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from test_calibration import write_dataset
+from typer.testing import CliRunner
+
+from kerv_cli.cli.app import app
+from kerv_cli.lab.resolve import resolve, resolve_rollout
+
+TASK = "reach-v3"
+MINE = "policy.target=mine"
+
+
+def kerv(*words: str, code: int = 0) -> str:
+    """The output of a command that ends with this code."""
+    run = CliRunner().invoke(app, list(words))
+    assert run.exit_code == code, run.output
+    return run.output
+
+
+@pytest.fixture
+def results(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, with the target `mine`, trained on one of the two tasks of the demonstrations `few`."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "results"
+    for kind in ("target", "drafter"):
+        shutil.copytree(policies / "artifacts" / kind / "nano-state", folder / "artifacts" / kind / "mine")
+    path = folder / "artifacts/target/mine/target.json"
+    described = json.loads(path.read_text())
+    described["provenance"] |= {
+        "settings": {"task": ["reach"], "demos": "few"},
+        "demos": {"config": {"episodes": 4}},
+    }
+    path.write_text(json.dumps(described))
+    write_dataset(folder / "artifacts/demos/few", episodes=4, names=(TASK, "push-v3"))
+    return folder
+
+
+@pytest.mark.usefixtures("results")
+@pytest.mark.parametrize("command", ["build datastore", "calibrate"])
+def test_tasks_and_demonstrations_are_those_of_the_target(command: str) -> None:
+    plan = " ".join(kerv(*command.split(), MINE, "--plan").split())
+    assert "1 tasks" in plan
+    assert "2 tasks" in " ".join(kerv(*command.split(), MINE, "task=[reach,push]", "--plan").split())
+
+
+def test_a_target_is_trained_on_the_demonstrations_that_are_named(results: Path) -> None:
+    assert "8 demonstrations of 2 tasks" in kerv("train", "target", "name=new", "demos=few", "--plan")
+    (results / "artifacts/demos/few").rename(results / "artifacts/demos/reach")
+    assert "4 demonstrations of 1 tasks" in kerv("train", "target", "name=new", "task=reach", "--plan")
+
+
+def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(results: Path) -> None:
+    (results / "artifacts/demos/few").rename(results / "artifacts/demos/other")
+    line = kerv("build", "datastore", MINE, code=1)
+    assert "kerv demos name=few task=reach episodes=4'" in line
+    assert "demos=other" in line
+    assert "kerv demos task=push'" in kerv("train", "target", "name=new", "task=push", code=1)
+
+
+@pytest.mark.usefixtures("results")
+def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows() -> None:
+    def tasks(*words: str) -> list[str]:
+        (chosen,) = {tuple(one.task) for one in resolve(list(words)).settings.values()}
+        return list(chosen)
+
+    assert resolve_rollout([MINE], False).settings["ar"].task == [TASK]
+    assert tasks("study=own", MINE) == [TASK]
+    assert tasks("study=main", MINE) == [TASK]  # the study names ten
+    assert tasks("study=demo", MINE) == [TASK]  # none of its three
+    assert tasks("study=main", MINE, "task=push") == ["push"]
+    assert tasks("study=main") == ["MT10"]
+    assert len(resolve_rollout(["policy=expert"], False).settings["expert"].task) == 10
+
+
+@pytest.mark.usefixtures("few_validations")
+def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) -> None:
+    plan = kerv("prepare", MINE, "--plan")
+    words = [line.split() for line in plan.splitlines() if "│" in line]
+    assert [(row[1], row[3]) for row in words] == [
+        ("drafter", "there"), ("early", "missing"), ("datastore", "missing"), ("calibration", "missing"),
+    ]  # fmt: skip
+    missing = kerv("rollout", "method=heisd", MINE, code=1)
+    assert f"kerv prepare {MINE} for=heisd'" in missing
+    done = kerv("prepare", MINE, "for=heisd,one_pass", "steps=2")
+    assert "kerv sweep study=own policy.target=mine" in done
+    for place in ("early/mine/early.json", "datastore/mine/manifest.json", "calibration/mine/calibration.json"):
+        assert (results / "artifacts" / place).is_file()
+    assert kerv("prepare", MINE, "--plan").count("there") == 4
+    shutil.rmtree(results / "artifacts/datastore/mine")
+    assert "missing" in kerv("prepare", MINE, "--plan")
+    path = results / "artifacts/drafter/mine/drafter.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
+    assert "kerv runs rm drafter/mine'" in kerv("prepare", MINE, "--plan", code=1)
+
+
+@pytest.mark.usefixtures("results")
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["policy.target=min"], "no target 'min'"),
+        ([MINE, "for=heisdd"], "did you mean heisd"),
+        ([MINE, "for=scout_unverified"], "needs a target that sees"),
+        (["policy=parallel"], "decodes all tokens at once"),
+    ],
+)
+def test_prepare_refuses_what_cannot_be(words: list[str], says: str) -> None:
+    assert says in kerv("prepare", *words, code=2)
+
+
+@pytest.mark.usefixtures("results")
+@pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
+def test_a_wrong_target_is_noticed_before_anything_else(command: str) -> None:
+    assert "no target 'min'" in kerv(*command.split(), "policy.target=min", code=2)
