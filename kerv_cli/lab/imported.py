@@ -37,6 +37,8 @@ from kerv_cli.lab.store import StudyStore
 COMMAND = ("runs", "import")
 _ELSEWHERE = "elsewhere"
 """Mode of the one decode that stands for those of a server which is not kerv."""
+_UNKNOWN = ("path_length", "jerk", "gripper_switches", "worker_pid")
+"""Columns of an episode of another server."""
 _ONE = ActionSpace(("x",), (Group("x", 1),), (), 1.0, (-1.0,), (1.0,))
 _WORLD = {"horizon": "horizon", "stress": "stress.kind", "stress_level": "stress.level", "camera": "camera.name"}
 """Parameter of kerv's own benchmark -> the setting of the world that it is."""
@@ -311,7 +313,7 @@ class _SidePlan:
         for cell, one, episodes in self.there:
             kept = [self._served(one, episode) for episode in episodes]
             pairs = list(zip(episodes, kept, strict=True))
-            found = [_row(cell, *pair) for pair in pairs]
+            found = [_row(cell, one, *pair) for pair in pairs]
             decodes = pa.concat_tables([_decodes(cell, *pair) for pair in pairs])
             tables = {
                 "episodes.parquet": table_bytes(pa.Table.from_pylist(found, schema=EPISODE_SCHEMA)),
@@ -374,12 +376,16 @@ def _identity(side: Side) -> dict[str, str]:
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
 
 
-def _row(cell: Cell, episode: Episode, served: Served | None) -> dict[str, Any]:
-    """The row of episodes.parquet. Success and steps are the harness's."""
-    row = dict(served.episode) if served is not None else episode_row(_bare(cell, episode), Circumstances())
-    row = {name: row.get(name) for name in EPISODE_SCHEMA.names}
+def _row(cell: Cell, one: Evaluation, episode: Episode, served: Served | None) -> dict[str, Any]:
+    """The row of episodes.parquet. Success and steps are the harness's; its evaluations did not take turns, so that
+    each is a block of its own."""
+    if served is None:
+        row = episode_row(_bare(cell, episode), Circumstances()) | dict.fromkeys(_UNKNOWN)
+    else:
+        row = {name: served.episode.get(name) for name in EPISODE_SCHEMA.names}
     shared = {"task": cell.task, "seed": episode.seed, "success": episode.success, "steps": episode.steps}
-    return row | shared | {"initial_state": list(episode.start), "wall_seconds": episode.seconds, "repeat": 0}
+    here = {"initial_state": list(episode.start), "wall_seconds": episode.seconds, "repeat": 0, "block": one.id}
+    return row | shared | here
 
 
 def _decodes(cell: Cell, episode: Episode, served: Served | None) -> pa.Table:
