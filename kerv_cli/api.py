@@ -24,7 +24,6 @@ from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import ServeSettings
 from kerv_cli.cli.rollout import planned_cells, run_cells
 from kerv_cli.cli.sweep import covered_cells, run_covered
-from kerv_cli.engine.decoder import Decoder
 from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.store import STUDIES, StudyStore
@@ -32,8 +31,8 @@ from kerv_cli.report.measures import MICRO
 from kerv_cli.report.report import report as write_report
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.tables import per_task_table, rows_of, study_table
-from kerv_cli.serve.policy import served
-from kerv_cli.serve.session import EXECUTED, RESET, Interface, Session
+from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
+from kerv_cli.serve.policy import Policy as Served
 
 TABLES = ("settings", "tasks", "episodes")
 
@@ -161,10 +160,10 @@ class Policy:
     (milliseconds) and `decode` (forwards, tokens, mode).
     """
 
-    def __init__(self, interface: Interface, decoder: Decoder) -> None:
-        self.info: dict[str, Any] = interface.metadata(decoder.steps)
+    def __init__(self, served: Served) -> None:
+        self.info: dict[str, Any] = metadata(served.interface, served.chunk)
         self.last: dict[str, Any] = {}
-        self._session = Session(interface, decoder)
+        self._client = OpenPi(served, served.new_session())
         self._begins = True
 
     def reset(self) -> None:
@@ -184,7 +183,7 @@ class Policy:
             UsageError: something is missing, of another shape or type, or not finite; the message names it.
         """
         extra = {} if executed is None else {EXECUTED: executed}
-        self.last = self._session.answer({**observation, **extra, RESET: self._begins})
+        self.last = self._client.act({**observation, **extra, RESET: self._begins})
         self._begins = False
         actions: np.ndarray = self.last["actions"]
         return actions
@@ -206,7 +205,7 @@ def load_policy(
             method needs is missing or of another policy.
     """
     typed = as_words(*words, **{"policy.target": target, "method": method, "task_name": task}, **settings)
-    return Policy(*served(compose("serve", typed, ServeSettings)))
+    return Policy(Served(compose("serve", typed, ServeSettings)))
 
 
 def as_words(*words: str, **settings: Any) -> list[str]:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,10 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.serve.policy import served
+from kerv_cli.serve.openpi import OpenPi, observation_of
+from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import PolicyServer
-from kerv_cli.serve.session import Interface, Session
+from kerv_cli.serve.session import Session
 from kerv_cli.serve.wire import packed, unpacked
 
 
@@ -65,16 +67,16 @@ class Client:
 
 
 @pytest.fixture(scope="module")
-def policy(policies: Path) -> tuple[Interface, Decoder]:
+def policy(policies: Path) -> Policy:
     words = ["policy.target=nano-vision", f"results={policies}", "method=naive_sd"]
-    return served(compose_settings("serve", words, ServeSettings))
+    return Policy(compose_settings("serve", words, ServeSettings))
 
 
 @contextmanager
-def serving(policy: tuple[Interface, Decoder], **chosen: Any) -> Iterator[tuple[int, list[str]]]:
-    """The port of a server that runs in a thread, and its log."""
+def serving(policy: Policy, **chosen: Any) -> Iterator[tuple[int, list[str]]]:
+    """The port of a server that runs in a thread, and its log. chosen: settings."""
     log: list[str] = []
-    with PolicyServer(*policy, log.append, **chosen).listening("127.0.0.1", 0) as listening:
+    with PolicyServer(policy, replace(policy.settings, **chosen), log.append).listening("127.0.0.1", 0) as listening:
         thread = threading.Thread(target=listening.serve_forever)
         thread.start()
         yield listening.socket.getsockname()[1], log
@@ -103,9 +105,9 @@ def until(condition: Any) -> None:
 
 
 @pytest.mark.bits
-def test_a_client_gets_the_actions_of_the_policy(policy: tuple[Interface, Decoder], policies: Path) -> None:
+def test_a_client_gets_the_actions_of_the_policy(policy: Policy, policies: Path) -> None:
     target: Any = Artifacts(str(policies), PolicySettings(target="nano-vision")).target
-    with serving(policy, every=2) as (port, log):
+    with serving(policy, log_every=2) as (port, log):
         client = Client(port)
         assert client.metadata["cameras"] == list(target.cameras)
         assert client.metadata["actions"] == ["dx", "dy", "dz", "gripper"]
@@ -137,7 +139,7 @@ def test_a_client_gets_the_actions_of_the_policy(policy: tuple[Interface, Decode
     ],
 )
 def test_a_wrong_observation_gets_an_error_frame_and_the_next_one_an_answer(
-    policy: tuple[Interface, Decoder], changes: dict[str, Any], said: str
+    policy: Policy, changes: dict[str, Any], said: str
 ) -> None:
     with serving(policy) as (port, log):
         client = Client(port)
@@ -166,9 +168,7 @@ BOMB = {b"__ndarray__": True, b"data": b"", b"dtype": "<f8", b"shape": [2**40]}
         (msgpack.packb({}), "or observation/image is wanted, the message has nothing"),
     ],
 )
-def test_garbage_gets_an_error_frame_and_the_server_goes_on(
-    policy: tuple[Interface, Decoder], frame: bytes | str, said: str
-) -> None:
+def test_garbage_gets_an_error_frame_and_the_server_goes_on(policy: Policy, frame: bytes | str, said: str) -> None:
     with serving(policy) as (port, _):
         client = Client(port)
         with pytest.raises(RuntimeError) as refused:
@@ -177,8 +177,8 @@ def test_garbage_gets_an_error_frame_and_the_server_goes_on(
         assert client.infer(seen(1))["actions"].shape == (4, 4)
 
 
-def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: tuple[Interface, Decoder]) -> None:
-    with serving(policy, megabytes=1) as (port, log):
+def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: Policy) -> None:
+    with serving(policy, max_mb=1) as (port, log):
         client = Client(port)
         raw: socket.socket = client.connection.socket
         raw.sendall(b"\x82\xfe\xff\xff")  # the beginning of a frame of 65535 bytes
@@ -191,7 +191,7 @@ def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy: tuple[I
         assert Client(port).infer(seen(1))["actions"].shape == (4, 4)
 
 
-def test_one_client_at_a_time(policy: tuple[Interface, Decoder]) -> None:
+def test_one_client_at_a_time(policy: Policy) -> None:
     with serving(policy) as (port, _):
         first = Client(port)
         with pytest.raises(ConnectionClosed, match="another client is being served"):
@@ -225,18 +225,18 @@ class Watching(Decoder):
         super().observe(action, end_effector)
 
 
-def test_the_decoder_is_told_what_was_executed(policy: tuple[Interface, Decoder]) -> None:
-    decoder = Watching(policy[1].target)
-    session = Session(policy[0], decoder)
-    first = session.answer(seen(0))["actions"]
-    session.answer(seen(1, executed=2))
+def test_the_decoder_is_told_what_was_executed(policy: Policy) -> None:
+    decoder = Watching(policy.artifacts.target)
+    client = OpenPi(policy, Session(lambda task: decoder))
+    first = unpacked(client.answer(packed(seen(0))).frame)["actions"]
+    client.answer(packed(seen(1, executed=2)))
     assert len(decoder.told) == 2
     np.testing.assert_allclose([action for action, _ in decoder.told], first[:2], atol=1e-6)
     start, end = (seen(seed)["observation/state"][:3] for seed in (0, 1))
     np.testing.assert_allclose([at for _, at in decoder.told], [(start + end) / 2, end])
-    session.answer(seen(2))
+    client.answer(packed(seen(2)))
     assert len(decoder.told) == 6
-    session.answer(seen(3, reset=True))
+    client.answer(packed(seen(3, reset=True)))
     assert decoder.told == []
     assert decoder.resets == 2
 
@@ -244,10 +244,8 @@ def test_the_decoder_is_told_what_was_executed(policy: tuple[Interface, Decoder]
 @pytest.mark.parametrize(
     ("gripper", "values"), [("as_is", [0.1, 0.9]), ("signed", [-1, 1]), ("signed_inverted", [1, -1])]
 )
-def test_grippers(policy: tuple[Interface, Decoder], gripper: str, values: list[float]) -> None:
-    from dataclasses import replace
-
-    made = replace(policy[0], gripper=gripper).converted(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
+def test_grippers(policy: Policy, gripper: str, values: list[float]) -> None:
+    made = replace(policy.interface, gripper=gripper).converted(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
     np.testing.assert_allclose(made[:, 3], values)
     np.testing.assert_allclose(made[:, 0], [0.3, 0])
 
@@ -293,9 +291,7 @@ def test_the_command_answers_and_stops_when_told(policies: Path, tmp_path: Path)
     assert "stopped" in (tmp_path / "log").read_text()
 
 
-def test_a_policy_that_reads_images_alone_needs_no_state(policy: tuple[Interface, Decoder]) -> None:
-    from dataclasses import replace
-
+def test_a_policy_that_reads_images_alone_needs_no_state(policy: Policy) -> None:
     message = {key: value for key, value in seen(0).items() if key != "observation/state"}
-    given = replace(policy[0], images_alone=True).observation_of(message)
+    given = observation_of(replace(policy.interface, images_alone=True), message)
     assert (given.proprioception.shape, given.state.shape) == ((4,), (39,))

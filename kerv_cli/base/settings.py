@@ -228,16 +228,36 @@ class RolloutSettings(MethodSettings, TaskSettings):
 
 @dataclass
 class ServeSettings(MethodSettings):
-    """`kerv serve`: a policy and a method for a client over websockets (docs/serving.md)."""
+    """`kerv serve`: a policy and a method for clients over websockets (docs/serving.md)."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu", "method": "ar"}
 
+    protocol: str = choice(
+        "openpi", "openpi", "vla_eval", help="what clients speak: robots openpi, benchmarks vla_eval"
+    )
     host: str = setting("127.0.0.1", "address to listen on; there is no password")
     port: int = number(8000, 0, 65_535, help="port to listen on; 0: a free one")
     max_mb: int = number(16, 1, 4096, help="largest message, MiB")
     log_every: int = number(100, 0, 10**9, help="answers between two lines of latencies; 0: at a connection's end only")
     gripper: str = setting("as_is", "how strict DoFs (0 closed to 1 open) are sent: as_is, signed, signed_inverted")
-    task_name: str = setting("", "the task, for parts whose levels differ between tasks")
+    task_name: str = setting("", "the task, for parts whose levels differ between tasks; empty: vla_eval's clients say")
+    batch: int = number(1, 1, 1024, help="clients that are decoded together; above 1: without times")
+    seats: int = number(0, 0, 4096, help="clients at a time; 0: 1 with openpi, 64 with vla_eval")
+    takeover: bool = setting(False, "a newer client takes the seat of the one that was silent longest")
+    ping_s: float = number(
+        0.0, 0, 86_400, help="a client that answers no ping for so long is gone; 0: 10, vla_eval none"
+    )
+    idle_s: float = number(0.0, 0, 86_400, help="a client without a message for so long is gone; 0: 120, vla_eval 1800")
+    origins: list[str] = setting([], "web pages that may connect; programs, which name no origin, always may")
+
+
+@dataclass(kw_only=True)
+class ImportSettings(CommandSettings):
+    """`kerv runs import`: recordings of vla-eval as a study (docs/vla_eval.md)."""
+
+    name: str = setting("", "of the study; empty: that of its benchmarks")
+    baseline: str = setting("", "label of the setting that the others are compared with; empty: ar, else the first")
+    labels: list[str] = setting([], "of the recordings, in their order; empty: methods, or names of servers")
 
 
 @dataclass

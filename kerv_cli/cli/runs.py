@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kerv_cli.base.errors import Interrupted, UsageError
-from kerv_cli.base.settings import CommandSettings
+from kerv_cli.base.settings import CommandSettings, ImportSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
 
@@ -202,6 +202,8 @@ def rerun(
         return
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
+    if run.command[:2] == ("runs", "import"):
+        raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
     from kerv_cli.cli.again import plan_again, run_again
     from kerv_cli.report.compare import same_tokens
 
@@ -274,3 +276,37 @@ def export(
     for name in run_names:
         typer.echo(name)
     typer.echo(f"{len(run_names)} runs in {folder}")
+
+
+@command(
+    "runs import",
+    ImportSettings,
+    names="NAME: recordings of vla-eval, recording-….sqlite or …_aggregate.json, or folders that hold one.",
+    keys="name baseline labels results",
+    examples=(
+        "kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite",
+        "kerv runs import evaluations name=libero",
+    ),
+    lists=("labels",),
+)
+def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
+    """Read evaluations of vla-eval as a study, whose episodes are paired as those of a sweep are."""
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.lab import imported
+    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.report.summary import summary_table
+    from kerv_cli.report.tables import load_study, rows_of, study_table
+
+    if not names:
+        raise UsageError("name a recording of vla-eval: kerv runs import recording-ID.sqlite")
+    sides = imported.sides_of([imported.read_evaluations(Path(name)) for name in names], settings.labels)
+    results, name = results_dir(settings.results), settings.name or imported.study_name(sides)
+    notes = imported.write_study(results, name, sides, settings.baseline, [*imported.COMMAND, *names])
+    table = study_table(load_study(StudyStore(results, name)))
+    if as_json:
+        print_json({"study": name, "notes": notes, "settings": rows_of(table)})
+        return
+    for line in notes:
+        typer.echo(line)
+    console().print(summary_table(table))
+    typer.echo(f"study {name}: {called()} report study={name}, {called()} report --choose study={name}")

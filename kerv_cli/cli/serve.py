@@ -16,22 +16,22 @@ from kerv_cli.cli.common import ShowPlan, print_plan
 @command(
     "serve",
     ServeSettings,
-    keys="policy method task host port gripper chunk log_every max_mb runtime.device",
+    keys="protocol policy method task host port gripper chunk batch seats takeover idle_s log_every max_mb",
     examples=(
         "kerv serve policy=vision method=one_pass",
         "kerv serve policy.target=openvla port=0 runtime.device=auto",
+        "kerv serve protocol=vla_eval policy=state method=spec_vla",
     ),
     typed={"task": "task_name"},  # one task's name; elsewhere it is a list
 )
 def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
-    """Answer observations with actions over websockets (openpi's protocol), with any method, until Ctrl-C."""
-    from kerv_cli.serve.policy import served
+    """Answer observations with actions over websockets, to robots or benchmarks, with any method, until Ctrl-C."""
+    from kerv_cli.serve.policy import Policy
     from kerv_cli.serve.server import PolicyServer
 
-    interface, decoder = served(settings)
+    server = PolicyServer(Policy(settings), settings, _log)
     if plan:
         print_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
-    server = PolicyServer(interface, decoder, _log, settings.max_mb, settings.log_every)
     with server.listening(settings.host, settings.port) as listening:
         port = listening.socket.getsockname()[1]
         _log(f"{settings.policy.target} with {settings.method} listens on ws://{settings.host}:{port}")

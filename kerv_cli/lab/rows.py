@@ -178,8 +178,13 @@ def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes
     for row in rows:
         if unknown := set(row) - set(schema.names):
             raise ValueError(f"columns {sorted(unknown)} are not in the schema")
+    return table_bytes(pa.Table.from_pylist(list(rows), schema=schema))
+
+
+def table_bytes(table: pa.Table) -> bytes:
+    """A table as the bytes of a parquet file."""
     buffer = io.BytesIO()
-    pq.write_table(pa.Table.from_pylist(list(rows), schema=schema), buffer, compression="zstd")
+    pq.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
 
 

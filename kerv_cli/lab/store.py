@@ -330,19 +330,22 @@ class StudyStore:
         if [(r.task, r.seed) for r in records] != [(cell.task, seed) for seed in cell.seeds]:
             raise ValueError(f"records of other episodes than cell {cell.id} asks for ({cell.task}, {cell.seeds})")
         at = circumstances or [Circumstances()] * len(records)
-        config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
-        files = {"config.yaml": to_yaml(config).encode(), **rows.tables_of(records, at, cell.repeat)}
-        full = {
-            "format": FORMAT,
-            "state": "complete",
+        sums = {
             "episodes": len(records),
             "successes": sum(r.success for r in records),
             "wall_seconds": sum(r.wall_seconds for r in records),
             "timed": all(r.timed for r in records),
             "started": at[0].started,
-            **status,
-            "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
         }
+        return self.write_tables(cell, rows.tables_of(records, at, cell.repeat), {**sums, **status})
+
+    def write_tables(self, cell: Cell, tables: Mapping[str, bytes], status: Mapping[str, Any]) -> bool:
+        """Writes a complete cell of these tables; returns and raises as `write_cell`. status: its entries, sums over
+        the episodes among them."""
+        config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
+        files = {"config.yaml": to_yaml(config).encode(), **tables}
+        hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+        full: dict[str, Any] = {"format": FORMAT, "state": "complete", **status, "files": hashes}
         full["sha256"] = _seal(full)
         files[_STATUS] = (json.dumps(full, indent=2, allow_nan=False) + "\n").encode()
 

@@ -175,7 +175,8 @@ def _columns(name: str, estimate: Estimate) -> dict[str, float]:
 
 
 def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
-    """Pairs of equal task, seed, repeat, initial state and device, sorted by task, seed and repeat.
+    """Pairs of equal task, seed, repeat, initial state and device, sorted by task, seed and repeat. Episodes that were
+    served by others than kerv name no device, have no times and pair with those of any.
 
     Columns: task, difficulty, seed, repeat; with the suffixes _baseline and _method: time (seconds per step), seconds
     (of the episode), success, block and the columns of `MOTION`; same_run, same_block; in_turn: same_block, and where
@@ -186,9 +187,10 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     method = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
     other = baseline[columns].assign(time=baseline["seconds"] / baseline["steps"])
     both = method.merge(other, on=keys, suffixes=("_method", "_baseline"))
-    agree = pd.Series(True, index=both.index)
-    for name in _SAME:
-        agree &= both[f"{name}_method"] == both[f"{name}_baseline"]
+    agree = both["initial_state_method"] == both["initial_state_baseline"]
+    elsewhere = (both["device_name_method"] == "") | (both["device_name_baseline"] == "")  # on a device without a name
+    for name in COMPARABLE:
+        agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     both["same_run"] = both["run_method"] == both["run_baseline"]
     both["same_block"] = (both["block_method"] == both["block_baseline"]) & (both["block_method"] != "")

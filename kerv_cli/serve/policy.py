@@ -1,58 +1,246 @@
-"""The served policy from its settings: interface and decoder, warmed up."""
+"""The served policy from its settings: its interface, and decoders that are warmed up, one for every client."""
 
 from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import ServeSettings
+from kerv_cli.base.settings import MethodSettings, RolloutSettings, ServeSettings
+from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import frame_shape
+from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
+from kerv_cli.worlds import specs
 
+VLA_EVAL = "vla_eval"
+"""The protocol whose clients name the task of every episode."""
 WARM_UP = 4  # decodes
+GATHER = 0.005
+"""Seconds that a batch waits for more clients."""
+_BY_TASK = frozenset({"calibration", "certificate"})
+"""Artifacts with levels that differ between tasks."""
 
 
-def served(settings: ServeSettings) -> tuple[Interface, Decoder]:
-    """The policy's interface and its decoder, after a warm-up: errors are raised before the first client connects.
+class Policy:
+    """What is served. Its clients' decoders share the weights; one of them decodes at a time, or several together.
+
+    chunk: H. by_task: whether the method's parts differ between tasks, which the clients name.
 
     Raises:
         UsageError: numbers out of range, parts that do not belong together. CheckpointError: no such policy, or an
             artifact of another.
     """
-    if settings.gripper not in GRIPPERS:
-        raise UnknownName("gripper", settings.gripper, GRIPPERS)
-    device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
-    description, method = artifacts.description, Method.of(settings)
-    method.check(description)
-    method.check_unwatched("kerv serve", "a client executes chunks without a look between their steps")
-    artifacts.check(method.needs)
-    decoder = method.decoder(artifacts.target, artifacts.load, settings.task_name)
-    interface = Interface(
-        name=settings.policy.target,
-        method=settings.method,
-        actions=description.actions,
-        observation=description.observation,
-        cameras=tuple(description.cameras),
-        size=int(description.settings.get("image_size", 0)) if description.cameras else 0,
-        privileged=not description.cameras and description.observation.state > 0,
-        gripper=settings.gripper,
-        task=settings.task_name,
-        images_alone=bool(find("target", description.family).traits.get("images_alone")),
-    )
-    warm_up(interface, decoder)
-    return interface, decoder
+
+    def __init__(self, settings: ServeSettings) -> None:
+        if settings.gripper not in GRIPPERS:
+            raise UnknownName("gripper", settings.gripper, GRIPPERS)
+        self.settings = settings
+        self.device, _ = set_up(settings.runtime)
+        self.artifacts = Artifacts(
+            settings.results, settings.policy, settings.datastore, self.device, settings.runtime.dtype
+        )
+        self.method = Method.of(settings)
+        self.method.check(self.artifacts.description, settings.batch)
+        if settings.protocol != VLA_EVAL:
+            self.method.check_unwatched("kerv serve", "a client executes chunks without a look between their steps")
+        self.identity = self.artifacts.check(self.method.needs)
+        self.interface = self._interface()
+        self.by_task = not settings.task_name and not _BY_TASK.isdisjoint(self.method.needs)
+        self._turn = threading.Lock()
+        self._idle: list[Decoder] = []
+        first = self._decoder(self._any_task())
+        self.chunk = first.steps
+        self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
+        self.released(first)
+
+    def _interface(self) -> Interface:
+        description = self.artifacts.description
+        spec = specs().get(description.environment)
+        return Interface(
+            name=self.settings.policy.target,
+            method=self.settings.method,
+            environment=description.environment,
+            actions=description.actions,
+            space=spec.actions if spec else description.actions,
+            observation=description.observation,
+            cameras=tuple(description.cameras),
+            size=int(description.settings.get("image_size", 0)) if description.cameras else 0,
+            privileged=not description.cameras and description.observation.state > 0,
+            gripper=self.settings.gripper,
+            grip=tuple(spec.grip) if spec else (),
+            task=self.settings.task_name,
+            images_alone=bool(find("target", description.family).traits.get("images_alone")),
+        )
+
+    def _any_task(self) -> str:
+        """The task of the settings; without one, where a client names its tasks, one that the method's levels know."""
+        if self.by_task and self.settings.protocol == VLA_EVAL:
+            for kind in sorted(_BY_TASK.intersection(self.method.needs)):
+                artifact = self.artifacts.load(kind)
+                return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ("",)))
+        return self.settings.task_name
+
+    @contextlib.contextmanager
+    def session(self) -> Iterator[Session]:
+        """For one more client, until it leaves: then its decoder serves the next one."""
+        session = self.new_session()
+        try:
+            yield session
+        finally:
+            if isinstance(session.decoder, Alone):
+                self.released(session.decoder.decoder)
+
+    def new_session(self) -> Session:
+        """For one more client."""
+        return Session(self._follower, self.settings.task_name, self.by_task)
+
+    def released(self, decoder: Decoder) -> None:
+        """A decoder that nobody uses any more; those of one task alone are not kept."""
+        if not self.by_task:
+            self._idle.append(decoder)
+
+    def _follower(self, task: str) -> ActionDecoder:
+        if self._together is not None:
+            return self._together.seat()
+        return Alone(self._idle.pop() if self._idle else self._decoder(task), self._turn)
+
+    def _decoder(self, task: str) -> Decoder:
+        """A new decoder, after a few observations of zeros: first calls allocate memory and choose kernels."""
+        with self._turn:
+            decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
+            images = {c: np.zeros(frame_shape(c, self.interface.size), np.uint8) for c in self.interface.cameras}
+            space = self.interface.observation
+            still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+            decoder.reset(task, 0, np.zeros(3))
+            for _ in range(WARM_UP):
+                for action in decoder.decode(still).actions:
+                    decoder.observe(action, np.zeros(3))
+        return decoder
+
+    def facts(self) -> dict[str, Any]:
+        """What a result must say about it: settings of a rollout, hashes, machine and versions; plain values."""
+        shared = {at.name: getattr(self.settings, at.name) for at in fields(MethodSettings)}
+        settings = asdict(RolloutSettings(**shared))
+        settings["runtime"]["device"] = self.device
+        camera = {"name": self.interface.cameras[0] if self.interface.cameras else "", "size": self.interface.size}
+        settings["world"]["camera"] |= {key: value for key, value in camera.items() if value}
+        return {"settings": settings, "identity": self.identity, "machine": stamp(self.device)}
 
 
-def warm_up(interface: Interface, decoder: Decoder) -> None:
-    """Answers a few observations of zeros: first calls allocate memory and choose kernels."""
-    session = Session(interface, decoder)
-    images = {f"observation/{c}": np.zeros(frame_shape(c, interface.size), np.uint8) for c in interface.cameras}
-    message = {**images, "observation/state": np.zeros(interface.observation.state), "prompt": ""}
-    for _ in range(WARM_UP):
-        session.answer(message)
+@dataclass(frozen=True)
+class Alone:
+    """A client's decoder, which decodes when no other one does."""
+
+    decoder: Decoder
+    turn: threading.Lock
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those of the decoder."""
+        return self.decoder.cameras
+
+    @property
+    def watcher(self) -> Decoder | None:
+        """That of the decoder."""
+        return self.decoder.watcher
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode."""
+        self.decoder.reset(task, seed, end_effector)
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Tells the decoder."""
+        self.decoder.observe(action, end_effector)
+
+    def finish(self, success: bool) -> None:
+        """Tells the decoder."""
+        self.decoder.finish(success)
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The decoder's record."""
+        with self.turn:
+            return self.decoder.decode(observation)
+
+
+@dataclass
+class _Request:
+    lane: Lane
+    observation: Observation
+    record: DecodeRecord | None = None
+    error: Exception | None = None
+
+    @property
+    def is_settled(self) -> bool:
+        return self.record is not None or self.error is not None
+
+
+@dataclass
+class Together:
+    """Decodes together what several clients ask for at nearly the same time. most: clients of a batch."""
+
+    decoder: BatchDecoder
+    most: int
+    _turn: threading.Lock = field(default_factory=threading.Lock)
+    _arrived: threading.Condition = field(default_factory=threading.Condition)
+    _waiting: list[_Request] = field(default_factory=list)
+
+    def seat(self) -> Seat:
+        """For one more client."""
+        return Seat(self)
+
+    def decode(self, lane: Lane, observation: Observation) -> DecodeRecord:
+        """The record of one client's observation. Whoever has the turn decodes for all who wait."""
+        mine = _Request(lane, observation)
+        with self._arrived:
+            self._waiting.append(mine)
+            self._arrived.notify_all()
+        with self._turn:
+            while not mine.is_settled:
+                with self._arrived:
+                    self._arrived.wait_for(lambda: len(self._waiting) >= self.most, GATHER)
+                    batch, self._waiting = self._waiting[: self.most], self._waiting[self.most :]
+                self._settle(batch)
+        if mine.error is not None:
+            raise mine.error
+        assert mine.record is not None
+        return mine.record
+
+    def _settle(self, batch: Sequence[_Request]) -> None:
+        """Decodes the batch; where that fails, one by one, so that one client's fault is no other's."""
+        try:
+            records = self.decoder.decode([one.lane for one in batch], [one.observation for one in batch])
+            for one, record in zip(batch, records, strict=True):
+                one.record = record
+        except Exception as error:  # noqa: BLE001 - it is raised in its client's thread
+            if len(batch) == 1:
+                batch[0].error = error
+                return
+            for one in batch:
+                self._settle([one])
+
+
+class Seat(Lane):
+    """A client's lane of a batch."""
+
+    def __init__(self, together: Together) -> None:
+        target = together.decoder.target
+        super().__init__(target.actions, target.cameras)
+        self.together = together
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The batch's record of it, without times."""
+        return self.together.decode(self, observation)

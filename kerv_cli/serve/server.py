@@ -1,43 +1,78 @@
-"""The policy server: answers observations with actions over websockets, one client at a time (docs/serving.md).
+"""The server: seats, silence and errors of clients over websockets, whatever their protocol (docs/serving.md).
 
-The protocol is openpi's: after the handshake the server sends its metadata; then every binary frame is an observation
-and is answered by a binary frame, or by a text frame that says what was wrong with it. The connection stays open after
-an error, and the server after any client.
+A connection stays open after an error, and the server after any client.
 """
 
 from __future__ import annotations
 
 import contextlib
 import http
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.engine.decoder import Decoder
-from kerv_cli.serve.session import Interface, Session
-from kerv_cli.serve.wire import packed, unpacked
+from kerv_cli.base.registry import load
+from kerv_cli.base.settings import ServeSettings
+from kerv_cli.serve.policy import Policy
 
 Log = Callable[[str], None]
-HEALTH = "/healthz"
-BUSY, GONE = 1013, 1001  # websocket close codes: try again later, going away
+PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.serve.vla_eval:VlaEval"}
+HEALTH = ("/healthz", "/health")
+BUSY, GONE, TAKEN = 1013, 1001, 4000
+"""Websocket close codes: try again later; going away; a newer client has the seat."""
+PATIENCE = 1.0
+"""Seconds that a newcomer waits for a seat: one that reconnects may be ahead of its own farewell."""
+FAREWELL = 2.0
+"""Seconds that a closing connection is waited for."""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to a frame. seconds: of inference, NaN where it was not timed; None: nothing was decoded for it."""
+
+    frame: bytes
+    seconds: float | None = None
+
+
+class Conversation(Protocol):
+    """One client, in the words of its protocol. seats, ping_s, idle_s: where the settings leave them to the
+    protocol."""
+
+    seats: int
+    ping_s: float
+    idle_s: float
+
+    def greeting(self) -> bytes | None:
+        """What the server says first."""
+
+    def answer(self, frame: bytes | str) -> Reply | None:
+        """The answer to a frame; None: it needs none. Raises KervError: what is wrong with it."""
+
+    def took(self, milliseconds: float) -> None:
+        """The last decode took so long, from the frame's arrival to the answer's end."""
+
+    def fault(self, line: str) -> bytes | str:
+        """The frame that tells the client what was wrong with the last one."""
 
 
 @dataclass
 class Latencies:
-    """Milliseconds of every answer, for the log. decode: inference time; whole: from the message's arrival to the
+    """Milliseconds of every decode, for the log. decode: inference time; whole: from the message's arrival to the
     answer's end."""
 
     decode: list[float] = field(default_factory=list)
     whole: list[float] = field(default_factory=list)
 
     def add(self, decode: float, whole: float) -> None:
-        """One answer."""
-        self.decode.append(decode)
+        """One answer. decode: NaN where it was not timed."""
+        if not math.isnan(decode):
+            self.decode.append(decode)
         self.whole.append(whole)
 
     def __str__(self) -> str:
@@ -49,15 +84,54 @@ class Latencies:
         return ", ".join(parts)
 
 
-class PolicyServer:
-    """Serves one decoder. log: called with every line. every: answers between two lines of latencies; 0: none.
-    megabytes: largest message."""
+class Seats:
+    """Who is being served. takeover: a newcomer gets the seat of whoever was silent longest."""
 
-    def __init__(self, interface: Interface, decoder: Decoder, log: Log, megabytes: int = 16, every: int = 100) -> None:
-        self.interface, self.decoder, self.log = interface, decoder, log
-        self.megabytes, self.every = megabytes, every
-        self.busy = threading.Lock()
-        self.connection: Any = None
+    def __init__(self, count: int, takeover: bool) -> None:
+        self.count, self.takeover = count, takeover
+        self._changed = threading.Condition()
+        self._heard: dict[Any, float] = {}  # connection -> when it was last heard
+
+    def take(self, connection: Any) -> tuple[bool, Any]:
+        """Whether the connection has a seat now, and the connection that lost its own to it, or None."""
+        with self._changed:
+            lost = None
+            if self.takeover and len(self._heard) >= self.count:
+                lost = min(self._heard, key=self._heard.__getitem__)
+                del self._heard[lost]
+            elif not self._changed.wait_for(lambda: len(self._heard) < self.count, PATIENCE):
+                return False, None
+            self._heard[connection] = time.monotonic()
+            return True, lost
+
+    def heard(self, connection: Any) -> None:
+        """The client said something."""
+        with self._changed:
+            if connection in self._heard:
+                self._heard[connection] = time.monotonic()
+
+    def leave(self, connection: Any) -> None:
+        """The seat is free, unless somebody else took it."""
+        with self._changed:
+            self._heard.pop(connection, None)
+            self._changed.notify_all()
+
+    @property
+    def taken(self) -> list[Any]:
+        """The connections that have one."""
+        with self._changed:
+            return list(self._heard)
+
+
+class PolicyServer:
+    """Serves one policy. log: called with every line."""
+
+    def __init__(self, policy: Policy, settings: ServeSettings, log: Log) -> None:
+        self.policy, self.settings, self.log = policy, settings, log
+        self.protocol: Any = load(PROTOCOLS[settings.protocol])
+        self.seats = Seats(settings.seats or self.protocol.seats, settings.takeover)
+        self.ping_s = settings.ping_s or self.protocol.ping_s
+        self.idle_s = settings.idle_s or self.protocol.idle_s
 
     @contextlib.contextmanager
     def listening(self, host: str, port: int) -> Iterator[Any]:
@@ -76,77 +150,95 @@ class PolicyServer:
                 host,
                 port,
                 compression=None,
-                max_size=self.megabytes * 2**20,
+                max_size=self.settings.max_mb * 2**20,
                 process_request=_health,
-                ping_interval=None,  # a slow decode is no dead connection
+                origins=[None, *self.settings.origins],  # a web page names its own
+                ping_interval=self.ping_s or None,
+                ping_timeout=self.ping_s or None,
+                close_timeout=FAREWELL,
             )
         except OSError as error:
             raise UsageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
         with server:
             yield server
-        if self.connection is not None:
-            self.connection.close(GONE, "the server stops")
+        for connection in self.seats.taken:
+            connection.close(GONE, "the server stops")
 
     def handle(self, connection: Any) -> None:
         """One connection, from its handshake to its end."""
         from websockets.exceptions import ConnectionClosed
 
         who = str(connection.remote_address)
-        if not self.busy.acquire(blocking=False):
-            self.log(f"{who} refused: another client is being served")
+        seated, lost = self.seats.take(connection)
+        if not seated:
+            self.log(f"{who} refused: {self._full}")
             with contextlib.suppress(ConnectionClosed):
-                connection.close(BUSY, "another client is being served: try again later")
+                connection.close(BUSY, f"{self._full}: try again later")
             return
-        latencies = Latencies()
+        if lost is not None:
+            _close(lost, TAKEN, "a newer client took the seat")
+        latencies, why = Latencies(), ""
         try:
             self.log(f"{who} connected")
-            self.connection = connection
-            session = Session(self.interface, self.decoder)
-            connection.send(packed(self.interface.metadata(self.decoder.steps)))
-            before: float | None = None
-            while True:
-                message = connection.recv()
-                before = self.reply(connection, session, message, latencies, before)
+            self._talk(connection, latencies)
         except ConnectionClosed as error:
-            reason = error.rcvd.reason if error.rcvd and error.rcvd.reason else ""
-            sent = f": {error.sent.reason}" if error.sent and error.sent.reason and not reason else ""
-            self.log(f"{who} disconnected{sent}; {latencies}")
+            frame = error.rcvd or error.sent
+            why = f": {frame.reason}" if frame and frame.reason else ""
+        except TimeoutError:
+            why = f": no message for {self.idle_s:g} s"
+            _close(connection, GONE, why[2:])
         finally:
-            self.connection = None
-            self.busy.release()
+            self.seats.leave(connection)
+            self.log(f"{who} disconnected{why}; {latencies}")
 
-    def reply(
-        self, connection: Any, session: Session, message: Any, latencies: Latencies, before: float | None
-    ) -> float | None:
-        """Answers one frame -> milliseconds that the answer took, or `before` after an error. before: milliseconds of
-        the last answer, which the client gets as `prev_total_ms`."""
+    @property
+    def _full(self) -> str:
+        return "another client is being served" if self.seats.count == 1 else f"{self.seats.count} clients are served"
+
+    def _talk(self, connection: Any, latencies: Latencies) -> None:
+        """Answers frames until the connection ends. Raises ConnectionClosed, and TimeoutError for silence."""
+        with self.policy.session() as session:
+            conversation: Conversation = self.protocol(self.policy, session)
+            if (greeting := conversation.greeting()) is not None:
+                connection.send(greeting)
+            while True:
+                frame = connection.recv(timeout=self.idle_s)
+                self.seats.heard(connection)
+                self.reply(connection, conversation, frame, latencies)
+
+    def reply(self, connection: Any, conversation: Conversation, frame: bytes | str, latencies: Latencies) -> None:
+        """Answers one frame, or says in one line to client and log what was wrong with it."""
         began = time.perf_counter()
         try:
-            if not isinstance(message, bytes):
-                raise UsageError("a text frame came, observations are binary (msgpack)")
-            answer = session.answer(unpacked(message))
+            reply = conversation.answer(frame)
         except KervError as error:
-            self.refuse(connection, str(error))
-            return before
+            self._refuse(connection, conversation, str(error))
+            return
         except Exception as error:  # noqa: BLE001 - whatever a client sends, the server goes on
-            self.refuse(connection, f"internal error, {type(error).__name__}: {str(error)[:200]}")
-            return before
-        inference = answer["policy_timing"]["infer_ms"]
-        timing = {"infer_ms": inference} | ({"prev_total_ms": before} if before is not None else {})
-        connection.send(packed({**answer, "server_timing": timing}))
+            self._refuse(connection, conversation, f"internal error, {type(error).__name__}: {str(error)[:200]}")
+            return
+        if reply is None:
+            return
+        connection.send(reply.frame)
+        if reply.seconds is None:
+            return
         whole = 1000 * (time.perf_counter() - began)
-        latencies.add(inference, whole)
-        if self.every and len(latencies.whole) % self.every == 0:
+        conversation.took(whole)
+        latencies.add(1000 * reply.seconds, whole)
+        if self.settings.log_every and len(latencies.whole) % self.settings.log_every == 0:
             self.log(str(latencies))
-        return whole
 
-    def refuse(self, connection: Any, reason: str) -> None:
-        """Tells client and log what was wrong, in one line."""
+    def _refuse(self, connection: Any, conversation: Conversation, reason: str) -> None:
         line = " ".join(reason.split())
         self.log(f"{connection.remote_address} error: {line}")
-        connection.send(f"kerv: {line}")
+        connection.send(conversation.fault(line))
+
+
+def _close(connection: Any, code: int, reason: str) -> None:
+    """Closes a connection that may never answer, in a thread of its own: nobody waits for it."""
+    threading.Thread(target=connection.close, args=(code, reason), daemon=True).start()
 
 
 def _health(connection: Any, request: Any) -> Any:
     """Answers GET /healthz without a handshake."""
-    return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path == HEALTH else None
+    return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path in HEALTH else None

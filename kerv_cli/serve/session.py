@@ -1,9 +1,9 @@
-"""One client's episode: its messages -> observations -> the decoder -> actions."""
+"""The interface of a served policy, and a client's episodes with a decoder of their own; both know no protocol."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,11 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
-from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.lab.episode import ActionDecoder
 
-STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
+LARGEST = 4096
+"""Pixels of an image's longest side, where the policy resizes images itself."""
 
 Gripper = Callable[[np.ndarray], np.ndarray]
 GRIPPERS: Mapping[str, Gripper] = {
@@ -27,81 +29,69 @@ which LIBERO's simulator expects."""
 
 @dataclass(frozen=True)
 class Interface:
-    """The inputs and outputs of a policy. size: pixels of its images, 0 where it sees none. privileged: it reads the
-    whole state. images_alone: it reads no state, so that a message may lack it. gripper: one of GRIPPERS. task: name
-    for parts whose levels differ between tasks."""
+    """The inputs and outputs of a policy.
+
+    environment: its name, "none" where kerv has no such one. space: the environment's action space, else the policy's.
+    size: pixels of its images, 0 where it sees none. privileged: it reads the whole state. images_alone: it reads
+    images of any size and no state, so that a message may lack it. gripper: one of GRIPPERS. grip: the environment's
+    actions of the strict DoFs that close and that open, empty where they are unknown. task: name for parts whose
+    levels differ between tasks; empty: the client's.
+    """
 
     name: str
     method: str
+    environment: str
     actions: ActionSpace
+    space: ActionSpace
     observation: ObservationSpace
     cameras: tuple[str, ...]
     size: int
     privileged: bool
-    gripper: str
-    task: str
+    gripper: str = "as_is"
+    grip: tuple[float, ...] = ()
+    task: str = ""
     images_alone: bool = False
 
-    def metadata(self, chunk: int) -> dict[str, Any]:
-        """The first frame that a client gets. chunk: H."""
-        return {
-            "server": "kerv",
-            "policy": self.name,
-            "method": self.method,
-            "cameras": list(self.cameras),
-            "image_size": self.size,
-            "state": list(self.observation.proprioception),
-            "actions": list(self.actions.names),
-            "low": list(self.actions.low),
-            "high": list(self.actions.high),
-            "control_hz": self.actions.control_hz,
-            "chunk": chunk,
-            "gripper": self.gripper,
-        }
-
-    def observation_of(self, message: Mapping[str, Any]) -> Observation:
-        """The observation in a message.
+    def image(self, image: Any, camera: str, key: str) -> np.ndarray:
+        """The image (h, w, 3) uint8 of a camera. key: its name in messages.
 
         Raises:
-            UsageError: something is missing, of another size or type, or not finite; the line names it.
+            UsageError: it is of another size or type.
         """
-        prompt = message.get(PROMPT, "")
-        if not isinstance(prompt, str):
-            raise UsageError(f"{PROMPT} is {type(prompt).__name__}, a text is wanted")
-        images = {camera: self._image(message, camera) for camera in self.cameras}
-        felt, state = self._numbers(message)
-        return Observation(felt, state, prompt, images)
-
-    def _image(self, message: Mapping[str, Any], camera: str) -> np.ndarray:
-        keys = [f"observation/{camera}", *([IMAGE] if len(self.cameras) == 1 else [])]
-        key = next((key for key in keys if key in message), None)
-        if key is None:
-            raise UsageError(f"no image: {' or '.join(keys)} is wanted, the message has {_keys(message)}")
-        image, shape = message[key], frame_shape(camera, self.size)
-        if not isinstance(image, np.ndarray) or image.shape != shape or image.dtype != np.uint8:
+        shape: tuple[Any, ...] = frame_shape(camera, self.size)
+        fits = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 3
+        if self.images_alone:
+            shape = ("height", "width", 3)
+            fits = fits and image.shape[2] == 3 and min(image.shape[:2]) >= 2 and max(image.shape[:2]) <= LARGEST
+        if not fits or (not self.images_alone and image.shape != shape):
             what = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise UsageError(f"{key} is {what}, {shape} uint8 is wanted")
-        return image
+            wanted = str(shape).replace("'", "")
+            raise UsageError(f"{key} is {what}, {wanted} uint8 is wanted")
+        return np.asarray(image)
 
-    def _numbers(self, message: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Proprioception (p,) and state (s,); numbers that the policy does not read are zero."""
+    def numbers(self, values: Any, key: str, message: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Proprioception (p,) and state (s,) from what stands under `key` of a message, None where nothing does;
+        numbers that the policy does not read are zero.
+
+        Raises:
+            UsageError: they are missing, too few, too many or not finite.
+        """
         few, many = len(self.observation.proprioception), self.observation.state
         if not many:
             return np.zeros(0), np.zeros(0)
-        values = message.get(STATE)
         if values is None and self.images_alone:
             return np.zeros(few), np.zeros(many)
         sizes = [many] if self.privileged else [few, many]
         if not isinstance(values, np.ndarray | list):
-            raise UsageError(f"no {STATE}: {sizes[0]} numbers are wanted, the message has {_keys(message)}")
+            raise UsageError(f"no {key}: {sizes[0]} numbers are wanted, the message has {keys_of(message)}")
         try:
             numbers = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise UsageError(f"{STATE} does not hold numbers") from error
+            raise UsageError(f"{key} does not hold numbers") from error
         if numbers.ndim != 1 or len(numbers) not in sizes:
-            raise UsageError(f"{STATE} has shape {numbers.shape}, {' or '.join(map(str, sizes))} numbers are wanted")
+            raise UsageError(f"{key} has shape {numbers.shape}, {' or '.join(map(str, sizes))} numbers are wanted")
         if not np.isfinite(numbers).all():
-            raise UsageError(f"{STATE} holds numbers that are not finite, at {np.flatnonzero(~np.isfinite(numbers))}")
+            raise UsageError(f"{key} holds numbers that are not finite, at {np.flatnonzero(~np.isfinite(numbers))}")
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
@@ -112,50 +102,45 @@ class Interface:
         return values
 
 
-def _keys(message: Mapping[str, Any]) -> str:
-    return ", ".join(sorted(message)[:8]) or "nothing"
+def keys_of(message: Mapping[str, Any]) -> str:
+    """The first keys of a message, for an error."""
+    return ", ".join(sorted(str(key)[:40] for key in message)[:8]) or "nothing"
 
 
-@dataclass
+def text_of(value: Any, key: str) -> str:
+    """A text of a message. Raises UsageError: it is none."""
+    if not isinstance(value, str):
+        raise UsageError(f"{key} is {type(value).__name__}, a text is wanted")
+    return value
+
+
+def hand_of(observation: Observation) -> np.ndarray:
+    """The end effector's position (3,), metres; zeros where the observation does not say."""
+    hand = np.zeros(3)
+    hand[: len(observation.proprioception[:3])] = observation.proprioception[:3]
+    return hand
+
+
 class Session:
-    """One connection. last: the actions (H, D) of the last decode, environment units. at: the end effector's position
-    (3,) at that decode, metres."""
+    """The episodes of one client.
 
-    interface: Interface
-    decoder: Decoder
-    last: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    at: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    begun: bool = False
-    decodes: int = 0
+    decoder: None before the first episode where it depends on the task.
+    """
 
-    def answer(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        """Decodes the observation in a message -> `actions` (H, D), its time and its forwards.
+    def __init__(self, decoder: Callable[[str], ActionDecoder], task: str = "", by_task: bool = False) -> None:
+        """decoder: makes the decoder of a task. task: of every episode; empty: the client names it. by_task: a new task
+        needs a new decoder."""
+        self._make, self._by_task, self.task = decoder, by_task, task
+        self.decoder: Any = None if by_task else decoder(task)
 
-        Raises:
-            UsageError: as `Interface.observation_of`, or a wrong `executed`.
-        """
-        observation = self.interface.observation_of(message)
-        hand = np.zeros(3)
-        hand[: len(observation.proprioception[:3])] = observation.proprioception[:3]
-        executed = self._executed(message)
-        if message.get(RESET) or not self.begun:
-            self.decoder.reset(self.interface.task, self.decodes, hand)
-            self.begun = True
-        else:
-            for step, action in enumerate(executed, 1):
-                self.decoder.observe(action, self.at + (hand - self.at) * step / len(executed))
-        record = self.decoder.decode(observation)
-        self.last, self.at = record.actions, hand
-        self.decodes += 1
-        return {
-            "actions": self.interface.converted(record.actions),
-            "policy_timing": {"infer_ms": 1000 * record.seconds},
-            "decode": {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode},
-        }
+    def begin(self, task: str, seed: int, hand: np.ndarray) -> None:
+        """An episode of a task begins with the end effector at (3,) metres. Raises CheckpointError: the method has no
+        levels for the task."""
+        if self._by_task and (self.decoder is None or task != self.task):
+            self.decoder, self.task = self._make(task), task
+        self.decoder.reset(self.task or task, seed, hand)
 
-    def _executed(self, message: Mapping[str, Any]) -> np.ndarray:
-        """The actions of the last answer that were executed since: all of them, or the first `executed` ones."""
-        count = message.get(EXECUTED, len(self.last))
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):
-            raise UsageError(f"{EXECUTED}={str(count)[:40]}: 0 to {len(self.last)} control steps of the last answer")
-        return self.last[: int(count)]
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """The actions for an observation, and their record."""
+        record: DecodeRecord = self.decoder.decode(observation)
+        return record

@@ -1,12 +1,13 @@
-"""Messages of the policy server: msgpack with numpy arrays, as openpi's client writes and reads them.
+"""Messages of the policy server: msgpack with numpy arrays, and how openpi's client writes and reads these.
 
-An array is a map with the *bytes* keys __ndarray__ (true), data, dtype, shape; a scalar one with __npgeneric__, data,
-dtype. Only plain numbers are accepted: nothing is unpickled, and no array is larger than its own bytes.
+openpi's array is a map with the *bytes* keys __ndarray__ (true), data, dtype, shape; a scalar one with __npgeneric__,
+data, dtype. Only plain numbers are accepted: nothing is unpickled, and no array is larger than its own bytes.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,19 +18,29 @@ KINDS = "biuf"  # booleans, integers, floats
 
 
 def packed(value: Any) -> bytes:
-    """A message of dicts, lists, texts, numbers and numpy arrays."""
-    data: bytes = _msgpack().packb(value, default=_plain)
-    return data
+    """A message of dicts, lists, texts, numbers and numpy arrays, for openpi."""
+    return packed_as(value, _plain)
 
 
 def unpacked(data: bytes) -> dict[str, Any]:
-    """A message that is a map with text keys.
+    """A message of openpi's; errors as `read_map`."""
+    return read_map(data, _array)
+
+
+def packed_as(value: Any, plain: Callable[[Any], Any]) -> bytes:
+    """A message. plain: a value that msgpack does not know -> one that it knows."""
+    data: bytes = _msgpack().packb(value, default=plain)
+    return data
+
+
+def read_map(data: bytes, special: Callable[[dict[Any, Any]], Any]) -> dict[str, Any]:
+    """A message that is a map with text keys. special: a map within it -> what it stands for.
 
     Raises:
         UsageError: it is not one, or holds an array that does not fit its bytes.
     """
     try:
-        value = _msgpack().unpackb(data, object_hook=_array, strict_map_key=True)
+        value = _msgpack().unpackb(data, object_hook=special, strict_map_key=True)
     except UsageError:
         raise
     except Exception as error:  # msgpack raises many kinds, which mean the same
@@ -49,15 +60,20 @@ def _plain(value: Any) -> Any:
 
 def _array(value: dict[Any, Any]) -> Any:
     if b"__ndarray__" in value:
-        dtype, shape, data = _dtype(value.get(b"dtype")), value.get(b"shape"), value.get(b"data")
-        if not isinstance(shape, list) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
-            raise UsageError(f"an array of shape {str(shape)[:60]}: at most 8 whole numbers are wanted")
-        if not isinstance(data, bytes) or math.prod(shape) * dtype.itemsize != len(data):
-            raise UsageError(f"an array of shape {shape} and type {dtype} does not fit its bytes")
-        return np.frombuffer(data, dtype).reshape(shape).copy()  # one that may be written to
+        return array_of(value.get(b"dtype"), value.get(b"shape"), value.get(b"data"))
     if b"__npgeneric__" in value:
         return _dtype(value.get(b"dtype")).type(value.get(b"data"))
     return value
+
+
+def array_of(name: Any, shape: Any, data: Any) -> np.ndarray:
+    """The array of that type and shape in these bytes. Raises UsageError: they do not fit together."""
+    dtype = _dtype(name)
+    if not isinstance(shape, list) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
+        raise UsageError(f"an array of shape {str(shape)[:60]}: at most 8 whole numbers are wanted")
+    if not isinstance(data, bytes) or math.prod(shape) * dtype.itemsize != len(data):
+        raise UsageError(f"an array of shape {shape} and type {dtype} does not fit its bytes")
+    return np.frombuffer(data, dtype).reshape(shape).copy()  # one that may be written to
 
 
 def _dtype(name: Any) -> np.dtype[Any]:

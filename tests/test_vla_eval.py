@@ -1,0 +1,597 @@
+"""vla-eval in both directions: kerv serves its benchmarks, Meta-World is one of them, and recordings become studies."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import anyio
+import msgpack
+import numpy as np
+import pandas as pd
+import pytest
+import vla_eval
+from examples.tiny_openvla import write_checkpoint
+from PIL import Image
+from test_serve import serving
+from typer.testing import CliRunner
+from vla_eval.benchmarks.base import StepBenchmark, StepResult
+from vla_eval.model_servers.predict import PredictModelServer
+from vla_eval.orchestrator import Orchestrator
+from vla_eval.recording import RecordingStore
+from vla_eval.specs import (
+    GRIPPER_CLOSE_POS,
+    IMAGE_RGB,
+    LANGUAGE,
+    POSITION_DELTA,
+    ROTATION_AA,
+    DimSpec,
+    check_specs,
+)
+from websockets.sync.client import connect
+
+from kerv_cli.base.config import compose
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.settings import RolloutSettings, ServeSettings
+from kerv_cli.cli.app import app
+from kerv_cli.lab.imported import read_evaluations, sides_of
+from kerv_cli.lab.run import run_task
+from kerv_cli.lab.served import read_served
+from kerv_cli.serve.policy import Policy
+from kerv_cli.serve.vla_eval import specs
+from kerv_cli.worlds.vla_eval import MetaWorld
+
+HORIZON = 10
+PARAMS = {"tasks": ["reach"], "seed": 100_000, "horizon": HORIZON}
+
+
+@pytest.fixture(scope="module")
+def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The policies in a folder that may be written to; the one that sees names its camera, as trained ones do."""
+    copy = shutil.copytree(policies, tmp_path_factory.mktemp("results") / "results")
+    path = copy / "artifacts" / "target" / "nano-vision" / "target.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"cameras": ["corner4"]}))
+    return copy
+
+
+def policy_of(results: Path, target: str, *words: str) -> Policy:
+    typed = ["protocol=vla_eval", f"policy.target={target}", f"results={results}", *words]
+    return Policy(compose("serve", typed, ServeSettings))
+
+
+def config_of(benchmark: str, episodes: int = 2, **params: Any) -> dict[str, Any]:
+    return {"benchmarks": [{"benchmark": benchmark, "episodes_per_task": episodes, "params": params}]}
+
+
+METAWORLD = config_of("kerv_cli.worlds.vla_eval:MetaWorld", **PARAMS)
+
+
+def evaluated(policy: Policy, config: Mapping[str, Any], folder: Path, name: str) -> Path:
+    """Serves the policy and runs the benchmark as `vla-eval run --no-docker` does -> its recording."""
+    with serving(policy) as (port, _):
+        run(config, f"ws://127.0.0.1:{port}", folder, name)
+    return folder / f"recording-{name}.sqlite"
+
+
+def run(config: Mapping[str, Any], url: str, folder: Path, name: str) -> list[dict[str, Any]]:
+    return vla_eval.run(dict(config), server_url=url, output_dir=folder, eval_id=name)
+
+
+def kerv(*words: str) -> str:
+    result = CliRunner().invoke(app, list(words))
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+# --- kerv's policies as a model server
+
+
+@pytest.mark.bits
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [("nano-state", ["method=naive_sd"]), ("nano-state", ["method=sp_vla"]), ("nano-vision", ["method=spec_vla"])],
+)
+def test_a_benchmark_run_by_vla_eval_has_the_episodes_of_a_rollout(
+    results: Path, tmp_path: Path, target: str, words: list[str]
+) -> None:
+    name = f"{target}-{words[0][7:]}"
+    evaluated(policy_of(results, target, *words), METAWORLD, tmp_path, name)
+    typed = [f"policy.target={target}", f"results={results}", f"world.horizon={HORIZON}", "episodes=2", *words]
+    settings = compose("rollout", [*typed, "record=0"], RolloutSettings)
+    served = {}
+    for path in (results / "served" / f"{name}-MetaWorld").iterdir():
+        episode = read_served(path)
+        assert episode is not None
+        served[episode.episode["task"], episode.episode["seed"]] = episode
+    for record in run_task(settings, "reach-v3", (100_000, 100_001)):
+        episode = served.pop(("reach-v3", record.seed))
+        row, decodes = episode.episode, episode.decodes.to_pylist()
+        assert (row["success"], row["steps"], row["forwards"]) == (record.success, record.steps, record.forwards)
+        assert [one["tokens"] for one in decodes] == [list(one.tokens) for one in record.decodes]
+        assert [one["mode"] for one in decodes] == [one.mode for one in record.decodes]
+        assert row["path_length"] == pytest.approx(record.path_length)
+        assert row["jerk"] == pytest.approx(record.jerk)
+        assert all(one["seconds"] > 0 for one in decodes)
+    assert not served
+
+
+class Client:
+    """Speaks vla-eval's protocol and nothing else."""
+
+    def __init__(self, port: int) -> None:
+        self.connection = connect(f"ws://127.0.0.1:{port}", compression=None, max_size=None).__enter__()
+        self.seq = 0
+
+    def tell(self, kind: str, payload: Any) -> None:
+        self.seq += 1
+        message = {"type": kind, "payload": payload, "seq": self.seq, "timestamp": 0.0}
+        self.connection.send(msgpack.packb(message, default=plain))
+
+    def ask(self, kind: str, payload: Any) -> tuple[str, Any]:
+        self.tell(kind, payload)
+        return self.hear()
+
+    def hear(self) -> tuple[str, Any]:
+        answer = msgpack.unpackb(self.connection.recv(5))
+        assert answer["seq"] == self.seq or answer["type"] == "error"
+        return answer["type"], answer["payload"]
+
+    def act(self, **changes: Any) -> np.ndarray:
+        kind, payload = self.ask("observation", {**seen(0), **changes})
+        assert kind == "action", payload
+        made = payload["actions"]
+        return np.frombuffer(made["data"], made["dtype"]).reshape(made["shape"])
+
+
+def plain(value: Any) -> Any:
+    """An array as vla-eval writes it: an image as PNG."""
+    if value.ndim == 3:
+        file = io.BytesIO()
+        Image.fromarray(value).save(file, "PNG")
+        return {"__image__": True, "format": "png", "data": file.getvalue(), "shape": list(value.shape)}
+    return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
+
+
+def seen(seed: int) -> dict[str, Any]:
+    random = np.random.default_rng(seed)
+    image = random.integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    return {"images": {"corner4": image}, "task_description": "open a drawer", "state": random.normal(size=4)}
+
+
+@pytest.fixture(scope="module")
+def policy(results: Path) -> Policy:
+    return policy_of(results, "nano-vision")
+
+
+def test_hello_says_what_the_policy_reads_and_sends(policy: Policy) -> None:
+    with serving(policy) as (port, _):
+        kind, about = Client(port).ask("hello", {"protocol_version": 1, "harness_version": "0.8.0"})
+    assert kind == "hello"
+    assert (about["protocol_version"], about["model_server"]) == (1, "kerv")
+    assert about["observation_params"] == {"camera": "corner4", "image_size": 96}
+    assert about["kerv"]["settings"]["method"] == "ar"
+    own = {key: {name: DimSpec.from_dict(one) for name, one in about[key].items()} for key in about if "spec" in key}
+    world = MetaWorld()
+    pair = own["action_spec"], world.get_action_spec(), own["observation_spec"], world.get_observation_spec()
+    assert check_specs(*pair) == []
+
+
+def test_a_chunk_is_sent_step_by_step_and_decoded_once(policy: Policy) -> None:
+    with serving(policy, log_every=1) as (port, log):
+        client = Client(port)
+        client.tell("episode_start", {"task": {"name": "reach-v3"}})
+        chunk = [client.act() for _ in range(4)]
+        client.act(images={"corner4": np.zeros((96, 96, 3), np.uint8)})
+        assert sum("answers" in line for line in log) == 2
+    expected = policy.artifacts.target
+    assert np.array(chunk).shape == (4, len(expected.actions.names))
+
+
+def shown(camera: str, image: Any) -> dict[str, Any]:
+    return {**seen(0), "images": {camera: image}}
+
+
+BLACK = np.zeros((96, 96, 3), np.uint8)
+NO_PNG = {"__image__": True, "format": "png", "data": b"cat"}
+BOMB = {"__image__": True, "format": "raw", "data": b"", "dtype": "<f8", "shape": [2**40]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "payload", "said"),
+    [
+        ("hello", {"protocol_version": 9}, "protocol version 9 is not known here: this server speaks 1"),
+        ("hello", {}, "protocol version None is not known"),
+        ("greeting", {}, "a message of type greeting: hello, episode_start, observation, episode_end"),
+        ("observation", [1], "a message of type observation"),
+        ("observation", shown("corner2", BLACK), "camera corner4: the message has images of corner2"),
+        ("observation", {**seen(0), "images": {}}, "has images of nothing"),
+        ("observation", shown("corner4", BLACK[:64, :64]), "images.corner4 is (64, 64, 3)"),
+        ("observation", shown("corner4", NO_PNG), "cannot be read as PNG or JPEG"),
+        ("observation", shown("corner4", BOMB), "does not fit its bytes"),
+        ("observation", {**seen(0), "state": np.zeros(7)}, "state has shape (7,), 4 or 39 numbers are wanted"),
+        ("observation", {**seen(0), "state": np.array([0, np.inf, 0, 0])}, "not finite, at [1]"),
+        ("observation", {**seen(0), "task_description": "word " * 40}, "has 40 words"),
+        ("observation", {**seen(0), "task_description": 3}, "task_description is int"),
+    ],
+)
+def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(
+    policy: Policy, kind: str, payload: Any, said: str
+) -> None:
+    with serving(policy) as (port, log):
+        client = Client(port)
+        answer, told = client.ask(kind, payload)
+        assert answer == "error"
+        assert said in told["error"]
+        assert "\n" not in told["error"]
+        assert any(said in line for line in log)
+        assert client.act().shape == (4,)
+
+
+@pytest.mark.parametrize("frame", [b"\xc1garbage", b"", "text", msgpack.packb([1]), msgpack.packb({"type": []})])
+def test_garbage_gets_one_line_and_the_server_goes_on(policy: Policy, frame: bytes | str) -> None:
+    with serving(policy) as (port, _):
+        client = Client(port)
+        client.connection.send(frame)
+        assert client.hear()[0] == "error"
+        assert client.act().shape == (4,)
+
+
+def test_names_that_are_no_file_names_are_not_kept(policy: Policy, results: Path) -> None:
+    with serving(policy) as (port, _):
+        client = Client(port)
+        client.tell("episode_start", {"recording": {"eval_id": "../../outside", "eid": "x"}})
+        client.act()
+        client.tell("episode_end", {"metrics": {"success": True}})
+        client.act()
+    assert not list(results.parent.rglob("x.parquet"))
+
+
+def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results: Path) -> None:
+    alone, together = policy_of(results, "nano-state"), policy_of(results, "nano-state", "batch=3")
+    states = [np.random.default_rng(seed).normal(size=39) for seed in range(3)]
+
+    def actions(policy: Policy) -> list[np.ndarray]:
+        made: dict[int, np.ndarray] = {}
+
+        def client(i: int, port: int) -> None:
+            made[i] = Client(port).act(images={}, state=states[i])
+
+        with serving(policy) as (port, _):
+            threads = [threading.Thread(target=client, args=(i, port)) for i in range(3)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        return [made[i] for i in range(3)]
+
+    np.testing.assert_allclose(actions(together), actions(alone), atol=1e-5)
+    with pytest.raises(UsageError, match="alone decode several episodes at once"):
+        policy_of(results, "nano-state", "batch=3", "method=naive_sd")
+
+
+def test_one_bad_observation_of_a_batch_is_no_others_fault(results: Path) -> None:
+    policy = policy_of(results, "nano-state", "batch=2")
+    with policy.session() as one, policy.session() as two:
+        good = {"images": {}, "task_description": "reach", "state": np.zeros(39)}
+        outcomes: list[Any] = [None, None]
+
+        def ask(i: int, session: Any, words: str) -> None:
+            from kerv_cli.base.spaces import Observation
+
+            session.begin("reach-v3", 0, np.zeros(3))
+            try:
+                outcomes[i] = session.decode(Observation(np.zeros(4), good["state"], words)).actions.shape
+            except UsageError as error:
+                outcomes[i] = str(error)
+
+        threads = [
+            threading.Thread(target=ask, args=(0, one, "reach")),
+            threading.Thread(target=ask, args=(1, two, "word " * 40)),
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert outcomes[0] == (4, 4)
+    assert "40 words" in outcomes[1]
+
+
+# --- Meta-World as a benchmark
+
+
+def test_the_benchmark_is_reached_without_a_simulator() -> None:
+    code = (
+        "import sys; from kerv_cli.worlds.vla_eval import MetaWorld; b = MetaWorld(tasks=['MT10'], stress='push', "
+        "stress_level=2); print(len(b.get_tasks()), [m for m in ('torch', 'mujoco', 'metaworld') if m in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "10 []"
+
+
+@pytest.mark.parametrize(
+    ("params", "said"),
+    [
+        ({"tasks": "reech"}, "unknown task or suite 'reech'"),
+        ({"camera": "corner9"}, "unknown camera 'corner9'"),
+        ({"horizon": 501}, "between 1 and 500"),
+        ({"stress": "earthquake", "stress_level": 1}, "unknown world.stress.kind|unknown stress"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_a_benchmark_that_cannot_be_says_so(params: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        MetaWorld(**params).reset({"name": "reach-v3"})
+
+
+class Scripted(PredictModelServer):
+    """A model server of vla-eval's own: moves towards the goal, which is privileged; dofs: numbers of its action."""
+
+    def __init__(self, dofs: int = 4) -> None:
+        super().__init__()
+        self.dofs = dofs
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return {"privileged": True, "send_images": False}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return {"position": POSITION_DELTA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        return {"language": LANGUAGE, "state": DimSpec("state", 39, "privileged39")}
+
+    def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
+        move = np.clip(10 * (obs["state"][36:39] - obs["state"][:3]), -1, 1)
+        return {"actions": np.append(move, np.zeros(self.dofs - 3))}
+
+
+@pytest.fixture(scope="module")
+def recordings(results: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Evaluations of the same episodes, served by kerv and by vla-eval's own server."""
+    root = tmp_path_factory.mktemp("recordings")
+    config = config_of("kerv_cli.worlds.vla_eval:MetaWorld", 3, **{**PARAMS, "horizon": 40})
+    there = {
+        method: evaluated(policy_of(results, "nano-state", f"method={method}"), config, root / method, method)
+        for method in ("ar", "naive_sd")
+    }
+    with vla_eval.serve_background(Scripted()) as server:
+        run(config, server.url, root / "scripted", "scripted")
+    return {**there, "scripted": root / "scripted" / "recording-scripted.sqlite"}
+
+
+def test_a_server_of_vla_eval_meets_meta_world(recordings: dict[str, Path]) -> None:
+    (one,) = read_evaluations(recordings["scripted"])
+    assert one.name == "Scripted"
+    assert {(e.task, e.seed) for e in one.episodes} == {
+        (t, 100_000 + i) for t in ("reach-v3", "push-v3") for i in range(3)
+    }
+    reached = [episode.success for episode in one.episodes if episode.task == "reach-v3"]
+    assert all(reached)
+    assert len({episode.start for episode in one.episodes}) == 6
+
+
+def test_seven_numbers_for_four_dofs_end_the_episode_in_one_line(tmp_path: Path) -> None:
+    with vla_eval.serve_background(Scripted(7)) as server:
+        run(config_of("kerv_cli.worlds.vla_eval:MetaWorld", 1, tasks="reach", horizon=5), server.url, tmp_path, "seven")
+    (one,) = read_evaluations(tmp_path)
+    assert [episode.reason for episode in one.episodes] == ["env_step"]
+    with sqlite3.connect(tmp_path / "recording-seven.sqlite") as file:
+        (detail,) = file.execute("SELECT failure_detail FROM episode_results").fetchone()
+    assert "takes 4 finite numbers (dx, dy, dz, gripper), the model server sent an array of shape (7,)" in detail
+
+
+# --- recordings as studies
+
+
+def test_evaluations_of_the_same_episodes_are_paired(results: Path, recordings: dict[str, Path]) -> None:
+    said = kerv("runs", "import", *map(str, recordings.values()), "name=three", f"results={results}", "--json")
+    rows = {r["label"]: r for r in json.loads(said)["settings"] if r["averaging"].startswith("micro")}
+    assert list(rows) == ["ar", "naive_sd", "Scripted"]
+    assert rows["naive_sd"]["pairs"] == rows["Scripted"]["pairs"] == rows["Scripted"]["only_method"] == 3
+    assert rows["naive_sd"]["time_per_step_ms"] > 0
+    assert rows["naive_sd"]["forwards_per_step"] <= rows["ar"]["forwards_per_step"] == 4
+    assert rows["Scripted"]["time_per_step_ms"] is None
+    assert rows["naive_sd"]["speedup"] is None, "the evaluations did not take turns"
+    assert rows["ar"]["target_sha256"]
+    report = kerv("report", "study=three", f"results={results}")
+    assert "Scripted" in report
+    assert "three" in kerv("runs", "list", f"results={results}")
+    assert "success" in kerv("runs", "compare", "three:ar", "three:Scripted", f"results={results}")
+    assert "three" in kerv("report", "--choose", "study=three", "loss=50", f"results={results}")
+    table = pd.read_csv(results / "report" / "tables" / "three.csv")
+    assert set(table["executor"]) == {"vla-eval"}
+    refused = CliRunner().invoke(app, ["runs", "rerun", "three", f"results={results}"])
+    assert (refused.exit_code, "was imported: run vla-eval again" in refused.output) == (2, True)
+
+
+def test_the_aggregate_and_the_recording_say_the_same(recordings: dict[str, Path]) -> None:
+    (recorded,) = read_evaluations(recordings["naive_sd"])
+    (aggregate,) = read_evaluations(recordings["naive_sd"].parent / "MetaWorld_aggregate.json")
+    assert sorted(recorded.episodes, key=str) == sorted(aggregate.episodes, key=str)
+    assert (recorded.facts, recorded.name, recorded.id) == (aggregate.facts, "naive_sd", aggregate.id)
+
+
+def test_an_import_again_replaces_the_study_and_no_other(results: Path, recordings: dict[str, Path]) -> None:
+    for _ in range(2):
+        kerv("runs", "import", str(recordings["ar"]), "name=again", "labels=mine", f"results={results}")
+    assert "mine" in kerv("runs", "show", "again", f"results={results}")
+    plan = results / "studies" / "own" / "plan.yaml"
+    plan.parent.mkdir(parents=True)
+    plan.write_text((results / "studies" / "again" / "plan.yaml").read_text())
+    refused = CliRunner().invoke(app, ["runs", "import", str(recordings["ar"]), "name=own", f"results={results}"])
+    assert "study 'own' is there and was not imported" in refused.output
+    shutil.rmtree(plan.parent)
+
+
+def test_a_killed_shard_leaves_episodes_that_are_missing_until_it_ran_again(results: Path, tmp_path: Path) -> None:
+    config = config_of("kerv_cli.worlds.vla_eval:MetaWorld", 4, **{**PARAMS, "horizon": 5})
+    config["output_dir"] = str(tmp_path)
+    claim, claimed = RecordingStore.claim, []
+
+    def killed(self: RecordingStore, *arguments: Any) -> int | None:
+        """Shard 1 claims an episode and is never heard of again."""
+        if arguments[1] == 1 and claimed:
+            raise KeyboardInterrupt
+        item = claim(self, *arguments)
+        claimed.append(item)
+        if arguments[1] == 1:
+            raise KeyboardInterrupt
+        return item
+
+    with serving(policy_of(results, "nano-state")) as (port, _), pytest.MonkeyPatch.context() as patch:
+        config["server"] = {"url": f"ws://127.0.0.1:{port}"}
+        patch.setattr(RecordingStore, "claim", killed)
+        with pytest.raises(KeyboardInterrupt):
+            anyio.run(Orchestrator(config, 1, 2, "shards").run)
+        anyio.run(Orchestrator(config, 0, 2, "shards").run)
+        patch.undo()
+        words = ["runs", "import", str(tmp_path), "name=shards", f"results={results}"]
+        assert "ar: 1 of 4 episodes of MetaWorld are missing" in kerv(*words)
+        assert "1 of 2 cells" in kerv("runs", "show", "shards", f"results={results}")
+        anyio.run(Orchestrator(config, 1, 2, "shards").run)
+    assert "missing" not in kerv(*words)
+    assert re.search(r"state +complete", kerv("runs", "show", "shards", f"results={results}"))
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _no_table(path: Path) -> None:
+    with sqlite3.connect(path) as file:
+        file.execute("DROP TABLE episode_results")
+
+
+def _no_numbers(path: Path) -> None:
+    with sqlite3.connect(path) as file:
+        file.execute("UPDATE episode_results SET metrics = '[1'")
+
+
+def _empty(path: Path) -> None:
+    with sqlite3.connect(path) as file:
+        file.execute("DELETE FROM episode_results")
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (_cut, "is damaged, cut short or no recording"),
+        (lambda path: path.write_text("SQLite no more"), "is damaged, cut short or no recording"),
+        (_no_table, "no such table: episode_results"),
+        (_no_numbers, "is damaged"),
+        (_empty, "the recording holds no episode"),
+        (Path.unlink, "no recording of vla-eval"),
+    ],
+)
+def test_a_harmed_recording_is_refused_in_one_line(
+    recordings: dict[str, Path], tmp_path: Path, harm: Callable[[Path], Any], said: str
+) -> None:
+    path = tmp_path / "recording-x.sqlite"
+    shutil.copy(recordings["ar"], path)
+    harm(path)
+    refused = CliRunner().invoke(app, ["runs", "import", str(path), f"results={tmp_path}"])
+    assert refused.exit_code in (1, 2)
+    assert said in refused.output
+    assert refused.output.count("\n") == 1
+
+
+def test_an_aggregate_that_is_cut_short_is_refused(recordings: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "x_aggregate.json"
+    path.write_text((recordings["ar"].parent / "MetaWorld_aggregate.json").read_text()[:-200])
+    with pytest.raises(CheckpointError, match="cannot be read as JSON"):
+        read_evaluations(path)
+    path.write_text("[1, 2]")
+    with pytest.raises(CheckpointError, match="or no recording of vla-eval"):
+        read_evaluations(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"config": {"params": {**PARAMS, "horizon": 40, "seed": 5}}}, "params.seed is 100000 and 5"),
+        ({"benchmark": "LIBERO"}, "are of other benchmarks: MetaWorld and LIBERO"),
+        ({"episodes": ()}, "have no episode in common"),
+    ],
+)
+def test_evaluations_of_other_episodes_are_refused(
+    recordings: dict[str, Path], changes: dict[str, Any], said: str
+) -> None:
+    (first,), (second,) = (read_evaluations(recordings[name]) for name in ("ar", "naive_sd"))
+    changes = {**changes, **({"config": {**second.config, **changes["config"]}} if "config" in changes else {})}
+    with pytest.raises(UsageError, match=said):
+        sides_of([[first], [replace(second, **changes)]])
+    with pytest.raises(UsageError, match="one for each of the 2 recordings"):
+        sides_of([[first], [second]], ["one"])
+
+
+# --- LIBERO up to its container (docs/libero.md)
+
+
+class Stand(StepBenchmark):
+    """In LIBERO's place: its observations, actions, specs and settle steps, in a world of noise."""
+
+    def __init__(self, suite: str = "libero_spatial", seed: int = 7) -> None:
+        super().__init__()
+        self.suite, self.seed, self.steps = suite, seed, 0
+
+    def get_tasks(self) -> list[dict[str, Any]]:
+        names = ("pick up the cup", "open the drawer")
+        return [{"name": name, "suite": self.suite, "task_id": number} for number, name in enumerate(names)]
+
+    def reset(self, task: dict[str, Any]) -> Any:
+        self.steps, self.sum = 0, 0.0
+        self.random = np.random.default_rng([self.seed, task["task_id"], task["episode_idx"]])
+        return self.random.integers(0, 256, (256, 256, 3), dtype=np.uint8)
+
+    def step(self, action: dict[str, Any]) -> StepResult:
+        values = np.asarray(action["actions"])
+        assert values.shape == (7,)
+        assert values[-1] in (-1.0, 1.0)
+        self.steps += 1
+        self.sum += float(values[:6].sum())
+        return StepResult(self.random.integers(0, 256, (256, 256, 3), dtype=np.uint8), 0.0, self.steps >= 3, {})
+
+    def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
+        return {"images": {"agentview": raw_obs}, "task_description": task["name"]}
+
+    def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
+        return {"success": self.sum > 0}
+
+    def get_metadata(self) -> dict[str, Any]:
+        return {"max_steps": 220, "max_episodes_per_task": 50, "suite": self.suite}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        return {"agentview": IMAGE_RGB, "language": LANGUAGE}
+
+
+def test_openvla_on_liberos_interface_from_checkpoint_to_paired_table(tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    checkpoint = write_checkpoint(tmp_path / "checkpoint")
+    built = ["target=openvla", f"checkpoint={checkpoint}", "name=libero", "camera=agentview", "control_hz=20"]
+    kerv("build", "target", *built, "crop=true", "libero=true", "prompt_tokens=120", f"results={results}")
+    config = config_of(f"{__name__}:Stand", 2, suite="libero_spatial")
+    recordings = []
+    for method in ("ar", "jacobi"):
+        policy = policy_of(results, "libero", f"method={method}", "gripper=signed_inverted")
+        stand = Stand()
+        own = {k: {n: DimSpec.from_dict(d) for n, d in v.items()} for k, v in specs(policy.interface).items()}
+        pair = own["action_spec"], stand.get_action_spec(), own["observation_spec"], stand.get_observation_spec()
+        assert check_specs(*pair) == []
+        recordings.append(str(evaluated(policy, config, tmp_path / method, method)))
+    said = kerv("runs", "import", *recordings, "name=libero", f"results={results}", "--json")
+    rows = {row["label"]: row for row in json.loads(said)["settings"] if row["averaging"].startswith("micro")}
+    assert rows["jacobi"]["pairs"] == 4
+    assert rows["jacobi"]["difference"] == 0
+    assert rows["ar"]["forwards_per_step"] == 7
+    assert rows["jacobi"]["task"] == "open the drawer;pick up the cup"
