@@ -276,7 +276,7 @@ def nano(policies: Path) -> CompactTarget:
 def test_observations_come_with_what_was_executed_before_them(nano: CompactTarget) -> None:
     demo = episode(10)
     some = columns_of(nano, demo, 3, np.arange(10), 2)
-    assert some["known"][:3].tolist() == [[0, 0], [0, 1], [1, 1]]
+    assert some["valid"][:3].tolist() == [[0, 0], [0, 1], [1, 1]]
     normal = nano.actions.normalise(demo.executed)
     for t in range(2, 10):
         assert np.allclose(some["history"][t], normal[t - 2 : t])

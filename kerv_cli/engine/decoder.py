@@ -261,9 +261,7 @@ class Decoder:
     def verify(self, chunk: Chunk, draft: Draft) -> tuple[Tensor, Verified]:
         """Forwards the last committed token and the draft's n rows -> hidden (1, 1 + n, E), and the draft with its
         target tokens on the host."""
-        tokens = upload(chunk.tokens[-1:], self.target.device)
-        if len(draft):
-            tokens = torch.cat([tokens, draft.tokens_on(tokens.device)])
+        tokens = draft.tokens_behind(chunk.tokens[-1], self.target.device)
         at = chunk.prompt_length + len(chunk.tokens) - 1
         hidden = self.forward(self.target.embed(tokens[None]), draft, at, 1, chunk)
         return hidden, self.read(chunk, draft, self.target.head(hidden)[0].argmax(-1))

@@ -103,6 +103,12 @@ class Draft:
         """(n,) int64."""
         return upload(self.tokens, device) if self.tokens.device == HOST else self.tokens
 
+    def tokens_behind(self, token: int, device: torch.device) -> Tensor:
+        """(1 + n,) int64: `token`, then the draft's."""
+        if self.tokens.device == HOST:
+            return upload(np.concatenate([[token], self.tokens.numpy()]), device)
+        return torch.cat([torch.full_like(self.tokens[:1], token), self.tokens])
+
     @cached_property
     def ancestors(self) -> np.ndarray | Tensor | None:
         """(n, n) bool: row i sees row j if j is i or an ancestor of i. An array where the parents lie on the host; None

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from kerv_cli.base.findings import Failed, Finding, run
 from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.protocol import Target
 
@@ -246,15 +247,7 @@ class Trial:
         tokens = torch.zeros(1, 0, dtype=torch.long, device=device)
         for _ in range(size):
             tokens = torch.cat([tokens, self.target.head(self.plain(tokens)[:, -1]).argmax(-1)[None]], 1)
-        cache, length = self.target.new_cache(1, self.capacity), self.prompt.shape[1]
-        hidden = self.target.forward(self.prompt, torch.arange(length, device=device), cache)
-        decoded = [int(self.target.head(hidden[0, -1]).argmax())]
-        while len(decoded) < size:
-            position = torch.tensor([length + len(decoded) - 1], device=device)
-            hidden = self.target.forward(
-                self.target.embed(torch.tensor([decoded[-1:]], device=device)), position, cache
-            )
-            decoded.append(int(self.target.head(hidden[0, -1]).argmax()))
+        decoded = greedy(self.target, self.prompt, self.target.new_cache(1, self.capacity))[0][0].tolist()
         if decoded != tokens[0].tolist() and self.prompt.dtype in (torch.float32, torch.float64):
             raise Failed(f"greedy decoding gives {decoded} with a cache and {tokens[0].tolist()} without")
         values = self.target.actions.decode(np.array(decoded).reshape(-1, self.target.actions.dofs))

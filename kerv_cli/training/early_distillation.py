@@ -47,7 +47,7 @@ class EarlySamples(Rows):
 
     features: Tensor  # (n, F) float16, pooled prompts
     history: Tensor  # (n, h, D) float32, the last executed actions, normalised, oldest first
-    known: Tensor  # (n, h) float32, 0 where the episode had not begun yet
+    valid: Tensor  # (n, h) float32, 0 where the episode had not begun yet
     tokens: Tensor  # (n, N) int64
     episodes: Tensor  # (n,) int64
     perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
@@ -99,9 +99,9 @@ def columns_of(target: Target, episode: DemoEpisode, index: int, steps: np.ndarr
     """The fields of `EarlySamples` that do not need the target, for some control steps (n,) of one episode."""
     executed = target.actions.normalise(episode.executed)
     histories = [padded(executed[:t], history, target.actions.dofs) for t in steps.tolist()]
-    actions, known = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
+    actions, valid = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
     episodes, perturbed = (torch.full((len(steps),), value) for value in (index, episode.perturbed))
-    return {"history": actions, "known": known, "episodes": episodes, "perturbed": perturbed}
+    return {"history": actions, "valid": valid, "episodes": episodes, "perturbed": perturbed}
 
 
 class EarlyDistillation:
@@ -119,7 +119,7 @@ class EarlyDistillation:
 
     def logits(self, early: EarlyDrafter, samples: EarlySamples, indices: Tensor) -> Tensor:
         """The drafter's logits (B, N, V) for the samples at `indices` (B,)."""
-        inputs = (samples.features, samples.history, samples.known)
+        inputs = (samples.features, samples.history, samples.valid)
         return early(*(x[indices].to(self.device).float() for x in inputs))
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:

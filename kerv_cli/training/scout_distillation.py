@@ -30,10 +30,10 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 
 @dataclass(frozen=True)
 class ScoutSamples(Observations):
-    """Observations, and what the target says of them. history, known, episodes, perturbed: as in `EarlySamples`."""
+    """Observations, and what the target says of them. history, valid, episodes, perturbed: as in `EarlySamples`."""
 
     history: Tensor
-    known: Tensor
+    valid: Tensor
     episodes: Tensor
     perturbed: Tensor
     tokens: Tensor  # (n, N) int64
@@ -80,7 +80,7 @@ class ScoutDistillation:
 
     def outputs(self, scout: Scout, samples: ScoutSamples, indices: Tensor) -> tuple[Tensor, Tensor]:
         """Logits (B, N, V) and positions (B, K, 3) for the samples at `indices` (B,)."""
-        past = (samples.history[indices].to(self.device), samples.known[indices].to(self.device))
+        past = (samples.history[indices].to(self.device), samples.valid[indices].to(self.device))
         logits, places = scout(samples.inputs(indices, self.device), *past)
         return logits, places
 

@@ -8,6 +8,7 @@ first look without 15 GB:
 from __future__ import annotations
 
 import sys
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -87,18 +88,18 @@ def config_of(shape: Shape) -> dict[str, Any]:
 
 
 def random_tensors(shape: Shape, seed: int) -> dict[str, Tensor]:
-    """Seeded weights that keep activations of order one, so that tokens depend on image and instruction. The head's
-    rows of the action tokens are the longest: the greedy token over all ids is an action."""
-    random = torch.Generator().manual_seed(seed)
-    tensors = {name: _random(name, sizes, random) for name, sizes in layout(shape).items()}
+    """Seeded weights that keep activations of order one, so that tokens depend on image and instruction; a tensor's
+    follow from its name, in whatever order names are listed. The head's rows of the action tokens are the longest: the
+    greedy token over all ids is an action."""
+    tensors = {name: _random(name, sizes, seed) for name, sizes in layout(shape).items()}
     head = tensors["language_model.lm_head.weight"]
     head[: shape.vocabulary - shape.bins] *= 0.1
     head[shape.vocabulary :] *= 0.1
     return tensors
 
 
-def _random(name: str, sizes: Sizes, random: torch.Generator) -> Tensor:
-    drawn = torch.randn(sizes, generator=random)
+def _random(name: str, sizes: Sizes, seed: int) -> Tensor:
+    drawn = torch.randn(sizes, generator=torch.Generator().manual_seed(zlib.crc32(f"{seed} {name}".encode())))
     if "norm" in name and name.endswith("weight"):
         return 1 + 0.1 * drawn
     if name.endswith(("bias", "scale_factor")):
