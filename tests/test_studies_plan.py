@@ -171,7 +171,7 @@ def test_docstrings_and_layout_do_not_make_other_code() -> None:
 def test_settings_may_have_weights_of_their_own() -> None:
     settings = {"a": settings_of("ar"), "b": settings_of("ar")}
     settings["b"].policy.target = "other"
-    cells = plan(settings, ["reach-v3"], lambda s: {"target": s.policy.target})
+    cells = plan(settings, ["reach-v3"], lambda label: {"target": settings[label].policy.target})
     assert [c.identity["target"] for c in cells] == ["mt10-vision", "other"]
     assert cells[0].id != cells[1].id
 

@@ -63,7 +63,7 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     worlds = pairs[pairs["repeat"] == 0]  # a repeat is another time, not another world
     once = episodes[episodes["repeat"] == 0]
     timed = pairs if apart else pairs[pairs["in_turn"]]
-    has_times = _decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
+    has_times = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
         **_columns("success", _averaged(once, macro, _success)),
@@ -199,7 +199,7 @@ def paired(episodes: pd.DataFrame, baseline: pd.DataFrame) -> pd.DataFrame:
     return both.rename(columns={"difficulty_method": "difficulty"})
 
 
-def _decodes(episodes: pd.DataFrame) -> bool:
+def decodes(episodes: pd.DataFrame) -> bool:
     """Whether a target decodes at all; a scripted expert has no decoding time to compare."""
     return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
 

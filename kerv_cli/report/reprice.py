@@ -19,7 +19,7 @@ from kerv_cli.base.places import as_path, shipped_dir
 from kerv_cli.engine.cost import FORMAT, READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
 from kerv_cli.lab.identity import batch_of
 from kerv_cli.lab.plan import Cell
-from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.measures import MICRO, decodes, measure
 from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, is_baseline, rows_of
 from kerv_cli.report.text import compared, interval, intervals
@@ -82,7 +82,7 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
             times of its own.
     """
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
-    labels = [label for label in data.plan.labels if label in episodes and _decodes(episodes[label])]
+    labels = [label for label in data.plan.labels if label in episodes and decodes(episodes[label])]
     works = {label: _recorded(data, label) for label in labels}
     rows = []
     for machine in machines:
@@ -124,10 +124,6 @@ def _same(about: Mapping[str, Any], cell: Cell, episodes: pd.DataFrame) -> bool:
 
 def _speeds(values: Mapping[str, Any], prefix: str) -> dict[str, float]:
     return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
-
-
-def _decodes(episodes: pd.DataFrame) -> bool:
-    return bool(episodes["forwards"].sum() or episodes["skipped_decodes"].sum())
 
 
 @dataclass(frozen=True)
