@@ -9,6 +9,15 @@ from kerv_cli.base.errors import StorageError, UsageError
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.limits import check_name
 
+RELEASED = {
+    "mt10-state": "074e70fddd4f9a41885d7af9e93d81c722b3e470e23a2f560facf1556442f050",
+    "mt10-state-h8": "9669af18d21a824f5962a03961226e66fb01ff9a644cfc96ae8d8876af308c52",
+    "mt10-vision": "d2bda555360bfcd04b9d3c77a665623b23c1c9fedff1229838ade1f5cfca47de",
+    "mt10-vision-parallel": "096ce2dae9793b7f2efa3fbf020bebaf9ec6b664e650ab8ef97efc503db1e7f4",
+    "mt50-vision": "da0a0abf9f03a75a1a0b083778a7ef60bec2e288be250507bddb4be9030534e1",
+}
+"""Shipped policy -> SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
+
 
 def results_dir(results: str) -> Path:
     """The results folder.
@@ -81,6 +90,11 @@ def find_target(results: str, name: str) -> Path:
     for place in places:
         if (place / "target.json").is_file():
             return place
+    if name in RELEASED:
+        raise UsageError(
+            f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'kerv build policy "
+            f"source={name}.tar.gz', or source= its URL"
+        )
     known = sorted({p.parent.parent.name for p in shipped_dir().glob("[!.]*/target/target.json")})
     known += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json")})
     raise UsageError(

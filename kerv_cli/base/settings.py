@@ -493,6 +493,14 @@ class BuildTargetSettings(RunSettings):
 
 
 @dataclass
+class BuildPolicySettings(CommandSettings):
+    """`kerv build policy`: a policy of a release, which a wheel leaves out."""
+
+    source: str = setting("", "archive of the policy's folder (.tar.gz), by URL or path")
+    sha256: str = setting("", "of the archive; of a policy of kerv's the weights' hashes suffice")
+
+
+@dataclass
 class BuildDrafterSettings(RunSettings):
     """`kerv build drafter`: a drafter in the public EAGLE or Spec-VLA layout. policy.drafter: its new name."""
 

@@ -1,10 +1,17 @@
-"""`kerv build target`, `kerv build drafter` and `kerv build datastore`."""
+"""`kerv build target`, `policy`, `drafter` and `datastore`."""
 
 from __future__ import annotations
 
+import typer
+
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find, load, parts
-from kerv_cli.base.settings import BuildDatastoreSettings, BuildDrafterSettings, BuildTargetSettings
+from kerv_cli.base.settings import (
+    BuildDatastoreSettings,
+    BuildDrafterSettings,
+    BuildPolicySettings,
+    BuildTargetSettings,
+)
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_plan, progress_bar
 
@@ -27,6 +34,22 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
         raise UsageError(f"family={settings.family}: only {', '.join(importers)} is imported, others are trained")
     folder, figures = load(importers[settings.family].traits["importer"])(settings)
     print_figures("target", figures, folder, as_json)
+
+
+@command(
+    "build policy",
+    BuildPolicySettings,
+    keys="source sha256 results",
+    examples=(
+        "kerv build policy source=mt50-vision.tar.gz",
+        "kerv build policy source=https://example.org/mine.tar.gz sha256=0123abcd",
+    ),
+)
+def policy(settings: BuildPolicySettings) -> None:
+    """Fetch a policy of a release, which a wheel leaves out; its hashes are checked."""
+    from kerv_cli.targets.release import install
+
+    typer.echo(f"policy in {install(settings)}")
 
 
 @command(

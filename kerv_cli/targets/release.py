@@ -1,0 +1,75 @@
+"""A policy of a release, as an archive: `kerv build policy` puts it where policies are looked for, checked."""
+
+from __future__ import annotations
+
+import shutil
+import tarfile
+import tempfile
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.files import sha256_of, write_folder
+from kerv_cli.base.places import RELEASED, as_path, results_dir
+from kerv_cli.base.settings import BuildPolicySettings
+from kerv_cli.targets.checkpoint import read_target
+
+TIMEOUT = 60.0  # seconds without an answer
+
+
+def install(settings: BuildPolicySettings) -> Path:
+    """Unpacks the archive `settings.source` -> the policy's folder below `<results>/pretrained`. Every file of weights
+    is checked against its description, the target against the hash that kerv knows, another policy's archive against
+    the one that the settings name.
+
+    Raises:
+        UsageError: no source, no archive, or nothing to check it with. CheckpointError: it is another file than was
+            asked for, damaged, or holds no policy. KervError: the download failed. StorageError: writing failed.
+    """
+    if not settings.source:
+        raise UsageError("source=FILE: name the archive of a policy, by URL or path")
+    with tempfile.TemporaryDirectory() as scratch:
+        archive = _archive(settings.source, Path(scratch))
+        digest = sha256_of(archive)
+        if settings.sha256 and digest != settings.sha256.lower():
+            raise CheckpointError(f"{settings.source} has SHA-256 {digest}, not sha256={settings.sha256}")
+        policy = _unpacked(archive, Path(scratch) / "content", settings.source)
+        target = read_target(policy / "target")  # checks the weights
+        if target.sha256 != RELEASED.get(policy.name, target.sha256):
+            raise CheckpointError(f"{settings.source} holds another target than kerv's {policy.name}: fetch it again")
+        if policy.name not in RELEASED and not settings.sha256:
+            raise UsageError(f"{policy.name} is no policy of kerv: set sha256={digest} if you trust {settings.source}")
+        folder = results_dir(settings.results) / "pretrained" / policy.name
+        if not write_folder(folder, lambda place: shutil.copytree(policy, place, dirs_exist_ok=True)):
+            raise UsageError(f"{folder} is there already: remove it first")
+    return folder
+
+
+def _archive(source: str, scratch: Path) -> Path:
+    """The file of a path, or the download of a URL."""
+    if not source.startswith(("http://", "https://")):
+        path = as_path(source)
+        if not path.is_file():
+            raise UsageError(f"source={source}: no such file")
+        return path
+    path = scratch / "archive"
+    try:
+        with urllib.request.urlopen(source, timeout=TIMEOUT) as answer, path.open("wb") as file:
+            shutil.copyfileobj(answer, file)
+    except (urllib.error.URLError, OSError, ValueError) as error:
+        raise KervError(f"source={source} cannot be fetched: {getattr(error, 'reason', error)}") from error
+    return path
+
+
+def _unpacked(archive: Path, place: Path, source: str) -> Path:
+    """The one folder in the archive."""
+    try:
+        with tarfile.open(archive) as file:
+            file.extractall(place, filter="data")
+    except (tarfile.TarError, EOFError, OSError) as error:
+        raise CheckpointError(f"source={source} is no intact archive (.tar.gz): {error}") from error
+    folders = [path for path in place.iterdir() if (path / "target" / "target.json").is_file()]
+    if len(folders) != 1:
+        raise CheckpointError(f"source={source} holds no policy: one folder with target/target.json in it")
+    return folders[0]

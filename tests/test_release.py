@@ -1,0 +1,77 @@
+"""`kerv build policy`: the archive of a policy, checked and put where policies are looked for."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import shutil
+import tarfile
+import threading
+from functools import partial
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from kerv_cli.base import places
+from kerv_cli.base.files import sha256_of
+from kerv_cli.cli.app import app
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def kerv(*words: str, code: int = 0) -> str:
+    run = CliRunner().invoke(app, list(words))
+    assert run.exit_code == code, run.output
+    return run.output
+
+
+def test_the_hashes_are_those_of_the_shipped_policies() -> None:
+    shipped = (ROOT / "results/pretrained").glob("*/target/target.json")
+    assert {path.parts[-3]: json.loads(path.read_text())["sha256"] for path in shipped} == places.RELEASED
+
+
+@pytest.fixture
+def archive(policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An archive of a policy that this kerv does not have beside it, called as one of the released ones."""
+    monkeypatch.setattr(places, "shipped_dir", lambda: tmp_path / "nothing")
+    policy = tmp_path / "release/mt50-vision"
+    for kind in ("target", "drafter"):
+        shutil.copytree(policies / "artifacts" / kind / "nano-vision", policy / kind)
+    digest = json.loads((policy / "target/target.json").read_text())["sha256"]
+    monkeypatch.setitem(places.RELEASED, "mt50-vision", digest)
+    path = tmp_path / "mt50-vision.tar.gz"
+    with tarfile.open(path, "w:gz") as file:
+        file.add(policy, "mt50-vision")
+    return path
+
+
+def test_a_policy_that_the_wheel_leaves_out_is_fetched(archive: Path, tmp_path: Path) -> None:
+    results = f"results={tmp_path}/results"
+    words = ("rollout", "policy=mt50", "task=reach", results, "--plan")
+    assert "kerv build policy source=mt50-vision.tar.gz" in kerv(*words, code=2)
+    handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_address[1]}"
+        assert "pretrained/mt50-vision" in kerv("build", "policy", f"source={address}/{archive.name}", results)
+        assert "cannot be fetched" in kerv("build", "policy", f"source={address}/absent", results, code=1)
+        server.shutdown()
+    assert "is there already" in kerv("build", "policy", f"source={archive}", results, code=2)
+    assert "1 tasks" in kerv(*words)
+
+
+def test_another_file_than_the_one_asked_for_is_refused(
+    archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*words: str, code: int = 1) -> str:
+        return kerv("build", "policy", f"source={archive}", f"results={tmp_path}/results", *words, code=code)
+
+    assert "not sha256=00" in refused("sha256=00")
+    monkeypatch.setitem(places.RELEASED, "mt50-vision", "0" * 64)
+    assert "another target than kerv's mt50-vision" in refused()
+    monkeypatch.delitem(places.RELEASED, "mt50-vision")
+    assert f"set sha256={sha256_of(archive)}" in refused(code=2)
+    archive.write_bytes(archive.read_bytes()[:-500])
+    assert "no intact archive" in refused()
+    assert not (tmp_path / "results/pretrained").exists()
