@@ -171,8 +171,6 @@ def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
     Raises:
         StorageError: the disk refused.
     """
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # it is laid out: not again for each of the files
     contents = {kind: figure_bytes(figure, kind) for kind in ("png", "svg")}
     small = len(contents["svg"]) <= SVG_LIMIT
     if not small:

@@ -230,7 +230,8 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
         **_latencies(episodes["decode_seconds"]),
         "gauge_ms": 1000.0 * float(episodes["gauge_seconds"].median()),
     }
-    values |= {f"ms.{phase}": float((episodes[f"seconds.{phase}"] * per_step).mean()) for phase in PHASES}
+    phases = episodes[[f"seconds.{phase}" for phase in PHASES]].mul(per_step, axis=0).mean()
+    values |= {f"ms.{phase}": float(phases[f"seconds.{phase}"]) for phase in PHASES}
     sums = episodes[list({name: 0 for pair in _RATIOS.values() for name in pair})].sum().to_dict()
     values |= {name: float(sums[a] / sums[b]) if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
