@@ -275,7 +275,7 @@ def test_a_mistake_is_answered_for_what_it_is(
 def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Path) -> None:
     shown = kerv("sweep", f"results={tmp_path}")
     assert shown.returncode == 0, shown.stderr
-    assert re.search(r"\bdemo +│ 12 +│ 3 +│ 3 +│ 108 +│ The three papers", shown.stdout)
+    assert re.search(r"\bdemo +│ 12 +│ 3 +│ 5 +│ 180 +│ The three papers", shown.stdout)
     assert list(tmp_path.iterdir()) == []
     listed = {row["study"]: row for row in json.loads(kerv("sweep", "--json").stdout)}
     assert set(listed) == set(groups()["study"])
