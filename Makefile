@@ -29,9 +29,8 @@ test: lint ## check style, types and imports, then run the tests
 test-cpus: setup ## run the tests of equal bits and tokens under four kinds of CPU kernels
 	@$(BIN)/python scripts/cpus.py $(PARALLEL)
 
-demo: setup ## run the demo study and report it
+demo: setup ## run the demo study; ends with its verdict, its page and a recording
 	@$(BIN)/kerv sweep study=demo
-	@$(BIN)/kerv report study=demo
 
 torture: export OMP_NUM_THREADS := 1
 

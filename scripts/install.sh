@@ -66,8 +66,12 @@ pip() {
 # By itself and without what it needs, so that the second index serves nothing else.
 if [ "$build" = cpu ]; then
     torch=$(grep '^torch==' "$versions")
-    "$venv/bin/python" -m pip freeze --disable-pip-version-check 2>/dev/null | grep -qxF "$torch" ||
-        pip --no-deps --retries 1 --extra-index-url "$cpu_index" "$torch"
+    if ! "$venv/bin/python" -m pip freeze --disable-pip-version-check 2>/dev/null | grep -qxF "$torch" &&
+        ! pip --no-deps --retries 1 --extra-index-url "$cpu_index" "$torch" 2>/dev/null; then
+        echo "setup: $torch is not to be had here: taking the PyTorch that the package index offers (up to 3 GB)" >&2
+        versions=$venv/constraints.txt
+        grep -v '^torch==' requirements/cpu.txt >"$versions"
+    fi
 fi
 pip --constraint "$versions" --editable '.[dev]'
 touch "$stamp"

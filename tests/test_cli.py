@@ -241,6 +241,24 @@ def test_the_help_shows_the_defaults_that_hold() -> None:
         ("sweep study=typo.yaml study=main", "study= is given twice, typo.yaml and main: leave one out"),
         ("sweep study=typo.yaml", "unknown key in study=typo.yaml: 'setings': did you mean settings"),
         ("sweep study=no_baseline.yaml", "study 'no_baseline' has no setting 'ar', the baseline that its others are"),
+        ("rollout reach", "'reach' is not an override: did you mean task=reach?"),
+        ("sweep demo", "'demo' is not an override: did you mean study=demo?"),
+        ("rollout --task reach", "No such option: --task; settings have no dashes: task=VALUE"),
+        ("rollout task=", "name at least one task or suite: task=NAME, or leave it out"),
+        (
+            "rollout policy=mine",
+            "state, state_h8, vision, vision_h8 (policy.target=mine names weights)",
+        ),
+        ("train drafter target=mine", "unknown target 'mine': did you mean tiny? (policy.target=mine names weights)"),
+        ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
+        ("rollout method=ar,kerv", "method=ar,kerv names 2 choices: run each in turn with 'kerv rollout -m'"),
+        ("rollout task=reach, push", "'push' is not an override: did you mean task=push?"),
+        ("rollout episodes=three", "episodes: Value 'three' of type 'str' could not be converted to Integer"),
+        ("rollout method=kerv method=ar", "method= is given twice, kerv and ar: leave one out"),
+        ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
+        ("prepare for=kervv", "unknown method 'kervv': did you mean kerv"),
+        ("view nothing.rrd", "nothing.rrd does not exist: name a recording (.rrd) or a folder of them"),
+        ("report study=main", "no study 'main' in results/studies: run `kerv sweep study=main`"),
         ("sweep study=empty.yaml", "study 'empty' has no settings: see conf/study/demo.yaml"),
     ],
 )
@@ -257,7 +275,7 @@ def test_a_mistake_is_answered_for_what_it_is(
 def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Path) -> None:
     shown = kerv("sweep", f"results={tmp_path}")
     assert shown.returncode == 0, shown.stderr
-    assert re.search(r"\bdemo +│ 12 +│ 3 +│ 3 +│ 108 +│ The three papers", shown.stdout)
+    assert re.search(r"\bdemo +│ 12 +│ 3 +│ 5 +│ 180 +│ The three papers", shown.stdout)
     assert list(tmp_path.iterdir()) == []
     listed = {row["study"]: row for row in json.loads(kerv("sweep", "--json").stdout)}
     assert set(listed) == set(groups()["study"])

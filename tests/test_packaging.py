@@ -115,7 +115,8 @@ case "$1 $2" in
     "-m venv") mkdir -p .venv/bin && cat "$0" > .venv/bin/python && chmod +x .venv/bin/python ;;
     "-m pip") [ "$3" = --version ] && exit 0
               [ "$3" = freeze ] && { cat frozen 2>/dev/null || true; exit 0; }
-              echo "pip ${@:3}" >> log; [ ! -e pip-hangs ] || sleep 60; [ ! -e pip-fails ] ;;
+              echo "pip ${@:3}" >> log; [ ! -e pip-hangs ] || sleep 60
+              [[ "$*" = *torch==* && -e no-torch ]] && exit 1; [ ! -e pip-fails ] ;;
     "-I -S") [ -e drawable ] ;;
     *) echo "unexpected: $*" >&2; exit 97 ;;
 esac
@@ -203,6 +204,18 @@ def test_pytorch_that_is_there_is_not_fetched_again(checkout: Checkout) -> None:
     (checkout.root / "frozen").write_text(f"numpy==1\n{locked('cpu', 'torch')}\n")
     checkout.setup()
     assert len(checkout.log) == 1
+
+
+def test_another_pytorch_is_taken_where_the_locked_build_is_not_to_be_had(checkout: Checkout) -> None:
+    (checkout.root / "no-torch").touch()
+    result = checkout.setup()
+    assert result.returncode == 0
+    (line,) = setup_lines(result)
+    assert line.startswith(f"setup: {locked('cpu', 'torch')} is not to be had here: taking the PyTorch that")
+    assert checkout.log[-1].endswith("--constraint .venv/constraints.txt --editable .[dev]")
+    kept = (checkout.root / ".venv/constraints.txt").read_text()
+    assert "\ntorch==" not in kept
+    assert locked("cpu", "numpy") in kept
 
 
 def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_fetches(checkout: Checkout) -> None:

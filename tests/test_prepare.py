@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,8 @@ from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
 from kerv_cli.lab.resolve import resolve, resolve_rollout
+from kerv_cli.report import curves
+from kerv_cli.report.drawing import new_figure
 
 TASK = "reach-v3"
 MINE = "policy.target=mine"
@@ -73,7 +76,7 @@ def test_a_rollout_and_a_study_run_on_the_tasks_that_the_target_knows() -> None:
     assert resolve_rollout([MINE], False).settings["ar"].task == [TASK]
     assert tasks("study=own", MINE) == [TASK]
     assert tasks("study=main", MINE) == [TASK]  # the study names ten
-    assert tasks("study=demo", MINE) == [TASK]  # none of its three
+    assert tasks("study=demo", MINE) == [TASK]  # one of its three
     assert tasks("study=main", MINE, "task=push") == ["push"]
     assert tasks("study=main") == ["MT10"]
     assert len(resolve_rollout(["policy=expert"], False).settings["expert"].task) == 10
@@ -98,6 +101,40 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) ->
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
     assert "kerv runs rm drafter/mine'" in kerv("prepare", MINE, "--plan", code=1)
+
+
+class Tracker:
+    """A tracker's module: it keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.points: list[tuple[int, set[str]]] = []
+        self.ended = False
+
+    def init(self, **about: object) -> Tracker:
+        assert about["name"] == "target/short"
+        return self
+
+    def log(self, numbers: dict[str, float], step: int) -> None:
+        self.points.append((step, {key.split("/")[0] for key in numbers}))
+
+    def finish(self) -> None:
+        self.ended = True
+
+
+def test_a_training_is_logged_as_it_runs_and_a_short_one_draws_its_loss(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("train", "target", "name=short", "demos=few", "target=nano", "target.observation=state", "train.steps=3")
+    assert "pip install 'kerv[trackio]'" in kerv(*words, "log=trackio", code=2)
+    tracker = Tracker()
+    monkeypatch.setitem(sys.modules, "wandb", tracker)
+    drawn: list[dict[int, float]] = []
+    monkeypatch.setattr(curves, "loss_figure", lambda losses, title: drawn.append(losses) or new_figure(2.0, 2.0))
+    kerv(*words, "log=wandb")
+    assert tracker.points == [(1, {"training"}), (2, {"training"}), (3, {"training"}), (3, {"validation"})]
+    assert tracker.ended
+    assert [list(losses) for losses in drawn] == [[1, 2, 3]]
+    assert (results / "artifacts/target/short/curves.png").is_file()
 
 
 @pytest.mark.usefixtures("results")

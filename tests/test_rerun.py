@@ -23,6 +23,7 @@ from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, EpisodeRecord, Round
 from kerv_cli.report.viewing import rerun_log, viewer
 from kerv_cli.report.viewing.facts import readable
+from kerv_cli.report.viewing.film import save_film
 from kerv_cli.report.viewing.rerun_log import save_episode
 from kerv_cli.report.viewing.together import save_together
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of
@@ -175,9 +176,25 @@ def test_finding_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert find_recordings([tmp_path]) == [path]
     monkeypatch.setattr(viewer, "has_display", lambda: False)
     told = open_recording([path])
-    assert "--serve-web --bind 127.0.0.1" in told
+    assert "kerv view --web" in told
     assert path.name in told
     assert "drawer-open-v3" in read_summary(path)
+
+
+@pytest.mark.parametrize("ending", ["gif", "mp4"])
+def test_a_film_shows_the_camera_and_below_it_the_tokens(tmp_path: Path, ending: str) -> None:
+    place = save_film(saved(episode("drafter", frames=64), tmp_path), tmp_path / f"film.{ending}")
+    content = place.read_bytes()
+    assert content[:3] == b"GIF" if ending == "gif" else content[4:8] == b"ftyp"
+    if ending == "gif":
+        film = Image.open(place)
+        assert getattr(film, "n_frames") > 1  # noqa: B009
+        colours = {
+            colour for _, colour in film.convert("RGB").crop((0, film.width, *film.size)).getcolors(1 << 20) or ()
+        }
+        assert len(colours) > 3
+    with pytest.raises(UsageError, match=r"\.gif or \.mp4"):
+        save_film(place, tmp_path / "film.avi")
 
 
 def test_every_place_of_a_chunk_has_its_outcome() -> None:

@@ -23,7 +23,7 @@ from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.files import to_yaml as plain_yaml
 from kerv_cli.base.limits import check_settings, description
 from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, part_of
-from kerv_cli.base.settings import DERIVED_FROM, choices_of
+from kerv_cli.base.settings import DERIVED_FROM, PolicySettings, choices_of
 
 T = TypeVar("T")
 
@@ -136,7 +136,14 @@ class Composer(Generic[T]):
                 grid = self.command == "rollout"
                 hint = "run each in turn with 'kerv rollout -m', or" if grid else "this command takes one:"
                 raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
-            raise UnknownName(key, value, self.groups[key])
+            raise UnknownName(key, value, self.groups[key], self._of_policy(key, value))
+
+    def _of_policy(self, key: str, value: str) -> str:
+        """What the writer of a choice that no group has may have meant: weights by their name."""
+        mine = {at.name for at in fields(self.schema)}  # type: ignore[arg-type]
+        name = "target" if key == "policy" else key
+        weights = "policy" in mine and name in {at.name for at in fields(PolicySettings)}
+        return f"policy.{name}={value} names weights" if weights and (key == "policy" or key not in mine) else ""
 
     def _hint(self, word: str) -> str:
         """What the writer of a word without `=` may have meant, e.g. `episodes:`."""

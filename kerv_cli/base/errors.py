@@ -34,17 +34,19 @@ GONE = {
 
 
 class UnknownName(UsageError):
-    """A name that no registry knows; the message lists the nearest ones, or says what replaces it."""
+    """A name that no registry knows; the message lists the nearest ones, or says what replaces it. more: behind
+    them, in brackets."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, known: Iterable[str], more: str = "") -> None:
         known = list(known)
-        self._arguments = (kind, name, known)
+        self._arguments = (kind, name, known, more)
         near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
         gone = GONE.get((kind.split(".")[0], name))
+        hint = f"{hint} ({more})" if more else hint
         super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")
 
-    def __reduce__(self) -> tuple[type[UnknownName], tuple[str, str, list[str]]]:
+    def __reduce__(self) -> tuple[type[UnknownName], tuple[str, str, list[str], str]]:
         return UnknownName, self._arguments  # pickled by these: worker processes hand it on
 
 

@@ -180,6 +180,8 @@ class PolicySettings:
 POLICY = "what chooses the actions: vision, state, expert, … (conf/policy)"
 DEMOS = "demonstrations, by name"
 TARGET_DEMOS = f"{DEMOS}; empty: those that the target was trained on"
+TRACKERS = ("none", "trackio", "wandb", "tensorboard")
+LOG = "where the curves are drawn while it trains"
 STARTS = "half: of every task, the episodes that begin on one side"
 FIRST_EPISODES = "per task, the first ones by seed; 0: all"
 
@@ -353,6 +355,7 @@ class TrainTargetSettings(TaskSettings):
     name: str = setting("mt10-vision", "folder below <results>/artifacts/target, or a path")
     task: list[str] = setting([], "tasks and suites; empty: those of the demonstrations")
     demos: str = setting("", f"{DEMOS}; empty: those that `kerv demos` makes of the same tasks")
+    log: str = choice("none", *TRACKERS, help=LOG)
     target: TargetSettings = setting(TargetSettings, "shapes: nano, tiny, small, base, … (conf/target)")
     train: TrainSettings = setting(TrainSettings, "optimisation")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
@@ -408,6 +411,7 @@ class TrainDrafterSettings(RunSettings):
     demos: str = setting("", TARGET_DEMOS)
     task: list[str] = setting([], "tasks and suites whose demonstrations are used; empty: those that the target knows")
     starts: str = choice("all", "all", "half", help=STARTS)
+    log: str = choice("none", *TRACKERS, help=LOG)
     drafter: Any = setting(chosen("drafter", "eagle"), "its shapes and loss: eagle, early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 
@@ -65,6 +66,7 @@ def typer_command(part: Part) -> TyperCommand:
 
     def called(overrides: list[str] | None = None, cfg: bool = False, **options: Any) -> None:
         words, names = _divided(part, overrides or [], "names" in parameters)
+        _check_bare(part, words)
         given = {"words": words, "names": names, "cfg": cfg}
         if "settings" in parameters or (cfg and "cfg" not in parameters):
             given["settings"] = _composed(part, words, cfg)
@@ -159,6 +161,19 @@ def _divided(part: Part, words: list[str], named: bool) -> tuple[list[str], list
     keys = set(top_keys(part)) if part.settings is not NoSettings else set()
     overrides = [word for word in words if "=" in word and word.lstrip("+").partition("=")[0].split(".")[0] in keys]
     return overrides, [word for word in words if word not in overrides]
+
+
+def _check_bare(part: Part, words: list[str]) -> None:
+    """Refuses a value without its key: `kerv rollout reach`.
+
+    Raises:
+        UsageError: names the key that takes such a value.
+    """
+    for word in words:
+        if "=" not in word and part.settings is not NoSettings:
+            taking = [key for key in top_keys(part) if {word, f"{word}-v3"} & set(_values(part, key))]
+            if taking:
+                raise UsageError(f"'{word}' is not an override: did you mean {taking[0]}={word}?")
 
 
 def _composed(part: Part, words: list[str], cfg: bool) -> Any:

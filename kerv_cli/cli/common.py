@@ -69,7 +69,9 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except typer.TyperException as error:
         if "\n" in error.format_message():  # the help, where the command is left out
             raise
-        _refuse(error.format_message(), error.exit_code, error)
+        message, option = error.format_message(), getattr(error, "option_name", None)
+        setting = f"; settings have no dashes: {option.lstrip('-')}=VALUE" if option else ""
+        _refuse(message + setting, error.exit_code, error)
     except KeyboardInterrupt:
         _refuse("interrupted", Interrupted.exit_code, None)
     except BrokenPipeError:

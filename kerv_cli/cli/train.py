@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings
+from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings, as_plain
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_json, print_plan, progress_bar
+from kerv_cli.cli.live import live
 
 if TYPE_CHECKING:
     from kerv_cli.training.runs import DrafterRun, TargetRun
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 @command(
     "train target",
     TrainTargetSettings,
-    keys="name demos task target target.observation train.steps train.init train.lr world.camera.name runtime.device",
+    keys="name demos task target target.observation train.steps train.init world.camera.name log runtime.device",
     examples=(
         "kerv train target name=mine demos=mt10",
         "kerv train target name=quick target=nano train.steps=500 --plan",
@@ -34,7 +36,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 @command(
     "train drafter",
     TrainDrafterSettings,
-    keys="policy.target drafter demos task starts policy.drafter policy.early train.steps train.lr runtime.device",
+    keys="policy.target drafter demos task starts policy.drafter policy.early train.steps log runtime.device",
     examples=(
         "kerv train drafter policy.target=mine demos=mt10",
         "kerv train drafter drafter=early policy.target=mine",
@@ -54,21 +56,30 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
     with progress_bar(loading) as advance:
         run.load(advance)
     begun = False
+    losses: dict[int, float] = {}
+    settings = run.settings
 
     def on_step(step: int, now: dict[str, float]) -> None:
         nonlocal begun
         if not begun and step > 1 and run.ranks.first:
             typer.echo(f"resuming at step {step - 1}", err=True)
         begun = True
-        advance(step, run.settings.train.steps, _line(now))
+        losses.setdefault(step, now.get("loss", math.nan))
+        log(step, now)
+        advance(step, settings.train.steps, _line(now))
 
-    with progress_bar(training) as advance:
+    tracker = settings.log if run.ranks.first else "none"
+    name = f"{run.kind}/{run.folder.name}"
+    with (
+        live(tracker, name, run.folder, settings.train.steps, as_plain(settings)) as log,
+        progress_bar(training) as advance,
+    ):
         metrics = run.train(on_step)
     if not run.ranks.first:
         return
     from kerv_cli.report.curves import save_curves
 
-    plot = save_curves(run.folder)
+    plot = save_curves(run.folder, losses)
     if as_json:
         print_json({"folder": run.folder, "best": metrics, "curves": plot})
         return

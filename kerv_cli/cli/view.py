@@ -7,10 +7,13 @@ from typing import Annotated
 
 import typer
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import ViewSettings
 from kerv_cli.cli.command import command
 
 Together = Annotated[bool, typer.Option("--together", help="Show two recordings of one seed side by side.")]
+Web = Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser here, until Ctrl-C.")]
+To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recording: FILE.mp4 or FILE.gif.")]
 Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")]
 
 
@@ -18,13 +21,20 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
     "view",
     ViewSettings,
     keys="results",
-    examples=("kerv view", "kerv view --summary results/rollouts"),
+    examples=("kerv view --web", "kerv view --to episode.gif results/rollouts"),
     names="NAME: recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )
-def view(settings: ViewSettings, names: list[str], together: Together = False, summary: Summary = False) -> None:
-    """Open recordings in the Rerun viewer; without a display, print the command that does."""
-    from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary
+def view(
+    settings: ViewSettings,
+    names: list[str],
+    together: Together = False,
+    web: Web = False,
+    to: To = None,
+    summary: Summary = False,
+) -> None:
+    """Open recordings in the Rerun viewer; without a display, name the command that serves them."""
+    from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary, serve_web
 
     places = [Path(name) for name in names] or [Path(settings.results)]
     if together:
@@ -37,5 +47,15 @@ def view(settings: ViewSettings, names: list[str], together: Together = False, s
     if summary:
         for recording in recordings:
             typer.echo(read_summary(recording))
+        return
+    if to is not None:
+        from kerv_cli.report.viewing.film import save_film
+
+        if len(recordings) > 1 and names:
+            raise UsageError(f"--to {to} is a film of one recording, there are {len(recordings)}: name one")
+        typer.echo(str(save_film(recordings[0], to)))
+        return
+    if web:
+        serve_web(recordings, typer.echo)
         return
     typer.echo(open_recording(recordings))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib as mpl
@@ -13,6 +14,7 @@ from kerv_cli.base.files import MOST_TEXT, atomic_path, regular
 from kerv_cli.report.drawing import COLOURS, MUTED, STYLE, entitle, figure_bytes, new_figure
 
 _COLUMNS = 3  # panels beside one another
+_FEW = 4  # validations: their curves show less than the loss of every step
 
 
 def read_log(folder: Path) -> pd.DataFrame:
@@ -51,14 +53,28 @@ def curves_figure(log: pd.DataFrame, title: str) -> Figure:
     return figure
 
 
-def save_curves(folder: Path) -> Path:
-    """Writes `curves.png` beside a training's log.csv -> its path.
+def loss_figure(losses: Mapping[int, float], title: str) -> Figure:
+    """The loss of every step of a run that is too short for curves of validations. losses: by step."""
+    with mpl.rc_context(STYLE):
+        figure = new_figure(7.0, 3.6)
+        panel = figure.subplots()
+        panel.plot(list(losses), list(losses.values()), color=COLOURS[0], linewidth=1.5)
+        panel.set(xlabel="step", ylabel="loss")
+        entitle(figure, title, f"loss per step of training, {len(losses)} steps")
+    return figure
+
+
+def save_curves(folder: Path, losses: Mapping[int, float] | None = None) -> Path:
+    """Writes `curves.png` beside a training's log.csv -> its path. losses: by step, of this run of the command; drawn
+    where there are fewer than `_FEW` validations.
 
     Raises:
         CheckpointError: as `read_log`. StorageError: the disk refused.
     """
     path = folder / "curves.png"
-    content = figure_bytes(curves_figure(read_log(folder), f"{folder.parent.name} {folder.name}"), "png")
+    log, title = read_log(folder), f"{folder.parent.name} {folder.name}"
+    figure = loss_figure(losses, title) if losses and len(log) < _FEW else curves_figure(log, title)
+    content = figure_bytes(figure, "png")
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
     return path

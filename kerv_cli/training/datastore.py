@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_folder, write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
@@ -114,8 +114,6 @@ class DatastoreBuild:
         """Indices of the task's episodes in the dataset, by seed."""
         entries = self.dataset.episodes
         indices = sorted((i for i, e in enumerate(entries) if e.task == name), key=lambda i: entries[i].seed)
-        if not indices:
-            raise CheckpointError(f"the demonstrations in {self.dataset.path} hold no episode of {name}")
         return indices[: self.settings.episodes or None]
 
     @property

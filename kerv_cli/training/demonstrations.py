@@ -68,7 +68,14 @@ def demos_for(settings: OfTarget) -> DemoDataset:
     episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
     settings.demos = settings.demos or target.demos or name_of(())
     dataset = open_demos(settings.results, settings.demos, tasks, episodes)
+    there = list(dataset.manifest.tasks)
+    for task in resolve_tasks(settings.task) if settings.task else ():
+        if task not in there:
+            raise CheckpointError(
+                f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "
+                f"{', '.join(there)}, or record others with 'kerv demos task={task}' and name them by demos="
+            )
     known = resolve_tasks(target.tasks) if target.tasks and not settings.task else ()
-    if set(dataset.manifest.tasks) - set(known):
-        settings.task = settings.task or [task for task in dataset.manifest.tasks if task in known]
+    if set(there) - set(known):
+        settings.task = settings.task or [task for task in there if task in known]
     return dataset
