@@ -89,7 +89,7 @@ COMMANDS = {  # in the order in which each needs what the ones before it made
         f"demos task={TASK} episodes=8 name=two frame_stride=16 {TWO}", "artifacts/demos/two/**/*"
     ),
     "demos export": Command("demos export demos=few", "lerobot/**/*"),
-    "demos import": Command("demos import source=results/lerobot/few name=read", "artifacts/demos/read/**/*"),
+    "demos import": Command("demos import source=results/lerobot/few name=read", "artifacts/demos/read/**/*", (0, 2)),
     "train target": Command(
         f"train target task={TASK} name=mine demos=few target.observation=state {NANO} {TRAIN}", "artifacts/target/**/*"
     ),
@@ -139,10 +139,12 @@ NO_CLOCK = ["task", "seed", "success", "steps", "forwards", "tokens", "accepted"
 
 def state(command: str) -> dict[str, str]:
     """What a command must make again: file -> hash; of a cell: the columns that no clock decides."""
-    results, made = Path("results"), {}
+    results, here, made = Path("results"), os.getcwd().encode(), {}
     for path in (path for path in results.glob(COMMANDS[command].makes) if path.is_file()):
         cell = path.name == "episodes.parquet"
-        content = pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() if cell else path.read_bytes()
+        content = (
+            pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() if cell else path.read_bytes().replace(here, b"")
+        )
         made[_undated(str(path))] = hashlib.sha256(content).hexdigest()
     return made
 
