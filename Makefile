@@ -34,8 +34,8 @@ demo: setup ## run the demo study; ends with its verdict, its page and a recordi
 
 torture: export OMP_NUM_THREADS := 1
 
-torture: setup ## kill commands and damage files for at most 15 minutes (MINUTES=, SHORT=1); see docs/torture.md
-	@$(BIN)/python scripts/torture.py --minutes $(or $(MINUTES),15) $(if $(SHORT),--short)
+torture: setup ## kill commands, break their disk, damage files: at most 15 minutes (MINUTES=), 2 with SHORT=1; see docs/torture.md
+	@$(BIN)/python scripts/torture.py --minutes $(or $(MINUTES),$(if $(SHORT),2,15)) $(if $(SHORT),--short)
 
 lint: setup ## check style, types and which room imports which
 	@$(BIN)/ruff check $(CODE)

@@ -80,46 +80,34 @@ class Command(NamedTuple):
     again: tuple[int, ...] = (0,)
 
 
-CELLS = "{}/*/cells/*/episodes.parquet"
+_COMMANDS = f"""
+demos | demos task={TASK} episodes=4 name=few frame_stride=16 runtime.workers=1 | artifacts/demos/**/*
+demos, two workers | demos task={TASK} episodes=8 name=two frame_stride=16 {TWO} | artifacts/demos/two/**/*
+demos export | demos export demos=few | lerobot/**/*
+demos import | demos import source=results/lerobot/few name=read | artifacts/demos/read/**/*
+target | train target task={TASK} name=mine demos=few target.observation=state {NANO} {TRAIN} | artifacts/target/**/*
+target, seeing | train target task={TASK} name=seeing demos=few {NANO} {TRAIN} | artifacts/target/seeing/**/*
+drafter | train drafter {POLICY} demos=few drafter.samples=12 train.steps=4 {TRAIN} | artifacts/drafter/**/*
+early | train drafter drafter=early {POLICY} {SMALL} drafter.samples=12 | artifacts/early/**/*
+scout | train drafter drafter=scout policy.target=seeing {SMALL} train.scene_steps=2 | artifacts/scout/**/*
+build | build datastore task={TASK} {POLICY} demos=few | artifacts/datastore/**/*
+calibrate | calibrate task={TASK} {POLICY} demos=few held_out=0.4 decodes=3 | artifacts/calibration/**/*
+calibrate success | calibrate success study=certified name=sure | artifacts/certificate/**/*
+rollout | rollout task={TASK} world.horizon=8 {POLICY} episodes=2 record=1 method=ar | rollouts/**/episodes.parquet
+sweep | sweep study=tortured | studies/**/episodes.parquet
+sweep, two workers | sweep study=tortured episodes=4 {TWO} | studies/**/episodes.parquet
+report | report study=tortured | report/**/*
+runs export | runs export tortured | exports/**/*
+runs rerun | runs rerun certified | studies/**/episodes.parquet
+runs rm | runs rm tortured --yes | studies/*/plan.yaml
+"""
 COMMANDS = {  # in the order in which each needs what the ones before it made
-    "demos": Command(
-        f"demos task={TASK} episodes=4 name=few frame_stride=16 runtime.workers=1", "artifacts/demos/**/*"
-    ),
-    "demos, two workers": Command(
-        f"demos task={TASK} episodes=8 name=two frame_stride=16 {TWO}", "artifacts/demos/two/**/*"
-    ),
-    "demos export": Command("demos export demos=few", "lerobot/**/*"),
-    "demos import": Command("demos import source=results/lerobot/few name=read", "artifacts/demos/read/**/*"),
-    "train target": Command(
-        f"train target task={TASK} name=mine demos=few target.observation=state {NANO} {TRAIN}", "artifacts/target/**/*"
-    ),
-    "train drafter": Command(
-        f"train drafter {POLICY} demos=few drafter.samples=12 train.steps=4 {TRAIN}", "artifacts/drafter/**/*"
-    ),
-    "train early": Command(f"train drafter drafter=early {POLICY} {SMALL} drafter.samples=12", "artifacts/early/**/*"),
-    "train scout": Command(
-        f"train drafter drafter=scout policy.target=seeing {SMALL} train.scene_steps=2", "artifacts/scout/**/*"
-    ),
-    "build": Command(f"build datastore task={TASK} {POLICY} demos=few", "artifacts/datastore/**/*"),
-    "calibrate": Command(
-        f"calibrate task={TASK} {POLICY} demos=few held_out=0.4 decodes=3", "artifacts/calibration/**/*"
-    ),
-    "calibrate success": Command("calibrate success study=certified name=sure", "artifacts/certificate/**/*"),
-    "rollout": Command(
-        f"rollout task={TASK} world.horizon=8 {POLICY} episodes=2 record=1 method=ar", CELLS.format("rollouts")
-    ),
-    "sweep": Command("sweep study=tortured", CELLS.format("studies")),
-    "sweep, two workers": Command(f"sweep study=tortured episodes=4 {TWO}", CELLS.format("studies")),
-    "report": Command("report study=tortured", "report/**/*"),
-    "runs export": Command("runs export tortured", "exports/**/*"),
-    "runs rerun": Command("runs rerun certified", CELLS.format("studies")),
-    "runs rm": Command("runs rm tortured --yes", "studies/*/plan.yaml", again=(0, 2)),
+    name: Command(words, makes, (0, 2) if name in ("demos import", "runs rm") else (0,))
+    for name, words, makes in (line.split(" | ") for line in _COMMANDS.strip().splitlines())
 }
-NEEDED = {"train scout": f"train target task={TASK} name=seeing demos=few {NANO} {TRAIN}"}
-"""What is made, undisturbed, before a command."""
 READERS = {
     "rollout": f"rollout task={TASK} world.horizon=8 {POLICY} episodes=1 record=0 method=heisd",
-    "resume": COMMANDS["train target"].words,
+    "resume": COMMANDS["target"].words,
     "record": COMMANDS["demos"].words,
     "build": COMMANDS["build"].words + " name=again",
     "import": COMMANDS["demos import"].words + "-again",
@@ -139,10 +127,12 @@ NO_CLOCK = ["task", "seed", "success", "steps", "forwards", "tokens", "accepted"
 
 def state(command: str) -> dict[str, str]:
     """What a command must make again: file -> hash; of a cell: the columns that no clock decides."""
-    results, made = Path("results"), {}
+    results, here, made = Path("results"), os.getcwd().encode(), {}
     for path in (path for path in results.glob(COMMANDS[command].makes) if path.is_file()):
         cell = path.name == "episodes.parquet"
-        content = pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() if cell else path.read_bytes()
+        content = (
+            pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() if cell else path.read_bytes().replace(here, b"")
+        )
         made[_undated(str(path))] = hashlib.sha256(content).hexdigest()
     return made
 
@@ -218,8 +208,6 @@ class Torture:
         whole.mkdir()
         os.chdir(whole)
         for command, (words, _, _) in COMMANDS.items():
-            if command in NEEDED:
-                undisturbed(NEEDED[command], log)
             if command == "runs rm":
                 shutil.copytree(whole, self.folder / "all")
             shutil.copytree(whole, self.folder / f"before {command}")

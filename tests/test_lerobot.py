@@ -161,6 +161,22 @@ def test_a_truncated_table_is_refused(results: Path, tmp_path: Path) -> None:
     assert "file-000.parquet is missing or damaged" in line
 
 
+def test_without_its_episodes_or_with_a_folder_for_a_file_it_is_refused(results: Path, tmp_path: Path) -> None:
+    import_it = ["demos", "import", f"source={tmp_path}/set", "name=bad", f"results={tmp_path}"]
+    for name in ("meta/episodes", "meta/tasks.parquet", "meta/info.json", "data/chunk-000/file-000.parquet"):
+        shutil.rmtree(tmp_path / "set", ignore_errors=True)
+        shutil.copytree(results / "lerobot/pegs", tmp_path / "set")
+        path = tmp_path / "set" / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for _ in range(2):  # missing, then a folder
+            code, text = kerv(*import_it)
+            assert code == 1, text
+            assert "internal error" not in text
+            assert str(tmp_path / "set") in text
+            path.mkdir(exist_ok=True)
+    assert list((tmp_path / "artifacts/demos").glob("*")) == []
+
+
 def test_a_dataset_with_videos_is_read(results: Path, tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     source = edited(results, tmp_path)

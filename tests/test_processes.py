@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import signal
 import subprocess
 import sys
@@ -9,6 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+
+from kerv_cli.base.errors import KervError
+from kerv_cli.lab.executors.local import build
 
 LONGEST = 5.0
 
@@ -125,3 +129,13 @@ def test_sigterm_clears_away(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         assert process.stdout.read() == "cleared\n"
     assert process.returncode == 0
+
+
+def test_without_shared_memory_workers_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def refused(self: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(multiprocessing.get_context("fork")), "Lock", refused)
+    with pytest.raises(KervError, match=r"runtime\.workers=1"):
+        build(None, 2, 1, tmp_path)
+    assert build(None, 1, 1, tmp_path).slots == 1

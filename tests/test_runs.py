@@ -137,6 +137,12 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(results: Path, tmp_pa
     told = json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))
     assert (told["episodes"], told["same_tokens"]) == (2, 2)
     assert told["run"] != single
+    folder = copy / "rollouts" / told["run"]
+    noted = json.loads((folder / "run.json").read_text())
+    noted["commands"][-1]["finished"] = ""
+    (folder / "run.json").write_text(json.dumps(noted))
+    shutil.rmtree(next((folder / "cells").iterdir()))  # as a kill leaves it
+    assert json.loads(works("runs", "rerun", single, f"results={copy}", "--json"))["run"] == told["run"]
     assert "removed" in works("runs", "rm", told["run"], single, "--yes", f"results={copy}")
     assert listed(copy, "method=ar") == []
     weights = copy / "artifacts/target/nano-state/target.json"

@@ -21,7 +21,7 @@ from kerv_cli.base.leftovers import is_left_over
 from kerv_cli.engine.record import PHASES
 from kerv_cli.lab import claims, rows
 from kerv_cli.lab.plan import Cell
-from kerv_cli.lab.store import StudyStore, begun_studies
+from kerv_cli.lab.store import ROLLOUTS, StudyStore, begun_studies
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 
@@ -160,6 +160,35 @@ def test_a_lock_that_is_a_link_is_refused_and_a_file_behind_it_stays(store: Stud
     lock.write_text("not truncated")
     store.write_plan(threshold_settings(), threshold_study(["reach-v3"]))
     assert lock.read_text() == "not truncated"
+    lock.write_text("")
+    store.write_plan(threshold_settings(), threshold_study(["reach-v3"]))
+    assert not lock.exists()  # a lock goes with its holder
+
+
+def test_a_new_run_appears_with_its_plan_and_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = StudyStore(tmp_path, "20260301-142530-ar", ROLLOUTS)
+
+    def full(old: Path, new: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "rename", full)
+    with pytest.raises(StorageError):
+        store.begin(threshold_settings(), threshold_study(["reach-v3"]), ["rollout"])
+    assert list((tmp_path / ROLLOUTS).iterdir()) == []
+    monkeypatch.undo()
+    for _ in range(2):
+        store.begin(threshold_settings(), threshold_study(["reach-v3"]), ["rollout"])
+    assert sorted(path.name for path in store.root.iterdir()) == ["plan.yaml", "run.json"]
+    assert [command.arguments for command in store.commands()] == [("rollout",)] * 2
+
+
+def test_the_folder_of_failures_goes_with_the_last_one(store: StudyStore) -> None:
+    for name in ("a", "b"):
+        store.write_failure(name, "trace")
+    store.clear_failure("a")
+    assert store.failures.is_dir()
+    store.clear_failure("b")
+    assert not store.failures.exists()
 
 
 def test_claims_exclude_others_until_their_process_is_gone(store: StudyStore) -> None:

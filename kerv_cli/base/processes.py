@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -11,6 +12,8 @@ import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
+
+from kerv_cli.base.errors import KervError
 
 WATCH_SECONDS = 1.0
 """Between two looks at whether the parent lives."""
@@ -52,6 +55,18 @@ def end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def check_workers() -> None:
+    """Refuses worker processes where they could not wait for each other.
+
+    Raises:
+        KervError: no semaphores, on Linux because of /dev/shm.
+    """
+    try:
+        multiprocessing.get_context("fork").Lock()
+    except (OSError, ImportError) as error:
+        raise KervError(f"no worker processes here, /dev/shm cannot be used ({error}): set runtime.workers=1") from None
 
 
 def begin_worker(parent: int) -> None:

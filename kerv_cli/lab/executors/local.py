@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
-from kerv_cli.base.processes import begin_worker
+from kerv_cli.base.processes import begin_worker, check_workers
 from kerv_cli.lab.executors import THREAD_VARIABLES, Executor, WorkerLost
 
 T = TypeVar("T")
@@ -43,6 +43,7 @@ class Processes:
     """One loky pool per worker: when a worker dies, only its own work is lost, and which one is known."""
 
     def __init__(self, slots: int, threads: int) -> None:
+        check_workers()
         self.slots, self.threads = slots, threads
         self._free: list[Any] = []
         self._all: list[Any] = []
