@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,7 @@ import msgpack
 import numpy as np
 import pytest
 from typer.testing import CliRunner
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from kerv_cli.base.config import compose as compose_settings
@@ -28,6 +31,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.serve.guard import Finite
 from kerv_cli.serve.openpi import OpenPi, observation_of
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import PolicyServer
@@ -295,3 +299,146 @@ def test_a_policy_that_reads_images_alone_needs_no_state(policy: Policy) -> None
     message = {key: value for key, value in seen(0).items() if key != "observation/state"}
     given = observation_of(replace(policy.interface, images_alone=True), message)
     assert (given.proprioception.shape, given.state.shape) == ((4,), (39,))
+
+
+# --- the contract: seats, silence, ranges, faults (docs/serving.md)
+
+
+def silent(port: int) -> socket.socket:
+    """A client that completes the handshake and never says or answers anything."""
+    raw = socket.create_connection(("127.0.0.1", port))
+    lines = ("GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade")
+    key = ("Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13")
+    raw.sendall("\r\n".join((*lines, *key, "", "")).encode())
+    assert b"101 Switching" in raw.recv(4096)
+    return raw
+
+
+def test_a_client_that_answers_no_ping_loses_its_seat(policy: Policy) -> None:
+    with serving(policy, ping_s=0.3) as (port, log):
+        lost = silent(port)
+        until(lambda: any("connected" in line for line in log))
+        began = time.monotonic()
+        until(lambda: _accepted(port))
+        assert time.monotonic() - began < 5
+        assert any("keepalive ping timeout" in line for line in log)
+        lost.close()
+
+
+def test_a_client_that_says_nothing_loses_its_seat(policy: Policy) -> None:
+    with serving(policy, idle_s=0.3) as (port, log):
+        first = Client(port)
+        until(lambda: any("disconnected: no message for 0.3 s" in line for line in log))
+        assert _accepted(port)
+        with pytest.raises(ConnectionClosed, match="no message"):
+            first.infer(seen(0))
+
+
+def test_a_newer_client_takes_the_seat_where_that_is_set(policy: Policy) -> None:
+    with serving(policy, takeover=True) as (port, log):
+        lost, first = silent(port), Client(port)
+        second = Client(port)
+        assert second.infer(seen(0))["actions"].shape == (4, 4)
+        with pytest.raises(ConnectionClosed, match="a newer client took the seat"):
+            first.infer(seen(0))
+        until(lambda: sum("disconnected" in line for line in log) == 2)
+        lost.close()
+
+
+def test_two_hundred_quick_reconnects_are_all_served(policy: Policy) -> None:
+    with serving(policy) as (port, log):
+        for _ in range(200):
+            client = Client(port)
+            assert client.metadata["chunk"] == 4
+            client.connection.close()
+        assert not any("refused" in line for line in log)
+
+
+@pytest.mark.parametrize(("origins", "accepted"), [([], False), (["http://robot.local"], True)])
+def test_a_web_page_may_connect_only_where_it_is_named(policy: Policy, origins: list[str], accepted: bool) -> None:
+    with serving(policy, origins=origins) as (port, _):
+        url = f"ws://127.0.0.1:{port}"
+        refused = pytest.raises(InvalidStatus, match="403")
+        with nullcontext() if accepted else refused, connect(url, origin="http://robot.local") as page:
+            assert page.recv(5)
+        with pytest.raises(InvalidStatus, match="403"), connect(url, origin="http://elsewhere.net"):
+            pass
+        assert _accepted(port)
+
+
+def ranged(policies: Path, tmp_path: Path, *words: str) -> Policy:
+    """A policy whose target says that its demonstrations' numbers lay between 0 and 1."""
+    shutil.copytree(policies, tmp_path / "results")
+    path = tmp_path / "results" / "artifacts" / "target" / "nano-vision" / "target.json"
+    stored = json.loads(path.read_text()) | {"state_range": [[0.0] * 39, [1.0] * 39]}
+    path.write_text(json.dumps(stored))
+    typed = ["policy.target=nano-vision", f"results={tmp_path / 'results'}", *words]
+    return Policy(compose_settings("serve", typed, ServeSettings))
+
+
+@pytest.mark.parametrize("height", [1e39, -2.5, 3.5])
+def test_a_state_far_from_the_demonstrations_is_refused(policies: Path, tmp_path: Path, height: float) -> None:
+    state = np.array([0.5, 0.5, height, 0.5])
+    with serving(ranged(policies, tmp_path, "margin=2")) as (port, log):
+        client = Client(port)
+        with pytest.raises(RuntimeError, match=r"out of range: z is .*, the policy was trained on -2 to 3"):
+            client.infer(seen(0, **{"observation/state": state}))
+        assert any("out of range: z" in line for line in log)
+        assert client.infer(seen(0, **{"observation/state": np.array([0.5, 0.5, 2.9, 0.5])}))["actions"].shape == (4, 4)
+
+
+def test_or_the_last_action_is_held(policies: Path, tmp_path: Path) -> None:
+    near, far = ({"observation/state": np.full(4, value)} for value in (0.5, 9.0))
+    with serving(ranged(policies, tmp_path, "outside=hold")) as (port, log):
+        client = Client(port)
+        with pytest.raises(RuntimeError, match="out of range"):
+            client.infer(seen(0, **far))  # there is no last action yet
+        last = client.infer(seen(0, **near))["actions"][-1:]
+        held = client.infer(seen(1, **far))
+        np.testing.assert_array_equal(held["actions"], last)
+        assert held["decode"] == {"forwards": 0, "tokens": 0, "mode": "hold"}
+        assert any("out of range: x is 9" in line and line.endswith("the last action is held") for line in log)
+        assert client.infer(seen(1, **near))["decode"]["forwards"] > 0
+
+
+def test_a_policy_without_a_range_is_checked_for_finite_numbers_alone(policy: Policy) -> None:
+    assert policy.range is None
+
+
+def test_no_action_follows_from_logits_that_are_not_finite(policy: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(policy) as (port, log):
+        client = Client(port)
+        client.infer(seen(0))
+        monkeypatch.setattr(Finite, "head", lambda self, hidden: self._noted(self._target.head(hidden) * float("nan")))
+        with pytest.raises(RuntimeError, match="numbers that are not finite: no action is sent"):
+            client.infer(seen(0))
+        monkeypatch.undo()
+        assert client.infer(seen(0))["actions"].shape == (4, 4)
+        assert any("not finite" in line for line in log)
+
+
+def test_a_policy_that_fails_is_one_line_to_the_client(policy: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(observation: Observation) -> None:
+        raise RuntimeError("CUDA error:\n" + "word " * 1000)
+
+    with serving(policy) as (port, log):
+        client = Client(port)
+        client.infer(seen(0))
+        monkeypatch.setattr(policy.artifacts.target, "encode", fails)
+        with pytest.raises(RuntimeError) as told:
+            client.infer(seen(0))
+        assert str(told.value).startswith("kerv: internal error, RuntimeError: CUDA error: word")
+        assert len(str(told.value)) < 600
+        assert "\n" not in str(told.value)
+        assert any("internal error, RuntimeError" in line for line in log)
+        monkeypatch.undo()
+        assert client.infer(seen(0))["actions"].shape == (4, 4)
+
+
+def test_health_is_answered_without_a_seat(policy: Policy) -> None:
+    with serving(policy) as (port, _):
+        first = Client(port)
+        for path in ("healthz", "health"):
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=5) as answer:
+                assert answer.read() == b"OK\n"
+        first.connection.close()

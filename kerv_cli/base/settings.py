@@ -251,6 +251,10 @@ class ServeSettings(MethodSettings):
     )
     idle_s: float = number(0.0, 0, 86_400, help="a client without a message for so long is gone; 0: 120, vla_eval 1800")
     origins: list[str] = setting([], "web pages that may connect; programs, which name no origin, always may")
+    outside: str = choice(
+        "refuse", "refuse", "hold", help="a state that the policy was not trained on: an error, or the last action"
+    )
+    margin: float = number(1.0, 0, 1e6, help="by how many widths a state may exceed the demonstrations' range")
 
 
 @dataclass(kw_only=True)

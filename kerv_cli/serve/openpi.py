@@ -10,6 +10,8 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.serve.guard import HOLD
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import Reply
 from kerv_cli.serve.session import Interface, Session, hand_of, keys_of, text_of
@@ -90,12 +92,16 @@ class OpenPi:
         observation = observation_of(interface, message)
         hand, executed = hand_of(observation), self._executed(message)
         if message.get(RESET) or not self.begun:
+            self.last = self.last[:0]
             self.session.begin(interface.task, self.decodes, hand)
             self.begun = True
         else:
             for step, action in enumerate(executed, 1):
                 decoder.observe(action, self.at + (hand - self.at) * step / len(executed))
-        record = self.session.decode(observation)
+        if self.session.is_held(observation, len(self.last) > 0):
+            record = DecodeRecord((), self.last[-1:], 0, (), HOLD, 0.0, {})
+        else:
+            record = self.session.decode(observation)
         self.last, self.at = record.actions, hand
         self.decodes += 1
         timing = {"infer_ms": 1000 * record.seconds}

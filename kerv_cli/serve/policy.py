@@ -23,6 +23,7 @@ from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
+from kerv_cli.serve.guard import HOLD, Finite, StateRange
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
 from kerv_cli.worlds import specs
 
@@ -59,6 +60,7 @@ class Policy:
             self.method.check_unwatched("kerv serve", "a client executes chunks without a look between their steps")
         self.identity = self.artifacts.check(self.method.needs)
         self.interface = self._interface()
+        self.range = self._range()
         self.by_task = not settings.task_name and not _BY_TASK.isdisjoint(self.method.needs)
         self._turn = threading.Lock()
         self._idle: list[Decoder] = []
@@ -86,6 +88,15 @@ class Policy:
             images_alone=bool(find("target", description.family).traits.get("images_alone")),
         )
 
+    def _range(self) -> StateRange | None:
+        """Of the numbers that the policy reads; None where its target does not say, or it reads none."""
+        stored, interface = self.artifacts.description.state_range, self.interface
+        if stored is None or interface.images_alone:
+            return None
+        names = interface.observation.proprioception
+        low, high = (np.array(ends)[: None if interface.privileged else len(names)] for ends in stored)
+        return StateRange(low, high, names, self.settings.margin)
+
     def _any_task(self) -> str:
         """The task of the settings; without one, where a client names its tasks, one that the method's levels know."""
         if self.by_task and self.settings.protocol == VLA_EVAL:
@@ -106,7 +117,8 @@ class Policy:
 
     def new_session(self) -> Session:
         """For one more client."""
-        return Session(self._follower, self.settings.task_name, self.by_task)
+        holds = self.settings.outside == HOLD
+        return Session(self._follower, self.settings.task_name, self.by_task, self.range, holds)
 
     def released(self, decoder: Decoder) -> None:
         """A decoder that nobody uses any more; those of one task alone are not kept."""
@@ -122,6 +134,7 @@ class Policy:
         """A new decoder, after a few observations of zeros: first calls allocate memory and choose kernels."""
         with self._turn:
             decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
+            decoder.target = Finite(decoder.target)
             images = {c: np.zeros(frame_shape(c, self.interface.size), np.uint8) for c in self.interface.cameras}
             space = self.interface.observation
             still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
@@ -139,6 +152,12 @@ class Policy:
         camera = {"name": self.interface.cameras[0] if self.interface.cameras else "", "size": self.interface.size}
         settings["world"]["camera"] |= {key: value for key, value in camera.items() if value}
         return {"settings": settings, "identity": self.identity, "machine": stamp(self.device)}
+
+
+def check_finite(decoder: Decoder | BatchDecoder) -> None:
+    """Raises KervError: the last decode computed numbers that are not finite."""
+    target: Any = decoder.target
+    target.check()
 
 
 @dataclass(frozen=True)
@@ -173,7 +192,9 @@ class Alone:
     def decode(self, observation: Observation) -> DecodeRecord:
         """The decoder's record."""
         with self.turn:
-            return self.decoder.decode(observation)
+            record = self.decoder.decode(observation)
+            check_finite(self.decoder)
+        return record
 
 
 @dataclass
@@ -223,6 +244,7 @@ class Together:
         """Decodes the batch; where that fails, one by one, so that one client's fault is no other's."""
         try:
             records = self.decoder.decode([one.lane for one in batch], [one.observation for one in batch])
+            check_finite(self.decoder)
             for one, record in zip(batch, records, strict=True):
                 one.record = record
         except Exception as error:  # noqa: BLE001 - it is raised in its client's thread

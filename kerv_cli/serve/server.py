@@ -26,6 +26,8 @@ PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.ser
 HEALTH = ("/healthz", "/health")
 BUSY, GONE, TAKEN = 1013, 1001, 4000
 """Websocket close codes: try again later; going away; a newer client has the seat."""
+LONGEST = 500
+"""Letters of an error: a client's own words may be longer."""
 PATIENCE = 1.0
 """Seconds that a newcomer waits for a seat: one that reconnects may be ahead of its own farewell."""
 FAREWELL = 2.0
@@ -198,6 +200,7 @@ class PolicyServer:
     def _talk(self, connection: Any, latencies: Latencies) -> None:
         """Answers frames until the connection ends. Raises ConnectionClosed, and TimeoutError for silence."""
         with self.policy.session() as session:
+            session.say = lambda line: self.log(f"{connection.remote_address} {line}")
             conversation: Conversation = self.protocol(self.policy, session)
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
@@ -229,7 +232,7 @@ class PolicyServer:
             self.log(str(latencies))
 
     def _refuse(self, connection: Any, conversation: Conversation, reason: str) -> None:
-        line = " ".join(reason.split())
+        line = " ".join(reason.split())[:LONGEST]
         self.log(f"{connection.remote_address} error: {line}")
         connection.send(conversation.fault(line))
 

@@ -13,6 +13,7 @@ from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import ActionDecoder
+from kerv_cli.serve.guard import StateRange
 
 LARGEST = 4096
 """Pixels of an image's longest side, where the policy resizes images itself."""
@@ -124,14 +125,25 @@ def hand_of(observation: Observation) -> np.ndarray:
 class Session:
     """The episodes of one client.
 
-    decoder: None before the first episode where it depends on the task.
+    decoder: None before the first episode where it depends on the task. range: of the states that the policy may act
+    on; None: not known. holds: whether out of it the last action is executed once more, in place of an error. say:
+    writes into the log.
     """
 
-    def __init__(self, decoder: Callable[[str], ActionDecoder], task: str = "", by_task: bool = False) -> None:
+    def __init__(
+        self,
+        decoder: Callable[[str], ActionDecoder],
+        task: str = "",
+        by_task: bool = False,
+        range: StateRange | None = None,
+        holds: bool = False,
+    ) -> None:
         """decoder: makes the decoder of a task. task: of every episode; empty: the client names it. by_task: a new task
         needs a new decoder."""
         self._make, self._by_task, self.task = decoder, by_task, task
         self.decoder: Any = None if by_task else decoder(task)
+        self.range, self.holds = range, holds
+        self.say: Callable[[str], None] = lambda line: None
 
     def begin(self, task: str, seed: int, hand: np.ndarray) -> None:
         """An episode of a task begins with the end effector at (3,) metres. Raises CheckpointError: the method has no
@@ -139,6 +151,20 @@ class Session:
         if self._by_task and (self.decoder is None or task != self.task):
             self.decoder, self.task = self._make(task), task
         self.decoder.reset(self.task or task, seed, hand)
+
+    def is_held(self, observation: Observation, has_last: bool) -> bool:
+        """Whether the last action is to be executed again, because the policy may not act on this state. has_last:
+        whether there is one, of this episode.
+
+        Raises:
+            UsageError: it may not, and errors are wanted, or there is no last action.
+        """
+        why = self.range.outside(observation) if self.range is not None else ""
+        if why and not (self.holds and has_last):
+            raise UsageError(why)
+        if why:
+            self.say(f"{why}: the last action is held")
+        return bool(why)
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """The actions for an observation, and their record."""

@@ -156,13 +156,17 @@ class VlaEval:
         state = payload.get("state", payload.get("states"))
         numbers = self.policy.interface.numbers(state, "state", payload)
         observe = functools.partial(self._observation, payload, numbers)
-        hand = hand_of(Observation(*numbers))
+        felt = Observation(*numbers)
+        hand = hand_of(felt)
         if not episode.begun:
             self.session.begin(self.policy.interface.task or episode.task, episode.seed, hand)
             episode.begun = True
         elif len(episode.sent) == len(episode.path):
             self.session.decoder.observe(episode.sent[-1], hand)
         episode.path[len(episode.sent) :] = [hand]  # where the observation before got an error it stands there already
+        if self.session.is_held(felt, bool(episode.sent)):
+            episode.left.clear()  # what was planned from a state before it is not executed on
+            return self._act(episode, episode.sent[-1], None)
         seconds = self._look(episode, observe)
         if not episode.left:
             record = self.session.decode(observe())
@@ -170,7 +174,10 @@ class VlaEval:
             episode.decodes.append(record)
             episode.decode_steps.append(len(episode.sent))
             episode.left.extend(record.actions)
-        action = episode.left.popleft()
+        return self._act(episode, episode.left.popleft(), seconds)
+
+    def _act(self, episode: _Episode, action: np.ndarray, seconds: float | None) -> Reply:
+        """Sends an action (D,), environment units. seconds: of inference for it."""
         space = self.policy.interface.space
         episode.sent.append(np.clip(action, space.low, space.high).astype(np.float32))
         sent = self.policy.interface.converted(action[None])[0].astype(np.float32)

@@ -42,7 +42,8 @@ class Description:
 @dataclass(frozen=True)
 class TargetDescription(Description):
     """A target's JSON. family: name of the registered target that reads `settings`. environment: that of the
-    demonstrations it was trained on. cameras: names of the images it reads. words: vocabulary of instructions."""
+    demonstrations it was trained on. cameras: names of the images it reads. words: vocabulary of instructions.
+    state_range: 0.1th and 99.9th percentile of the demonstrations' states (s,); None: not recorded."""
 
     family: str
     environment: str
@@ -52,6 +53,7 @@ class TargetDescription(Description):
     cameras: tuple[str, ...]
     words: tuple[str, ...]
     provenance: dict[str, Any]
+    state_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings.get("chunk"), int):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from abc import ABC, abstractmethod
@@ -10,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -42,6 +44,8 @@ from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 Progress = Callable[[int, int], None]
+RANGED = 200
+"""Episodes from which the range of states is taken."""
 
 
 def run_settings(train: TrainSettings) -> dict[str, Any]:
@@ -240,7 +244,17 @@ class TargetRun(Run):
         """See `Run.write`."""
         assert isinstance(module, CompactTarget)
         environment = self.dataset.manifest.environment
-        save_target(self.folder, module, environment, origin | self.init_hash, self.settings.train.stored)
+        stored, states = self.settings.train.stored, self.state_range
+        save_target(self.folder, module, environment, origin | self.init_hash, stored, states)
+
+    @functools.cached_property
+    def state_range(self) -> list[list[float]]:
+        """See `TargetDescription`; of at most RANGED episodes, evenly chosen."""
+        count = len(self.dataset.episodes)
+        chosen = range(0, count, -(-count // RANGED))
+        states = np.concatenate([self.dataset.load(index).states for index in chosen])
+        ends: list[list[float]] = np.percentile(states, [0.1, 99.9], axis=0).tolist()
+        return ends
 
 
 class Lesson(Protocol):

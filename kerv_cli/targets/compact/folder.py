@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,21 @@ from kerv_cli.targets.compact.text import WordTokenizer
 
 
 def save_target(
-    folder: Path, target: CompactTarget, environment: str, provenance: dict[str, Any], stored: str = FLOAT32
+    folder: Path,
+    target: CompactTarget,
+    environment: str,
+    provenance: dict[str, Any],
+    stored: str = FLOAT32,
+    state_range: Sequence[Sequence[float]] | None = None,
 ) -> str:
     """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
-    `save_module`."""
+    `save_module`. state_range: as in `TargetDescription`."""
     fields = target_fields(
         *("compact", asdict(target.settings), environment, target.actions, target.observation),
         *(target.cameras, target.words.words, provenance),
     )
-    return save_module(folder, "target", target, fields, stored)
+    known = {"state_range": state_range} if state_range else {}
+    return save_module(folder, "target", target, {**fields, **known}, stored)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
