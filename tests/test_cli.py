@@ -199,6 +199,7 @@ def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
     assert completions("sweep", [], "until=") == ["until=done", "until=decided"]
     assert completions("demos", [], "ex") == ["export", "expert_share="]
     assert completions("report", [], "stu") == ["study="]
+    assert completions("prepare", [], "for=hei") == ["for=heisd", "for=heisd_paper"]
     assert completions("completion", [], "z") == ["zsh"]
 
 

@@ -168,7 +168,7 @@ def test_a_server_refuses_it(policies: Path) -> None:
 
 
 def test_without_what_looks_the_message_is_that_of_its_source(policies: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"no early drafter in .*: run 'kerv train drafter drafter=early'"):
+    with pytest.raises(CheckpointError, match=r"no early drafter in .*: run 'kerv prepare policy\.target=nano-state'"):
         policies_of.check(chosen(policies))
     policies_of.check(chosen(policies, "skip.source=hold"))
     with pytest.raises(UsageError, match=r"skip\.source=drafter: it does not draft whole chunks"):

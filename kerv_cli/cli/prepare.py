@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import typer
 
+from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import PrepareSettings
 from kerv_cli.cli.command import command, typer_command
@@ -16,6 +17,13 @@ OWN = ("for", "steps")
 """Settings that the steps do not take; those of demonstrations are for all but the certificate."""
 
 
+def method_names() -> list[str]:
+    """Values of `for=`."""
+    from kerv_cli.base.config import groups
+
+    return groups()["method"]
+
+
 @command(
     "prepare",
     PrepareSettings,
@@ -23,6 +31,7 @@ OWN = ("for", "steps")
     examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine for=one_pass,kerv --plan"),
     typed={"for": "methods"},
     lists=("methods",),
+    values={"for": method_names},
 )
 def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False) -> None:
     """Make everything that methods need of a target, in order: drafters, datastore, calibration, certificate. What is
@@ -60,7 +69,12 @@ def run(line: Sequence[str]) -> None:
     """Runs a command of kerv in this process.
 
     Raises:
-        KervError: as that command. typer.Exit: it failed and said why.
+        KervError: as that command. Interrupted: Ctrl-C. typer.Exit: it failed and said why.
     """
     name = max((name for name in parts("command") if " ".join(line).startswith(f"{name} ")), key=len)
-    typer_command(parts("command")[name]).main(list(line[len(name.split()) :]), standalone_mode=False)
+    try:
+        code = typer_command(parts("command")[name]).main(list(line[len(name.split()) :]), standalone_mode=False)
+    except typer.Abort:  # what typer makes of Ctrl-C
+        raise Interrupted("interrupted: what is made is kept, the same command goes on there") from None
+    if code:
+        raise typer.Exit(code)
