@@ -362,7 +362,7 @@ def test_a_missing_calibration_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="run 'kerv calibrate'"):
         CalibrationArtifact().checked(tmp_path / "calibration.json", description())
     (tmp_path / "list.json").write_text("[1]")
-    with pytest.raises(CheckpointError, match="not a calibration"):
+    with pytest.raises(CheckpointError, match="it holds no object; run 'kerv calibrate'"):
         CalibrationArtifact().checked(tmp_path / "list.json", description())
 
 

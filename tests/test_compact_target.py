@@ -169,7 +169,7 @@ class Demos:
     """Six made-up episodes of a task with seven DoFs."""
 
     sha256, path = "e" * 64, Path("demos")
-    manifest = SimpleNamespace(config={}, environment="insertion", actions=SEVEN, observation=ARM)
+    manifest = SimpleNamespace(config={}, environment="insertion", actions=SEVEN, observation=ARM, tasks={})
     episodes = tuple(DemoEntry(seed, bool(seed % 2), 9, 0, "", "insert", Path()) for seed in range(6))
 
     def load(self, index: int) -> DemoEpisode:

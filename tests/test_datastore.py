@@ -434,7 +434,7 @@ def test_a_datastore_that_does_not_belong_here_is_refused(copy: Path, change: Ch
         (lambda f: cut(f / "payload.parquet"), "payload.parquet does not match its manifest"),
         (lambda f: (f / "payload.parquet").unlink(), "payload.parquet cannot be read"),
         (lambda f: cut(f / "manifest.json"), "cannot be read as JSON"),
-        (lambda f: (f / "manifest.json").write_text("[]"), "is not a datastore"),
+        (lambda f: (f / "manifest.json").write_text("[]"), "it holds no object; build one"),
         (lambda f: shutil.rmtree(f), "no datastore in"),
     ],
 )

@@ -132,7 +132,8 @@ def test_target_and_method_must_fit(results: Path, words: str, message: str) -> 
 def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from kerv_cli.worlds.demos.dataset import DemoDataset
 
-    same = type("M", (), {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name})
+    of_them = {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name, "tasks": {}}
+    same = type("M", (), of_them)
     demos = type("D", (), {"manifest": same, "path": Path("demos")})()
     monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: demos))
     settings = compose("train_drafter", [f"results={results}", "policy.target=parallel"], TrainDrafterSettings)

@@ -24,7 +24,7 @@ from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.rows import DECODE_SCHEMA, decode_rows, parquet_bytes
 from kerv_cli.methods.watch import FARTHEST, Watch, WatchSettings, check_source
-from kerv_cli.serve.policy import served
+from kerv_cli.serve.policy import Policy
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 
 SPACE = SPEC.actions
@@ -164,11 +164,11 @@ def chosen(results: Path, *words: str) -> RolloutSettings:
 def test_a_server_refuses_it(policies: Path) -> None:
     words = ["method=watch", "policy.target=nano-state", f"results={policies}"]
     with pytest.raises(UsageError, match="skip=watch with kerv serve: a client executes chunks"):
-        served(compose("serve", words, ServeSettings))
+        Policy(compose("serve", words, ServeSettings))
 
 
 def test_without_what_looks_the_message_is_that_of_its_source(policies: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"no early drafter in .*: run 'kerv prepare policy\.target=nano-state'"):
+    with pytest.raises(CheckpointError, match=r"no early drafter in .*: run 'kerv prepare policy.target=nano-state'"):
         policies_of.check(chosen(policies))
     policies_of.check(chosen(policies, "skip.source=hold"))
     with pytest.raises(UsageError, match=r"skip\.source=drafter: it does not draft whole chunks"):

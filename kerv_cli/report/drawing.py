@@ -93,7 +93,7 @@ def place_labels(
     covered += [text.get_window_extent(renderer) for text in panel.texts]
     frame = panel.get_window_extent(renderer)
     notes = []
-    apart = np.sort(np.linalg.norm(spots[:, None] - spots[None], axis=-1), axis=1)[:, 1:4].mean(1)
+    apart = np.sort(np.linalg.norm(spots[:, None] - spots[None], axis=-1), axis=1)[:, :4].sum(1)
     for number in np.argsort(apart, kind="stable"):
         x, y, text = labels[number]
         shade, centred = shades[number], dict[str, Any](ha="center", va="center")

@@ -37,10 +37,16 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
     """
     whole = artifact(results, "demos", names)
     folders = [whole] if whole.is_dir() else [artifact(results, "demos", name) for name in names.split("+")]
+    datasets = []
     for folder in folders:
-        if not folder.is_dir():
-            raise CheckpointError(f"no demonstrations in {folder}: {_remedy(results, folder, tasks, episodes)}")
-    return DemoDataset.joined([DemoDataset.open(folder) for folder in folders])
+        try:
+            datasets.append(DemoDataset.open(folder))
+        except CheckpointError as error:
+            if folder.is_dir():
+                raise
+            remedy = _remedy(results, folder, tasks, episodes)
+            raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
+    return DemoDataset.joined(datasets)
 
 
 def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> str:
