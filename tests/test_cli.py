@@ -193,7 +193,7 @@ def test_completion_knows_groups_names_and_keys_of_the_command() -> None:
     assert "threshold.r=" not in completions("rollout", ["threshold=kinematic"], "threshold.r")
     assert "train.lr=" in completions("train target", [], "train.l")
     assert completions("train target", [], "method") == []
-    assert completions("demos", [], "prop") == []
+    assert completions("demos export", [], "prop") == []
     assert "study=demo" in completions("sweep", [], "study=d")
     assert completions("runs list", [], "me") == []
     assert completions("sweep", [], "until=") == ["until=done", "until=decided"]
@@ -346,7 +346,7 @@ def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
     words = ["policy=state", "policy.target=nano-state", f"results={policies}", "task=reach", *FAST]
     run = kerv("rollout", "--plan", "method=ar", "acceptance=relaxed", *words)
     assert run.returncode == 0
-    assert run.stderr == "note: acceptance=relaxed has no effect: method ar drafts nothing\n"
+    assert run.stderr == "note: acceptance=relaxed has no effect: method ar drafts nothing\nar acceptance=relaxed of nano-state on reach-v3: 2 episodes\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

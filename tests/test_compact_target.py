@@ -170,14 +170,14 @@ class Demos:
 
     sha256, path = "e" * 64, Path("demos")
     manifest = SimpleNamespace(config={}, environment="insertion", actions=SEVEN, observation=ARM, tasks={})
-    episodes = tuple(DemoEntry(seed, bool(seed % 2), 9, 0, "", "insert", Path()) for seed in range(6))
+    episodes = tuple(DemoEntry(seed, bool(seed % 2), 9, 0, "", "insert-peg", Path()) for seed in range(6))
 
     def load(self, index: int) -> DemoEpisode:
         random = np.random.default_rng(index)
         labels = np.tanh(random.normal(size=(20, 7))).astype(np.float32)
         states = random.normal(0, 0.1, (9, 14)).astype(np.float32)
         nothing = np.zeros((1, 8, 8, 3), np.uint8), np.zeros(1, np.int64)
-        return DemoEpisode("insert", index, bool(index % 2), 9, *nothing, states, labels, labels[:9], np.zeros(3))
+        return DemoEpisode("insert-peg", index, bool(index % 2), 9, *nothing, states, labels, labels[:9], np.zeros(3))
 
 
 @pytest.fixture
@@ -188,7 +188,7 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     train = TrainSettings(steps=4, batch=4, warmup=1, validate_every=2, held_out=0.34, bf16=False)
     dataset, settings = Demos(), nano().settings
     words = WordTokenizer.build(["insert the peg"])
-    samples = load_samples(dataset, settings, words, ("insert",))  # type: ignore[arg-type]
+    samples = load_samples(dataset, settings, words, ("insert-peg",))  # type: ignore[arg-type]
     target = new_target(settings, dataset, samples, words, "front", 0)  # type: ignore[arg-type]
     folder = tmp_path / "artifacts/target/arm"
     run = Imitation(target, samples, train, torch.device("cpu"))

@@ -84,7 +84,7 @@ def test_an_installed_wheel_runs_its_main_job_from_another_folder(wheel: zipfile
     work.mkdir()
     command = ["rollout", "method=one_pass", "task=drawer-open", "episodes=1", "world.horizon=8", "record=0"]
     run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", "kerv_cli.cli.app", *command],
+        [sys.executable, "-W", "ignore", "-m", "kerv_cli", *command],
         cwd=work,
         env={**os.environ, "PYTHONPATH": str(site)},
         capture_output=True,

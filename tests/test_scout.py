@@ -140,7 +140,7 @@ def test_it_is_trained_from_the_command_line_for_its_target_alone(results: Path)
     missing = CliRunner().invoke(app, rollout)
     assert missing.exit_code == 1
     assert "no scout in" in missing.stderr
-    assert "kerv train drafter drafter=scout" in missing.stderr
+    assert "kerv prepare policy.target=nano-vision" in missing.stderr
 
 
 # --- the certificate

@@ -16,10 +16,9 @@ from kerv_cli.cli.common import ShowPlan, print_plan
 @command(
     "serve",
     ServeSettings,
-    keys="protocol policy method task host port gripper chunk batch seats takeover idle_s log_every max_mb",
+    keys="protocol policy method task host port gripper batch seats idle_s",
     examples=(
         "kerv serve policy=vision method=one_pass",
-        "kerv serve policy.target=openvla port=0 runtime.device=auto",
         "kerv serve protocol=vla_eval policy=state method=spec_vla",
     ),
     typed={"task": "task_name"},  # one task's name; elsewhere it is a list
