@@ -17,6 +17,7 @@ from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_json, read_mapping, read_table, read_yaml, sha256_of
 from kerv_cli.lab.catalogue import find_runs
 from kerv_cli.lab.store import StudyStore, is_result_of
+from kerv_cli.report.curves import read_log
 from kerv_cli.report.tables import load_study
 from kerv_cli.report.viewing.viewer import read_back
 
@@ -167,6 +168,13 @@ def test_a_table_of_holes_or_of_another_kind_is_refused(tmp_path: Path, pipe: Pa
     for path in (tmp_path / "a.parquet", tmp_path, pipe):
         with pytest.raises((OSError, ValueError)):
             read_table(path)
+
+
+@pytest.mark.parametrize("text", ["", "a\n1\n", "step,loss\n: x,1\n", "step,loss\n,1\n"])
+def test_a_log_without_steps_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(CheckpointError):
+        read_log(tmp_path)
 
 
 def test_a_status_that_is_a_list_is_damaged(store: StudyStore) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_folder
+from kerv_cli.lab.claims import clean_void
 from kerv_cli.lab.code import code_hash
 from kerv_cli.lab.identity import ENGINE, OBSERVATION, depends_on_order, effective, flat, work_of
 from kerv_cli.lab.plan import Cell, blocks_of, unique_cells
@@ -254,6 +255,7 @@ def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], 
         with contextlib.suppress(UsageError, CheckpointError):
             if {(*cell.work, cell.seeds) for cell in store.read_plan().cells} != work:
                 continue
+            clean_void(store.claims)
             covered = cover(cells, Stock(store, others=False))
             if covered.reasons:
                 return store, covered.cells, len(covered.cells) - len(covered.reasons)

@@ -28,7 +28,7 @@ def read_log(folder: Path) -> pd.DataFrame:
         log = pd.read_csv(regular(path, MOST_TEXT))
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} cannot be read: {error}") from error
-    if "step" not in log or log.empty:
+    if "step" not in log or log.empty or pd.to_numeric(log["step"], errors="coerce").isna().any():
         raise CheckpointError(f"{path} is not the log of a training")
     return log
 

@@ -317,12 +317,16 @@ def _run_jobs(
         return
     check_workers()
     from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.process_executor import BrokenProcessPool
 
     # loky starts fresh interpreters: a fork after this process has drawn would deadlock in the GL driver.
     workers = {"n_jobs": min(config.workers, len(jobs)), "initializer": begin_worker, "initargs": (os.getpid(),)}
     with parallel_config(backend="loky", inner_max_num_threads=1, **workers):
         work = (delayed(_record_seeds)(config, out, task, seeds, make_actor) for task, seeds in jobs)
-        yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
+        try:
+            yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
+        except BrokenProcessPool as error:
+            raise KervError("a worker process was killed: the same command goes on where it was") from error
 
 
 _world: World | None = None
