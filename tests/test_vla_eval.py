@@ -253,7 +253,7 @@ def test_names_that_are_no_file_names_are_not_kept(policy: Policy, results: Path
         client.act()
         client.tell("episode_end", {"metrics": {"success": True}})
         client.act()
-    assert not list(results.parent.rglob("x.parquet"))
+    assert not list(results.parent.rglob("x.arrow"))
 
 
 def test_clients_of_a_batch_get_the_actions_that_each_would_alone(results: Path) -> None:

@@ -314,10 +314,9 @@ class _SidePlan:
             kept = [self._served(one, episode) for episode in episodes]
             pairs = list(zip(episodes, kept, strict=True))
             found = [_row(cell, one, *pair) for pair in pairs]
-            decodes = pa.concat_tables([_decodes(cell, *pair) for pair in pairs])
             tables = {
                 "episodes.parquet": table_bytes(pa.Table.from_pylist(found, schema=EPISODE_SCHEMA)),
-                "decodes.parquet": table_bytes(decodes),
+                "decodes.parquet": table_bytes(_decodes(cell, pairs)),
             }
             seconds = sum(row["seconds"] for row in found)
             store.write_tables(cell, tables, self._status(one, episodes, seconds))
@@ -388,16 +387,19 @@ def _row(cell: Cell, one: Evaluation, episode: Episode, served: Served | None) -
     return row | shared | here
 
 
-def _decodes(cell: Cell, episode: Episode, served: Served | None) -> pa.Table:
-    if served is None:
-        return pa.Table.from_pylist(decode_rows(_bare(cell, episode)), schema=DECODE_SCHEMA)
-    table = served.decodes
-    for name, value in (("task", cell.task), ("seed", episode.seed)):
-        at = DECODE_SCHEMA.get_field_index(name)
-        table = table.set_column(
-            at, DECODE_SCHEMA.field(at), pa.array([value] * len(table), DECODE_SCHEMA.field(at).type)
-        )
-    return table
+def _decodes(cell: Cell, pairs: Sequence[tuple[Episode, Served | None]]) -> pa.Table:
+    """The rows of decodes.parquet of a cell's episodes."""
+    bare = [row for episode, served in pairs if served is None for row in decode_rows(_bare(cell, episode))]
+    tables = [(episode, served.decodes) for episode, served in pairs if served is not None]
+    whole = pa.concat_tables([pa.Table.from_pylist(bare, schema=DECODE_SCHEMA), *(table for _, table in tables)])
+    seeds = np.repeat([episode.seed for episode, _ in tables], [len(table) for _, table in tables]).astype(np.int64)
+    columns = {
+        "task": pa.array([cell.task] * len(whole), pa.string()),
+        "seed": pa.array([*(row["seed"] for row in bare), *seeds.tolist()], pa.int64()),
+    }
+    for name, values in columns.items():
+        whole = whole.set_column(whole.column_names.index(name), DECODE_SCHEMA.field(name), values)
+    return whole
 
 
 def _bare(cell: Cell, episode: Episode) -> EpisodeRecord:

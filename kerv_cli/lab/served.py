@@ -1,7 +1,8 @@
 """What a server keeps of an episode whose world ran elsewhere: its decodes and a row like that of an episode here.
 
-results/served/<evaluation>/<episode>.parquet: rows of decodes.parquet; the row of episodes.parquet and what served it
-are JSON in the file's metadata. Both names are the harness's.
+results/served/<evaluation>/<episode>.arrow: rows of decodes.parquet; the row of episodes.parquet and what served it are
+JSON in the file's metadata. Both names are the harness's. Arrow's files are read several times as fast as parquet's, and an
+import reads thousands.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import atomic_path
@@ -41,7 +41,7 @@ def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
     """The file of an episode; None for names that cannot be those of files."""
     if not _NAME.fullmatch(evaluation) or not _NAME.fullmatch(episode):
         return None
-    return results / SERVED / evaluation / f"{episode}.parquet"
+    return results / SERVED / evaluation / f"{episode}.arrow"
 
 
 def write_served(path: Path, record: EpisodeRecord, at: Circumstances, by: Mapping[str, Any]) -> None:
@@ -55,8 +55,9 @@ def write_served(path: Path, record: EpisodeRecord, at: Circumstances, by: Mappi
         row |= {"path_length": math.nan, "jerk": math.nan}
     facts = json.dumps({"episode": row, "by": by})
     table = pa.Table.from_pylist(decode_rows(record), schema=DECODE_SCHEMA).replace_schema_metadata({_KEY: facts})
-    with atomic_path(path) as temporary:
-        pq.write_table(table, temporary, compression="zstd")
+    options = pa.ipc.IpcWriteOptions(compression="zstd")
+    with atomic_path(path) as temporary, pa.ipc.new_file(str(temporary), table.schema, options=options) as file:
+        file.write_table(table)
 
 
 def read_served(path: Path) -> Served | None:
@@ -66,9 +67,12 @@ def read_served(path: Path) -> Served | None:
         CheckpointError: it is damaged.
     """
     try:
-        table = pq.ParquetFile(path).read(use_threads=False)
+        with pa.ipc.open_file(str(path)) as file:
+            table = file.read_all()
         facts = json.loads((table.schema.metadata or {})[_KEY])
-        return Served(facts["episode"], facts["by"], table.replace_schema_metadata(None).cast(DECODE_SCHEMA))
+        table = table.replace_schema_metadata(None)
+        decodes = table if table.schema.equals(DECODE_SCHEMA) else table.cast(DECODE_SCHEMA)
+        return Served(facts["episode"], facts["by"], decodes)
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
