@@ -1,13 +1,8 @@
 """What a server keeps of an episode whose world ran elsewhere: its decodes and a row like that of an episode here.
 
 results/served/<evaluation>/<episode>.arrow: rows of decodes.parquet; the row of episodes.parquet and what served it are
-<<<<<<< HEAD
 JSON in the file's metadata. Both names are the harness's. Arrow's files are read several times as fast as parquet's,
 and an import reads thousands.
-=======
-JSON in the file's metadata. Both names are the harness's. Arrow's files are read faster than parquet's, and an import
-reads thousands.
->>>>>>> serve
 """
 
 from __future__ import annotations
