@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -192,6 +193,9 @@ def test_a_chunk_is_sent_step_by_step_and_decoded_once(policy: Policy) -> None:
         client.tell("episode_start", {"task": {"name": "reach-v3"}})
         chunk = [client.act() for _ in range(4)]
         client.act(images={"corner4": np.zeros((96, 96, 3), np.uint8)})
+        until = time.monotonic() + 10  # the line comes behind the answer
+        while sum("answers" in line for line in log) < 2 and time.monotonic() < until:
+            time.sleep(0.01)
         assert sum("answers" in line for line in log) == 2
     expected = policy.artifacts.target
     assert np.array(chunk).shape == (4, len(expected.actions.names))

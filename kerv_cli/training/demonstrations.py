@@ -75,7 +75,8 @@ def demos_for(settings: OfTarget) -> DemoDataset:
     settings.demos = settings.demos or target.demos or name_of(())
     dataset = open_demos(settings.results, settings.demos, tasks, episodes)
     there = list(dataset.manifest.tasks)
-    for task in resolve_tasks(settings.task) if settings.task else ():
+    same = dataset.manifest.environment == target.environment  # else the spaces differ, which is said instead
+    for task in resolve_tasks(settings.task) if settings.task and same else ():
         if task not in there:
             raise CheckpointError(
                 f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "
