@@ -187,11 +187,10 @@ def test_a_film_shows_the_camera_and_below_it_the_tokens(tmp_path: Path, ending:
     content = place.read_bytes()
     assert content[:3] == b"GIF" if ending == "gif" else content[4:8] == b"ftyp"
     if ending == "gif":
-        film = Image.open(place)
-        assert getattr(film, "n_frames") > 1  # noqa: B009
-        colours = {
-            colour for _, colour in film.convert("RGB").crop((0, film.width, *film.size)).getcolors(1 << 20) or ()
-        }
+        with Image.open(place) as film:
+            assert getattr(film, "n_frames") > 1  # noqa: B009
+            strip = film.convert("RGB").crop((0, film.width, *film.size))
+        colours = {colour for _, colour in strip.getcolors(1 << 20) or ()}
         assert len(colours) > 3
     with pytest.raises(UsageError, match=r"\.gif or \.mp4"):
         save_film(place, tmp_path / "film.avi")
