@@ -10,8 +10,8 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings
-from kerv_cli.base.spaces import Observation
+from kerv_cli.base.settings import EXPERT, WAITS, PolicySettings, RolloutSettings, RuntimeSettings, ServeSettings
+from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, deviation
@@ -34,7 +34,7 @@ CALIBRATION_DECODES = 15
 """Autoregressive decodes whose median is what `rollout.ar_ms` scales."""
 
 
-def artifacts_of(settings: RolloutSettings) -> Artifacts:
+def artifacts_of(settings: RolloutSettings | ServeSettings) -> Artifacts:
     """The policy's files on its device; all settings of this process share the loaded objects."""
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
@@ -110,12 +110,11 @@ def _check_expert(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
             raise UsageError(f"policy=expert with {kind}={part.kind}: the expert decodes nothing, leave it out")
 
 
-class Sampled:
-    """A decoder that also decodes every `every`-th observation autoregressively, outside the timing, and records the
-    deviation."""
+class Around:
+    """Base of what adds something to a decoder: all that it does not do itself, the decoder does."""
 
-    def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
-        self.decoder, self.reference, self.every, self.count = decoder, reference, every, 0
+    def __init__(self, decoder: Decoder) -> None:
+        self.decoder = decoder
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -128,9 +127,30 @@ class Sampled:
         return self.decoder.watcher
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
+        """Begins an episode."""
+        self.decoder.reset(task, seed, end_effector)
+
+    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
+        """Tells the decoder."""
+        self.decoder.observe(action, end_effector)
+
+    def finish(self, success: bool) -> None:
+        """Tells the decoder."""
+        self.decoder.finish(success)
+
+
+class Sampled(Around):
+    """A decoder that also decodes every `every`-th observation autoregressively, outside the timing, and records the
+    deviation. AR needs no history, so that only the decoder is told what was executed."""
+
+    def __init__(self, decoder: Decoder, reference: Decoder, every: int) -> None:
+        super().__init__(decoder)
+        self.reference, self.every, self.count = reference, every, 0
+
+    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Begins an episode of both decoders."""
         self.count = 0
-        self.decoder.reset(task, seed, end_effector)
+        super().reset(task, seed, end_effector)
         self.reference.reset(task, seed, end_effector)
 
     def decode(self, observation: Observation) -> DecodeRecord:
@@ -141,14 +161,6 @@ class Sampled:
             return record
         reference = self.reference.decode(observation).actions
         return dataclasses.replace(record, deviation=deviation(self.decoder.target.actions, record.actions, reference))
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Tells the decoder; AR needs no history."""
-        self.decoder.observe(action, end_effector)
-
-    def finish(self, success: bool) -> None:
-        """Tells the decoder."""
-        self.decoder.finish(success)
 
 
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
@@ -166,7 +178,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         if settings.deviation_every > 0:
             reference = Decoder(artifacts.target, chunk=settings.chunk)
             decoder = Sampled(decoder, reference, settings.deviation_every)
-    warm_up(decoder, task, spec, settings.world.camera.size)
+    warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 
 
@@ -210,25 +222,27 @@ def _ar_seconds(
     policy = PolicySettings(target=target)
     artifacts = artifacts_of(RolloutSettings(results=results, runtime=runtime, policy=policy))
     decoder = Decoder(artifacts.target, chunk=chunk)
-    warm_up(decoder, task, spec_of(task), pixels)
-    still = still_observation(decoder, spec_of(task), pixels)
+    space = spec_of(task).observation
+    warm_up(decoder, task, space, pixels)
+    still = still_observation(decoder, space, pixels)
     return float(np.median([decoder.decode(still).seconds for _ in range(CALIBRATION_DECODES)]))
 
 
-def still_observation(decoder: ActionDecoder, spec: EnvironmentSpec, pixels: int) -> Observation:
+def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
     """Zeros for everything that the decoder reads. pixels: size of the images."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
-    space = spec.observation
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
 
-def warm_up(decoder: ActionDecoder, task: str, spec: EnvironmentSpec, pixels: int) -> None:
+def warm_up(
+    decoder: ActionDecoder, task: str, space: ObservationSpace, pixels: int, decodes: int = WARM_UP_DECODES
+) -> None:
     """Runs a few decodes before anything is timed: first calls allocate memory and choose kernels. The hand is moved,
     so that parts that need a history or a path run too. pixels: size of the images."""
-    still = still_observation(decoder, spec, pixels)
+    still = still_observation(decoder, space, pixels)
     watcher: Watcher | None = getattr(decoder, "watcher", None)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))
-    for i in range(WARM_UP_DECODES):
+    for i in range(decodes):
         for step, action in enumerate(decoder.decode(still).actions):
             if step and watcher is not None and watcher.looks_at(step):
                 watcher.look(still, step)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import add, find
 from kerv_cli.engine.parts import Skip
-from kerv_cli.methods.watch import FARTHEST, check_source, needs_of_source
+from kerv_cli.methods.watch import FARTHEST, check_source, is_near, needs_of_source
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
@@ -42,13 +42,11 @@ class AgreementSkip(Skip):
 
     def take(self, chunk: Chunk) -> bool:
         """Fills the chunk with the draft where both sources agree -> whether it did."""
-        from kerv_cli.engine.loss import chunk_loss
-
         chains = [source.chains(chunk, chunk.size) for source in (self.draft, self.other)]
         if any(not chain or len(chain[0]) < chunk.size for chain in chains):
             return False
         (draft, *_), (other, *_) = chains
-        if FARTHEST * chunk_loss(chunk.space, draft, other, FARTHEST) > self.tolerance:
+        if not is_near(chunk, draft, other, self.tolerance):
             return False
         chunk.skip(draft, self.draft.name)
         return True

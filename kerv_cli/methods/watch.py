@@ -36,6 +36,14 @@ def check_source(settings: Any) -> None:
         raise UsageError(f"skip.source={settings.source}: it does not draft whole chunks from an observation")
 
 
+def is_near(chunk: Chunk, tokens: Sequence[int], others: Sequence[int], tolerance: float) -> bool:
+    """Whether tokens of the chunk differ from others by at most `tolerance`: the mean absolute difference, normalised;
+    FARTHEST where a strict DoF differs."""
+    from kerv_cli.engine.loss import chunk_loss
+
+    return FARTHEST * chunk_loss(chunk.space, tokens, others, FARTHEST) <= tolerance
+
+
 class Watch(Skip):
     """Leaves every chunk to the target, and keeps it for as long as the source's own action is near the planned one."""
 
@@ -54,10 +62,8 @@ class Watch(Skip):
 
     def keeps(self, chunk: Chunk, planned: Sequence[int]) -> bool:
         """See `Watches.keeps`. A source without a draft keeps every plan."""
-        from kerv_cli.engine.loss import chunk_loss
-
         chains = self.source.chains(chunk, len(planned))
-        return not chains or FARTHEST * chunk_loss(chunk.space, chains[0], planned, FARTHEST) <= self.tolerance
+        return not chains or is_near(chunk, chains[0], planned, self.tolerance)
 
 
 def needs_of_source(settings: Any) -> tuple[str, ...]:

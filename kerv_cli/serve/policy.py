@@ -13,15 +13,13 @@ import numpy as np
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
-from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import MethodSettings, RolloutSettings, ServeSettings
 from kerv_cli.base.spaces import Observation
-from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.batched import BatchDecoder, Lane
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import ActionDecoder
-from kerv_cli.methods.artifacts import Artifacts
+from kerv_cli.lab.policy import Around, artifacts_of, warm_up
 from kerv_cli.methods.compose import Method
 from kerv_cli.serve.guard import HOLD, Finite, StateRange
 from kerv_cli.serve.session import GRIPPERS, Interface, Session
@@ -50,10 +48,7 @@ class Policy:
         if settings.gripper not in GRIPPERS:
             raise UnknownName("gripper", settings.gripper, GRIPPERS)
         self.settings = settings
-        self.device, _ = set_up(settings.runtime)
-        self.artifacts = Artifacts(
-            settings.results, settings.policy, settings.datastore, self.device, settings.runtime.dtype
-        )
+        self.artifacts = artifacts_of(settings)
         self.method = Method.of(settings)
         self.method.check(self.artifacts.description, settings.batch)
         if settings.protocol != VLA_EVAL:
@@ -135,23 +130,17 @@ class Policy:
         with self._turn:
             decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
             decoder.target = Finite(decoder.target)
-            images = {c: np.zeros(frame_shape(c, self.interface.size), np.uint8) for c in self.interface.cameras}
-            space = self.interface.observation
-            still = Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
-            decoder.reset(task, 0, np.zeros(3))
-            for _ in range(WARM_UP):
-                for action in decoder.decode(still).actions:
-                    decoder.observe(action, np.zeros(3))
+            warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
         return decoder
 
     def facts(self) -> dict[str, Any]:
         """What a result must say about it: settings of a rollout, hashes, machine and versions; plain values."""
         shared = {at.name: getattr(self.settings, at.name) for at in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
-        settings["runtime"]["device"] = self.device
+        settings["runtime"]["device"] = self.artifacts.device
         camera = {"name": self.interface.cameras[0] if self.interface.cameras else "", "size": self.interface.size}
         settings["world"]["camera"] |= {key: value for key, value in camera.items() if value}
-        return {"settings": settings, "identity": self.identity, "machine": stamp(self.device)}
+        return {"settings": settings, "identity": self.identity, "machine": stamp(self.artifacts.device)}
 
 
 def check_finite(decoder: Decoder | BatchDecoder) -> None:
@@ -160,34 +149,12 @@ def check_finite(decoder: Decoder | BatchDecoder) -> None:
     target.check()
 
 
-@dataclass(frozen=True)
-class Alone:
+class Alone(Around):
     """A client's decoder, which decodes when no other one does."""
 
-    decoder: Decoder
-    turn: threading.Lock
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Those of the decoder."""
-        return self.decoder.cameras
-
-    @property
-    def watcher(self) -> Decoder | None:
-        """That of the decoder."""
-        return self.decoder.watcher
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode."""
-        self.decoder.reset(task, seed, end_effector)
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Tells the decoder."""
-        self.decoder.observe(action, end_effector)
-
-    def finish(self, success: bool) -> None:
-        """Tells the decoder."""
-        self.decoder.finish(success)
+    def __init__(self, decoder: Decoder, turn: threading.Lock) -> None:
+        super().__init__(decoder)
+        self.turn = turn
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """The decoder's record."""

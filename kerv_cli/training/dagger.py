@@ -6,6 +6,7 @@ The policy decodes by any method. So the states that a drafter's unverified chun
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ class PolicyActor:
     that are not executed yet."""
 
     def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
-        self.decoder_of, self.share = decoder_of, expert_share
+        self.decoder_of, self.share = functools.cache(decoder_of), expert_share
         self.actions: deque[NDArray[np.float64]] = deque()
         self.expert_steps = 0
         self.executed: NDArray[np.float32] | None = None

@@ -43,12 +43,17 @@ class Candidate:
     @property
     def rule(self) -> Any:
         """Settings of the skip rule."""
-        return read(part_of("skip", self.skip["kind"]).settings, self.skip, "the certificate's rule")
+        return _part_settings("skip", self.skip)
 
     @property
     def source(self) -> Any:
         """Settings of the draft."""
-        return read(part_of("prefill_draft", self.draft["kind"]).settings, self.draft, "the certificate's draft")
+        return _part_settings("prefill_draft", self.draft)
+
+
+def _part_settings(kind: str, plain: dict[str, Any]) -> Any:
+    """Settings of a part from plain values."""
+    return read(part_of(kind, plain["kind"]).settings, plain, f"the certificate's {kind}")
 
 
 @dataclass(frozen=True)
@@ -142,16 +147,16 @@ class CertificateArtifact(Artifact[Certificate]):
         return part_of("prefill_draft", source.kind).needs(source)
 
 
-def covers(context: Context) -> bool:
-    """Whether the certificate covers the decoder's task."""
+def covering(context: Context) -> Certificate | None:
+    """The certificate, where it covers the decoder's task."""
     certificate: Certificate = context.artifact("certificate")
-    return context.task in certificate.tasks
+    return certificate if context.task in certificate.tasks else None
 
 
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
     """prefill_draft=scoped: the draft for the task at hand."""
-    certificate: Certificate = context.artifact("certificate")
-    if covers(context) and certificate.certified is not None:
+    certificate = covering(context)
+    if certificate is not None and certificate.certified is not None:
         source = certificate.certified.source
     else:
         source = part_of("prefill_draft", settings.outside).default
@@ -160,9 +165,9 @@ def scoped(settings: ScopedSettings, context: Context) -> Proposer:
 
 def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     """skip=certified: the certified rule, or a streak outside the certificate."""
-    certificate: Certificate = context.artifact("certificate")
+    certificate = covering(context)
     rule: Any = StreakSkipSettings(most=settings.most)
-    if covers(context):
+    if certificate is not None:
         if certificate.certified is None:
             return None
         rule, chunk = certificate.certified.rule, context.chunk or context.target.chunk

@@ -63,7 +63,7 @@ def _rows(recording: Path) -> dict[str, list[tuple[int, float, Any]]]:
 
 def _at(rows: list[tuple[int, float, Any]], step: int) -> Any:
     """The value that holds at a control step; None before the first."""
-    place = bisect_right([row[0] for row in rows], step)
+    place = bisect_right(rows, step, key=lambda row: row[0])
     return rows[place - 1][2] if place else None
 
 
