@@ -15,6 +15,7 @@ from kerv_cli.cli.app import app
 from kerv_cli.lab.resolve import resolve, resolve_rollout
 from kerv_cli.report import curves
 from kerv_cli.report.drawing import new_figure
+from kerv_cli.training.preparation import needs
 
 TASK = "reach-v3"
 MINE = "policy.target=mine"
@@ -101,6 +102,11 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) ->
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
     assert "kerv runs rm drafter/mine'" in kerv("prepare", MINE, "--plan", code=1)
+
+
+def test_a_certificate_is_made_from_what_its_candidates_read() -> None:
+    assert needs(("one_pass_certified",), sees=True) == ("drafter", "early", "scout", "certificate")
+    assert needs(("one_pass",), sees=True) == ("early",)
 
 
 class Tracker:

@@ -140,7 +140,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     own = [word for word in words if word.split("=")[0] in OWN]
     theirs = [word for word in words if word not in own]
     if not any(word.startswith("study=") for word in theirs):
-        theirs = ["study=certify", *theirs]
+        theirs = [f"study={CalibrateSuccessSettings.groups['study']}", *theirs]
     folder = [word for word in theirs if word.startswith("results=")]
     settings = compose("calibrate_success", [*own, *folder], CalibrateSuccessSettings)
     resolved = resolve(theirs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,8 +10,9 @@ from pathlib import Path
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.registry import parts
-from kerv_cli.base.settings import PrepareSettings, RolloutSettings, TrainDrafterSettings
+from kerv_cli.base.settings import CalibrateSuccessSettings, PrepareSettings, RolloutSettings, TrainDrafterSettings
 from kerv_cli.lab.catalogue import state_of
+from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
@@ -19,7 +21,7 @@ from kerv_cli.worlds import specs
 ORDER = ("drafter", "early", "scout", "datastore", "calibration", "certificate")
 """A kind is made from those before it; kinds of parts that are not kerv's come last."""
 SEEING = ("scout", "certificate")
-"""Kinds that need a target with cameras: the certificate is of the scout's drafts."""
+"""Kinds that need a target with cameras: a scout drafts for one of the certificate's candidates."""
 THERE, MISSING = "there", "missing"
 
 
@@ -47,7 +49,7 @@ def plan(settings: PrepareSettings) -> list[Step]:
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
     spec = specs().get(description.environment)
     played = spec is not None and not spec.world_class.endswith(":NoWorld")
-    kinds = needs(settings.methods, bool(description.cameras), played)
+    kinds = needs(tuple(settings.methods), bool(description.cameras), played)
     steps: list[Step] = []
     for kind in kinds:
         place, command = artifacts.path(kind), list(kind_of(kind).command)
@@ -62,7 +64,8 @@ def plan(settings: PrepareSettings) -> list[Step]:
     return steps
 
 
-def needs(methods: Sequence[str], sees: bool, played: bool = True) -> list[str]:
+@functools.cache
+def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[str, ...]:
     """Kinds of artifacts that methods need, in the order in which they are made. methods: none: all that the target can
     have. sees: whether it has cameras. played: whether its environment can be run, and is not a recording alone.
 
@@ -79,8 +82,11 @@ def needs(methods: Sequence[str], sees: bool, played: bool = True) -> list[str]:
         if not sees and own & set(SEEING) and methods:
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= own
+    if "certificate" in kinds and sees and played:  # its candidates run before one of them is certified
+        candidates = resolve([f"study={CalibrateSuccessSettings.groups['study']}"]).settings.values()
+        kinds |= {kind for settings in candidates for kind in Method.of(settings).needs}
     made = [kind for kind in dict.fromkeys((*ORDER, *parts("artifact"))) if kind in kinds and kind_of(kind).command]
-    return [kind for kind in made if (sees or kind not in SEEING) and (played or kind != "certificate")]
+    return tuple(kind for kind in made if (sees or kind not in SEEING) and (played or kind != "certificate"))
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
