@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from types import FrameType
 
 
@@ -14,7 +15,7 @@ def main() -> None:
     from kerv_cli.cli.app import main as run
 
     for number in ours:
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, _interrupt)
     run()
 
 
@@ -22,6 +23,18 @@ def _end(number: int, frame: FrameType | None) -> None:
     """Ends the process while it only loads: an exception could surface anywhere in the middle of an import."""
     os.write(2, b"kerv: interrupted\n")
     os._exit(130)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Ctrl-C. In the middle of an import it waits: C++ code that runs Python while it loads would abort the process."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            again = threading.Timer(0.05, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import subprocess
 import sys
@@ -45,15 +46,26 @@ with guard():
     open(sys.argv[1], "a").write(f"{agent}\\n")
     time.sleep(float(sys.argv[2]))
 """
-SWEEP = """
-import time
-from kerv_cli.base.processes import sigterm_interrupts
-try:
-    with sigterm_interrupts():
-        print("here", flush=True)
+MODULE = """
+import os, sys, time
+os.kill(os.getpid(), int(sys.argv[1]))
+time.sleep(0.3)
+print("loaded", flush=True)
+"""
+COMMAND = """
+import signal, sys, time
+import kerv_cli.__main__ as kerv
+import kerv_cli.cli.app
+
+def run():
+    try:
+        import module_of_a_library
         time.sleep(60)
-except KeyboardInterrupt:
-    print("cleared", flush=True)
+    except KeyboardInterrupt:
+        print("cleared", flush=True)
+
+kerv_cli.cli.app.main = run
+kerv.main()
 """
 
 
@@ -122,13 +134,16 @@ def free_port() -> int:
     return port
 
 
-def test_sigterm_clears_away(tmp_path: Path) -> None:
-    with subprocess.Popen([sys.executable, "-c", SWEEP], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "here\n"
-        process.send_signal(signal.SIGTERM)
-        assert process.stdout.read() == "cleared\n"
-    assert process.returncode == 0
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_waits_for_the_end_of_an_import(number: signal.Signals, tmp_path: Path) -> None:
+    # an exception in the middle of an extension's start aborts the process
+    (tmp_path / "module_of_a_library.py").write_text(MODULE)
+    run = subprocess.run(
+        [sys.executable, "-c", COMMAND, str(number.value)], capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
+    )  # fmt: skip
+    assert (run.returncode, run.stdout) == (0, "loaded\ncleared\n"), run.stderr
 
 
 def test_without_shared_memory_workers_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

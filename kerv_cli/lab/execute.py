@@ -21,7 +21,6 @@ from typing import Any, Protocol, runtime_checkable
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError
 from kerv_cli.base.leftovers import clean
-from kerv_cli.base.processes import sigterm_interrupts
 from kerv_cli.base.provenance import git_commit, stamp
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
@@ -89,7 +88,7 @@ def execute(
 
     A cell that raises, or whose worker is killed, is reported as failed and the rest of its block goes on. Cells that
     another sweep computes at the moment are waited for. With one local worker everything happens in this process. On
-    KeyboardInterrupt and SIGTERM the workers are stopped; completed cells stay.
+    KeyboardInterrupt the workers are stopped; completed cells stay.
 
     Raises:
         StorageError: the disk refused a result; further results could not be stored either.
@@ -111,8 +110,7 @@ def execute(
     for cell, result in damaged:
         sweep.note(cell, result)
     if executor is not None:
-        with sigterm_interrupts():
-            sweep.run(blocks, executor)
+        sweep.run(blocks, executor)
     outcome = dataclasses.replace(sweep.outcome, seconds=time.perf_counter() - clock)
     on_event(events.SweepFinished(outcome))
     return outcome
