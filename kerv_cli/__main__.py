@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 from types import FrameType
 
@@ -16,6 +17,7 @@ def main() -> None:
 
     for number in ours:
         signal.signal(number, _interrupt)
+    sys.unraisablehook = _unraisable
     run()
 
 
@@ -29,12 +31,24 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     """Ctrl-C. In the middle of an import it waits: C++ code that runs Python while it loads would abort the process."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
-            again = threading.Timer(0.05, os.kill, (os.getpid(), number))
-            again.daemon = True
-            again.start()
+            _ask_again(number)
             return
         frame = frame.f_back
     raise KeyboardInterrupt
+
+
+def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
+    """An interrupt that reached code which cannot raise (a finaliser, a library's callback) comes again."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        _ask_again(signal.SIGTERM if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else signal.SIGINT)
+    else:
+        sys.__unraisablehook__(unraisable)
+
+
+def _ask_again(number: int) -> None:
+    timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    timer.start()
 
 
 if __name__ == "__main__":

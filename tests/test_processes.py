@@ -46,11 +46,21 @@ with guard():
     open(sys.argv[1], "a").write(f"{agent}\\n")
     time.sleep(float(sys.argv[2]))
 """
-MODULE = """
+IMPORT = """
 import os, sys, time
 os.kill(os.getpid(), int(sys.argv[1]))
 time.sleep(0.3)
 print("loaded", flush=True)
+"""
+FINALISER = """
+import os, sys
+class Handle:
+    def __del__(self):
+        os.kill(os.getpid(), int(sys.argv[1]))
+        print("not here", flush=True)
+def use():
+    Handle()
+    print("loaded", flush=True)
 """
 COMMAND = """
 import signal, sys, time
@@ -59,7 +69,8 @@ import kerv_cli.cli.app
 
 def run():
     try:
-        import module_of_a_library
+        import library
+        getattr(library, "use", int)()
         time.sleep(60)
     except KeyboardInterrupt:
         print("cleared", flush=True)
@@ -135,9 +146,9 @@ def free_port() -> int:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_waits_for_the_end_of_an_import(number: signal.Signals, tmp_path: Path) -> None:
-    # an exception in the middle of an extension's start aborts the process
-    (tmp_path / "module_of_a_library.py").write_text(MODULE)
+@pytest.mark.parametrize("library", [IMPORT, FINALISER])
+def test_an_interrupt_waits_for_code_that_cannot_raise(library: str, number: signal.Signals, tmp_path: Path) -> None:
+    (tmp_path / "library.py").write_text(library)
     run = subprocess.run(
         [sys.executable, "-c", COMMAND, str(number.value)], capture_output=True, text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},

@@ -160,9 +160,10 @@ def test_a_failure_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_damaged_recording_gets_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
+def test_a_damaged_recording_gets_one_line(share: float, tmp_path: Path) -> None:
     path = saved(episode("drafter"), tmp_path)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
     with pytest.raises(KervError) as caught:
         read_back(path)
     assert "\n" not in str(caught.value)

@@ -234,13 +234,13 @@ def _reader(path: Path) -> RrdReader:
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a missing footer, which may also raise
+        warnings.simplefilter("error")  # a footer is missing: the end of the file is
         try:
             reader = RrdReader(regular(path))
             recordings = reader.recordings()
         except FileNotFoundError as error:
             raise KervError(f"{path} is missing") from error
-        except (RuntimeError, OSError, ValueError) as error:
+        except (RuntimeError, OSError, ValueError, Warning) as error:
             raise KervError(_damaged(path, error)) from error
     if not recordings:
         raise KervError(f"{path} holds no recording: record the episode again")
@@ -261,4 +261,6 @@ def _chunks(reader: RrdReader, path: Path) -> list[Any]:
 
 def _damaged(path: Path, error: Exception) -> str:
     reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")
+    if isinstance(error, Warning):
+        reason = "its end is missing"
     return f"{path} is damaged ({reason}): record the episode again"
