@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
@@ -103,6 +104,7 @@ def certify(
         seeds=seeds_text(seed for cell in cells for seed in cell.seeds),
         candidates=candidates,
         chosen=chosen,
+        lengths={} if chosen is None else _lengths(episodes[episodes["label"] == candidates[chosen].label]),
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
     )
 
@@ -137,6 +139,12 @@ def verdicts(certificate: Certificate) -> list[dict[str, str]]:
         }
         for one in certificate.candidates
     ]
+
+
+def _lengths(episodes: pd.DataFrame) -> dict[str, list[int]]:
+    """Task -> decodes of each success, ascending."""
+    tasks = episodes[episodes["success"]].sort_values("decodes").groupby("task")["decodes"]
+    return {str(task): [int(count) for count in counts] for task, counts in tasks}
 
 
 def _bound(margin: float) -> float:
