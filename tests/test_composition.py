@@ -114,7 +114,7 @@ PRESETS: dict[str, dict[str, Any]] = {  # what differs from AR, spelled out: a d
         "prefill_draft": ScopedSettings(),
         "proposer": DrafterProposerSettings(),
         "acceptance": RELAXED,
-        "skip": CertifiedSkipSettings(guard=0.1),
+        "skip": CertifiedSkipSettings(),
     },
     "retrieval_unverified": {
         "prefill_draft": RetrievalProposerSettings(),
