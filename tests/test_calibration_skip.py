@@ -22,8 +22,8 @@ from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, Po
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.cli.app import app
 from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability, save_calibration
+from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels

@@ -20,7 +20,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDatastoreSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.retrieval.datastore import (
+from kerv_cli.methods.heisd.datastore import (
     PAYLOAD,
     PROJECTION,
     VECTORS,
