@@ -19,13 +19,13 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.settings import PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
+from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width

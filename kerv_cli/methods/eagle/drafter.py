@@ -27,7 +27,7 @@ from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import PublicShape, load_public
-from kerv_cli.targets.compact.cache import Cache
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.trunk import LayerStack
 
 

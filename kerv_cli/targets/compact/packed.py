@@ -21,8 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import load_state
-from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
 from kerv_cli.targets.compact.kernels import FastConv, FastLinear, RowNorm, gain_of, has_blocked_layouts
 from kerv_cli.targets.compact.packable import Packable, Packed

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.cache import Cache
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.kernels import RowNorm, has_blocked_layouts
 from kerv_cli.targets.compact.trunk import Layer, PackedStack, Rotary
 

@@ -24,7 +24,7 @@ from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape, views_of
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.compact.cache import Cache
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.features import (
     hand_features,
     places_of,
