@@ -43,7 +43,7 @@ from kerv_cli.methods.kinematics import KinematicThresholdSettings
 from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise
 from kerv_cli.methods.spec_vla import FixedThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
-from kerv_cli.training.calibration import CalibrationRun, reference_level
+from kerv_cli.training.calibration import CalibrationRun, distribution
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
@@ -220,10 +220,8 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens() -> None:
 
 
 def test_the_reference_level_is_the_median_and_can_divide() -> None:
-    assert reference_level([0.1, 5.0, 0.3], BIN) == 0.3
-    assert reference_level([0.0, 0.0], BIN) == BIN == pytest.approx(SPACE.centres[1] - SPACE.centres[0])
-    with pytest.raises(ValueError, match="no decode"):
-        reference_level([], BIN)
+    assert distribution([0.1, 5.0, 0.3], BIN).k_s == 0.3
+    assert distribution([0.0, 0.0], BIN).k_s == BIN == pytest.approx(SPACE.centres[1] - SPACE.centres[0])
 
 
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])

@@ -31,8 +31,7 @@ from kerv_cli.methods.heisd.datastore import (
     projected,
     prompt_key,
 )
-from kerv_cli.training.coverage import subset
-from kerv_cli.training.demonstrations import demos_for
+from kerv_cli.training.demonstrations import demos_for, subset
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_shown, read_chunks
 from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
@@ -90,8 +89,8 @@ class DatastoreBuild:
     """
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
-        self.settings = settings
-        self.dataset = subset(demos_for(settings), (), settings.starts)
+        settings, dataset = demos_for(settings)
+        self.settings, self.dataset = settings, subset(dataset, (), settings.starts)
         tasks = sorted(resolve_tasks(settings.task or list(self.dataset.manifest.tasks)))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
