@@ -17,7 +17,7 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.worlds import spec_of, specs
+from kerv_cli.worlds import instruction_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import EncodedFrames
@@ -170,11 +170,6 @@ def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> No
     recorded = dataset.manifest.config["camera"]["name"]
     if recorded != camera:
         raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
-
-
-def instruction_of(name: str) -> str:
-    """The instruction of a task."""
-    return spec_of(name).task(name).instruction
 
 
 S = TypeVar("S", bound=Rows)
