@@ -68,11 +68,6 @@ class Observations(Rows):
         return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
-def observed_steps(episode: DemoEpisode, settings: TargetSettings) -> np.ndarray:
-    """Control steps (n,) that such a policy learns from: those with a frame, for a state policy every step."""
-    return episode.frame_steps if settings.observation == "vision" else np.arange(episode.steps)
-
-
 def read_observations(
     episode: DemoEpisode,
     settings: TargetSettings,
@@ -80,13 +75,15 @@ def read_observations(
     words: WordTokenizer,
     chosen: slice | np.ndarray = slice(None),
 ) -> Observations:
-    """The observations of an episode that a policy of these settings learns from. chosen: which of them, default all.
+    """The observations of an episode that a policy of these settings learns from: those with a frame, for a state
+    policy every step. chosen: which of them, default all.
 
     Raises:
         CheckpointError: frames of another size than the policy takes.
     """
-    steps, frames = observed_steps(episode, settings)[chosen], None
-    if settings.observation == "vision":
+    sees, frames = settings.observation == "vision", None
+    steps = (episode.frame_steps if sees else np.arange(episode.steps))[chosen]
+    if sees:
         check_frames(episode, settings.image_size)
         pictures = episode.frames[chosen]
         frames = pictures if isinstance(pictures, EncodedFrames) else torch.from_numpy(pictures)

@@ -149,19 +149,11 @@ class TargetRun(Run):
             )
         self.folder = artifact(settings.results, "target", settings.name)
         self.init = self.find_init()
-        self.check_demos()
-        self.init_hash: dict[str, str] = {}  # {"init": hash of its weights}; empty for a fresh run
-
-    def check_demos(self) -> None:
-        """Refuses demonstrations of another environment, or frames of another camera than the policy will be shown.
-
-        Raises:
-            CheckpointError: they are.
-        """
-        spec, camera = self.spec, self.world.camera.name
-        check_spaces(self.dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
-        if self.settings.target.observation == "vision":
+        camera = self.world.camera.name
+        check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")
+        if settings.target.observation == "vision":
             check_camera(self.dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
+        self.init_hash: dict[str, str] = {}  # {"init": hash of its weights}; empty for a fresh run
 
     def find_init(self) -> Path | None:
         """Folder of the target `train.init`; None for a fresh run.

@@ -7,6 +7,7 @@ path is precise work, for which the drafter is better.
 
 from __future__ import annotations
 
+import functools
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -92,13 +93,10 @@ def neighbour_tree(
     return Draft.of(tokens, parents)
 
 
-class _Weights(dict[int, float]):
+@functools.lru_cache(maxsize=4096)
+def _weight(members: int) -> float:
     """Bit set of neighbours -> sum of their weights; the i-th neighbour, counted from 1, weighs 1 / i."""
-
-    def __missing__(self, members: int) -> float:
-        weight = sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
-        self[members] = weight
-        return weight
+    return sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
 
 
 class _Continuations:
@@ -107,7 +105,7 @@ class _Continuations:
 
     def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
         self.everyone = (1 << len(rows)) - 1
-        self.cross, self.weights = cross, _Weights()
+        self.cross = cross
         self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
         for first, last, strict in cuts:
             givers: dict[tuple[int, ...], int] = {}
@@ -126,11 +124,10 @@ class _Continuations:
             pool = last
             givers = [(group, members & last) for group, members in givers if members & last]
             givers.sort(key=lambda way: way[1] & -way[1])
-        weights, cross = self.weights, self.cross
-        of_whole, of_pool = weights[whole], weights[pool]
+        cross, of_whole, of_pool = self.cross, _weight(whole), _weight(pool)
         for group, members in givers:
             common = members & whole
-            probability = (1 - cross) * weights[common] / of_whole + cross * weights[members] / of_pool
+            probability = (1 - cross) * _weight(common) / of_whole + cross * _weight(members) / of_pool
             if probability > 0:
                 yield -math.log(probability), group, members, common or members
 

@@ -187,11 +187,8 @@ class CompactTarget(Packable):
                     f"the image of camera '{camera}' has shape {image.shape}, the target takes {self.frame_shape}"
                 )
             images = upload(image, self.device).permute(2, 0, 1)[None]
-        return Inputs(images, felt, state, self.words_of(observation.instruction))
-
-    def words_of(self, instruction: str) -> Tensor:
-        """The instruction's word ids (1, L) int64."""
-        return upload([self.words.encode(instruction, self.settings.instruction_tokens)], self.device)
+        words = self.words.encode(observation.instruction, self.settings.instruction_tokens)
+        return Inputs(images, felt, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
         """The prompt's embeddings (1, P, E); errors as `inputs`."""
