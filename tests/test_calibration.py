@@ -35,7 +35,6 @@ from kerv_cli.methods.calibration import (
     SkipLevel,
     SkipSection,
     Variability,
-    save_calibration,
 )
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd.rules import BoundaryRanges
@@ -335,7 +334,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
     change: Callable[[dict[str, Any]], Any], says: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "calibration.json"
-    save_calibration(path, calibration({"reach-v3": 0.7}))
+    write_json(path, dataclasses.asdict(calibration({"reach-v3": 0.7})))
     assert CalibrationArtifact().checked(path, description()) == calibration({"reach-v3": 0.7})
     value = copy.deepcopy(read_json(path))
     change(value)
@@ -349,7 +348,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
 @pytest.mark.parametrize("change", [{"low": (-2.0,) * 4}, {"strict": ()}, {"control_hz": 5.0}])
 def test_a_calibration_of_another_action_space_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
-    save_calibration(path, calibration({}))
+    write_json(path, dataclasses.asdict(calibration({})))
     other = description(actions=dataclasses.replace(SPACE, **change))
     with pytest.raises(CheckpointError, match="they were made for different actions") as caught:
         CalibrationArtifact().checked(path, other)

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
@@ -24,7 +26,6 @@ from kerv_cli.methods.calibration import (
     Demonstrations,
     SkipSection,
     Variability,
-    save_calibration,
 )
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
@@ -209,7 +210,7 @@ class CalibrationRun:
             **sections,
             provenance={**origin, "kept": earlier} if earlier else origin,
         )
-        save_calibration(self.path, calibration)
+        write_json(self.path, asdict(calibration))
         return calibration
 
     def _fill_empty(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -55,7 +55,9 @@ class CompactTarget(Packable):
 
     cameras: of a vision policy, the one whose images it reads; each of its views (`views_of`) has an encoder and vision
     tokens of its own. frame_shape: of those images. segments: slice of the prompt by the name of its part.
-    sha256: of the weights it was loaded with, else empty.
+    sha256: of the weights it was loaded with, else empty. chunk: H, control steps it was trained to decode at once.
+    parallel: whether it decodes by `parallel_pass` alone; it has not learnt to continue action tokens. width: E. heads,
+    feed_forward: attention heads and hidden units of the trunk's layers, and of a drafter's.
     """
 
     centre: Tensor
@@ -72,6 +74,8 @@ class CompactTarget(Packable):
         super().__init__()
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
+        self.chunk, self.parallel = s.chunk, s.parallel
+        self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
         self.cameras = (camera,) if s.observation == "vision" else ()
         views = len(views_of(camera)) if self.cameras else 0
         self.segments, self.frame_shape = _segments(s, views), frame_shape(camera, s.image_size)
@@ -103,31 +107,6 @@ class CompactTarget(Packable):
         if s.parallel:
             queries = self.embedding.weight.data.mean(0).repeat(s.chunk * actions.dofs, 1)
             self.queries = nn.Parameter(queries + 0.02 * torch.randn_like(queries))
-
-    @property
-    def chunk(self) -> int:
-        """H, control steps it was trained to decode at once."""
-        return self.settings.chunk
-
-    @property
-    def parallel(self) -> bool:
-        """Whether it decodes by `parallel_pass` alone; it has not learnt to continue action tokens."""
-        return self.settings.parallel
-
-    @property
-    def width(self) -> int:
-        """E."""
-        return self.settings.width
-
-    @property
-    def heads(self) -> int:
-        """A, attention heads of the trunk; a drafter has as many."""
-        return self.settings.heads
-
-    @property
-    def feed_forward(self) -> int:
-        """Hidden units of the trunk's feed-forward parts; a drafter has as many."""
-        return self.settings.feed_forward
 
     @property
     def max_prompt(self) -> int:
