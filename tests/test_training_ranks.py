@@ -21,7 +21,7 @@ from kerv_cli.lab.policy import decoder_for
 from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.imitation import task_borders
-from kerv_cli.training.loop import drawn
+from kerv_cli.training.loop import draw_samples
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds import spec_of
@@ -81,7 +81,7 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     generator = torch.Generator().manual_seed(0)
 
     def share(balance: float) -> float:
-        return float(tasks[drawn(1000, 20_000, generator, task_borders(tasks, balance))].double().mean())
+        return float(tasks[draw_samples(1000, 20_000, generator, task_borders(tasks, balance))].double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
     assert share(1.0) == pytest.approx(0.5, abs=0.02)

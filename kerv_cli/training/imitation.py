@@ -73,7 +73,7 @@ def load_samples(
 
 
 def task_borders(tasks: Tensor, balance: float) -> Tensor | None:
-    """(n,) float64: `borders` of `loop.drawn` by which a task of share p among the samples is drawn in proportion to
+    """(n,) float64: `borders` of `draw_samples` by which a task of share p among the samples is drawn in proportion to
     p^(1 − balance); None for balance 0, where all samples weigh alike. tasks (n,): index of each sample's task."""
     if balance == 0:
         return None

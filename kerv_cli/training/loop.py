@@ -46,7 +46,7 @@ class Lesson(Protocol):
         """Metrics of the EMA weights with a `score`, higher is better."""
 
 
-def drawn(samples: int, size: int, generator: torch.Generator, borders: Tensor | None = None) -> Tensor:
+def draw_samples(samples: int, size: int, generator: torch.Generator, borders: Tensor | None = None) -> Tensor:
     """(size,) int64 of `samples` samples, with replacement. borders (samples,) float64: the sums of their weights up to
     each, increasing; None: all alike."""
     if borders is None:
@@ -69,7 +69,7 @@ class Progress:
 class Loop:
     """Optimises a lesson's module. save: writes the best weights, which have these metrics. folder: holds
     `resume.safetensors` and `log.csv`. identity: hash of everything that determines the run; another run is never
-    resumed. ranks: the rank of this process among those that train together. borders: as in `drawn`."""
+    resumed. ranks: the rank of this process among those that train together. borders: as in `draw_samples`."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class Loop:
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
-        indices = self.ranks.share(drawn(len(self.lesson), settings.batch, generator, self.borders))
+        indices = self.ranks.share(draw_samples(len(self.lesson), settings.batch, generator, self.borders))
         loss, metrics = self.lesson.loss(indices, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()

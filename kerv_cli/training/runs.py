@@ -57,7 +57,7 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
 
 class Run(ABC):
     """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
-    `plan` says in one line what would be done. borders: as in `loop.drawn`."""
+    `plan` says in one line what would be done. borders: as in `draw_samples`."""
 
     kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
