@@ -27,8 +27,8 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter
-from kerv_cli.methods.retrieval import QdrantSearchSettings
-from kerv_cli.methods.retrieval.datastore import Datastore
+from kerv_cli.methods.heisd import QdrantSearchSettings
+from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.targets import checkpoint
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild

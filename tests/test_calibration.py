@@ -35,7 +35,6 @@ from kerv_cli.methods.calibration import (
     SkipLevel,
     SkipSection,
     Variability,
-    save_calibration,
 )
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd.rules import BoundaryRanges
@@ -43,7 +42,7 @@ from kerv_cli.methods.kinematics import KinematicThresholdSettings
 from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise
 from kerv_cli.methods.spec_vla import FixedThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
-from kerv_cli.training.calibration import CalibrationRun, reference_level
+from kerv_cli.training.calibration import CalibrationRun, distribution
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
@@ -220,10 +219,8 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens() -> None:
 
 
 def test_the_reference_level_is_the_median_and_can_divide() -> None:
-    assert reference_level([0.1, 5.0, 0.3], BIN) == 0.3
-    assert reference_level([0.0, 0.0], BIN) == BIN == pytest.approx(SPACE.centres[1] - SPACE.centres[0])
-    with pytest.raises(ValueError, match="no decode"):
-        reference_level([], BIN)
+    assert distribution([0.1, 5.0, 0.3], BIN).k_s == 0.3
+    assert distribution([0.0, 0.0], BIN).k_s == BIN == pytest.approx(SPACE.centres[1] - SPACE.centres[0])
 
 
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])
@@ -337,7 +334,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
     change: Callable[[dict[str, Any]], Any], says: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "calibration.json"
-    save_calibration(path, calibration({"reach-v3": 0.7}))
+    write_json(path, dataclasses.asdict(calibration({"reach-v3": 0.7})))
     assert CalibrationArtifact().checked(path, description()) == calibration({"reach-v3": 0.7})
     value = copy.deepcopy(read_json(path))
     change(value)
@@ -351,7 +348,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
 @pytest.mark.parametrize("change", [{"low": (-2.0,) * 4}, {"strict": ()}, {"control_hz": 5.0}])
 def test_a_calibration_of_another_action_space_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
-    save_calibration(path, calibration({}))
+    write_json(path, dataclasses.asdict(calibration({})))
     other = description(actions=dataclasses.replace(SPACE, **change))
     with pytest.raises(CheckpointError, match="they were made for different actions") as caught:
         CalibrationArtifact().checked(path, other)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,9 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.settings import BuildDatastoreSettings, CalibrateSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.cli.app import app
-from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability, save_calibration
+from kerv_cli.methods.calibration import NEVER, Calibration, CalibrationArtifact, Variability
+from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard
 from kerv_cli.methods.heisd.rules import BoundaryRanges
-from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard
 from kerv_cli.training.calibration import CalibrationRun
 from kerv_cli.training.datastore import DatastoreBuild
 from kerv_cli.training.skip_levels import LEAST, Matches, lowest_level, match, skip_section, task_levels
@@ -232,7 +232,7 @@ def test_what_cannot_be_computed_now_is_kept(copy: Path) -> None:
 
 def test_nothing_is_kept_of_another_target_or_a_damaged_file(copy: Path) -> None:
     run, made = calibrated(copy, levels={"reach-v3": Variability(0.25, 3, 0.1, 0.3, 0.4)})
-    save_calibration(run.path, replace(made, target=replace(made.target, sha256="f" * 64)))
+    write_json(run.path, asdict(replace(made, target=replace(made.target, sha256="f" * 64))))
     run, made = calibrated(copy)
     assert made.variability == {}
     assert run.notes == ["reference levels K_S: decodes=0; left empty"]

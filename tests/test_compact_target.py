@@ -19,13 +19,13 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.settings import PolicySettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterArtifact, DrafterProposer
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
+from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.captured import CapturedLayers, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
@@ -34,7 +34,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.training import runs
-from kerv_cli.training.imitation import Imitation, imitation_job, load_samples, new_target
+from kerv_cli.training.imitation import Imitation, load_samples, new_target
 from kerv_cli.training.loop import Loop
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -191,9 +191,11 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     samples = load_samples(dataset, settings, words, ("insert-peg",))  # type: ignore[arg-type]
     target = new_target(settings, dataset, samples, words, "front", 0)  # type: ignore[arg-type]
     folder = tmp_path / "artifacts/target/arm"
-    run = Imitation(target, samples, train, torch.device("cpu"))
-    job = imitation_job(run, lambda module, metrics: save_target(folder, module, "insertion", {}))  # type: ignore
-    metrics = Loop(job, train, folder, "seven").run()
+    metrics = Loop(
+        Imitation(target, samples, train),
+        lambda module, metrics: save_target(folder, module, "insertion", {}),  # type: ignore
+        *(train, folder, "seven"),
+    ).run()
     assert {f"l1_{name}" for name in SEVEN.names} <= metrics.keys()
     for drafter in (
         DrafterSettings(samples=12, unroll=2),

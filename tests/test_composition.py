@@ -22,13 +22,13 @@ from kerv_cli.methods.heisd import (
     HybridAcceptanceSettings,
     HybridProposerSettings,
     RandomBoundarySettings,
+    RetrievalProposerSettings,
     SequenceAcceptanceSettings,
     SimilaritySkipSettings,
 )
 from kerv_cli.methods.jacobi import JacobiProposerSettings
 from kerv_cli.methods.kinematics import CompensateSettings, KinematicThresholdSettings, ScheduleThresholdSettings
 from kerv_cli.methods.merged import MergedProposerSettings
-from kerv_cli.methods.retrieval import RetrievalProposerSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
 from kerv_cli.methods.streak import StreakSkipSettings

@@ -26,8 +26,9 @@ from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, Poli
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.draft import ROOT, TokenTree, merge
-from kerv_cli.methods.retrieval import QdrantSearchSettings
-from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, Shard, check_seeds, neighbour_tree, prompt_key
+from kerv_cli.methods.heisd import QdrantSearchSettings
+from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
+from kerv_cli.methods.heisd.rules import neighbour_tree
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import DatastoreBuild, directions, leave_one_out
@@ -249,7 +250,7 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
         for step in (0, 4):
             state, images = shown.states[step], dict.fromkeys(target.cameras, shown.frames[step // 2])
             prompt = target.encode(Observation(state[:4], state, instruction, images))
-            found = store.query(store.key(prompt, target), "reach-v3", 3)
+            found = store.query(store.key_of(store.pooled(prompt, target).numpy()), "reach-v3", 3)
             assert (found.seeds[0], found.steps[0], found.left[0]) == (1, step, LENGTHS[1] - step)
             assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
             assert (np.diff(found.similarity) <= 0).all()
@@ -336,7 +337,7 @@ def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(
     shown, instruction = smooth("reach-v3", 1, LENGTHS[1], TAIL, 96), SPEC.task("reach").instruction
     with torch.inference_mode():  # what is looked up while decoding is projected, too
         prompt = target.encode(Observation(shown.states[2][:4], shown.states[2], instruction))
-    found = short.query(short.key(prompt, target), "reach-v3", 1)
+    found = short.query(short.key_of(short.pooled(prompt, target).numpy()), "reach-v3", 1)
     assert (found.seeds[0], found.steps[0]) == (1, 2)
     assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
 

@@ -213,7 +213,7 @@ def test_plain_and_perturbed_episodes_count_alike() -> None:
     tokens = torch.full((4, 8), 50)
     perturbed = torch.tensor([True, True, True, False])
     samples = EarlySamples(
-        torch.zeros(4, 1), torch.zeros(4, 0, 4), torch.zeros(4, 0), tokens, torch.arange(4), perturbed
+        torch.zeros(4, 0, 4), torch.zeros(4, 0), tokens, torch.arange(4), perturbed, torch.zeros(4, 1)
     )
     drafts = tokens.clone()
     drafts[:3, 0] += 20
@@ -232,7 +232,7 @@ def test_the_network_learns_what_the_teacher_says() -> None:
     history = torch.randn(256, 2, 4, generator=generator).sign()
     tokens = torch.where(history[:, 1, 0] > 0, 200, 40)[:, None].repeat(1, 8)
     tokens[:, 1] = torch.where(features[:, 0] > 0, 90, 170)
-    samples = EarlySamples(features, history, torch.ones(256, 2), tokens, torch.arange(256), torch.arange(256) % 2 == 0)
+    samples = EarlySamples(history, torch.ones(256, 2), tokens, torch.arange(256), torch.arange(256) % 2 == 0, features)
     torch.manual_seed(0)
     early = EarlyDrafter(SMALL, ACTIONS, 2, FEATURES)
     run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
@@ -319,7 +319,7 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
 
 def test_a_single_episode_cannot_be_held_out() -> None:
     zeros = torch.zeros(4, dtype=torch.long)
-    one = EarlySamples(torch.zeros(4, 1), torch.zeros(4, 0, 4), torch.zeros(4, 0), zeros[:, None], zeros, zeros.bool())
+    one = EarlySamples(torch.zeros(4, 0, 4), torch.zeros(4, 0), zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
     with pytest.raises(CheckpointError, match="at least two"):
         split(one, 0.1)
 

@@ -21,10 +21,10 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.early.drafter import EarlyDraft, EarlyProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
-from kerv_cli.methods.heisd.rules import HybridProposer, Random, SkipLevels, VerifySkip
+from kerv_cli.methods.heisd.datastore import Datastore, Manifest, prompt_key
+from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer, VerifySkip
 from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
-from kerv_cli.methods.retrieval.datastore import Datastore, Manifest, RetrievalProposer, prompt_key
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -181,7 +181,7 @@ def skipping(
     tokens = list(range(16))
     store = stored(target, prompt, np.array([tokens] * entries), left)
     retrieval = RetrievalProposer(store, target, 1, 16)
-    skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, SkipLevels(0.4, s_min, 0.9))
+    skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, (0.4, s_min, 0.9))
     decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
     decoder.situation = situation(np.random.default_rng(0), 3)
     return decoder, prompt, tokens

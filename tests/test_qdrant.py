@@ -14,9 +14,9 @@ import pytest
 
 from kerv_cli.base.errors import StorageError, UnknownName, UsageError
 from kerv_cli.base.registry import find as find_part
-from kerv_cli.methods.retrieval import QdrantSearchSettings
-from kerv_cli.methods.retrieval import qdrant as module
-from kerv_cli.methods.retrieval.datastore import Datastore, Manifest
+from kerv_cli.methods.heisd import QdrantSearchSettings
+from kerv_cli.methods.heisd import qdrant as module
+from kerv_cli.methods.heisd.datastore import Datastore, Manifest
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 pytestmark = pytest.mark.filterwarnings("ignore:Local mode performs exact:UserWarning")
@@ -43,7 +43,7 @@ def searched(request: pytest.FixtureRequest) -> Open:
         request.getfixturevalue("local_server")
     else:
         pytest.importorskip("qdrant_edge")
-    from kerv_cli.methods.retrieval.qdrant import QdrantIndex
+    from kerv_cli.methods.heisd.qdrant import QdrantIndex
 
     def open_(vectors: np.ndarray, seeds: np.ndarray, digest: str = "d" * 64) -> Datastore:
         url = "http://nowhere" if request.param == "server" else None
@@ -90,7 +90,7 @@ def test_the_neighbours_are_those_of_exact_search(searched: Open, kind: str, wid
 
 
 def test_a_server_keeps_a_datastore_and_completes_one_that_was_cut(local_server: Any) -> None:
-    from kerv_cli.methods.retrieval.qdrant import QdrantIndex
+    from kerv_cli.methods.heisd.qdrant import QdrantIndex
 
     vectors, seeds = vectors_of("random", 8), np.arange(300)
     filled: list[int] = []
@@ -109,7 +109,7 @@ def test_a_server_keeps_a_datastore_and_completes_one_that_was_cut(local_server:
 
 
 def test_a_server_is_asked_for_exact_search(local_server: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from kerv_cli.methods.retrieval.qdrant import QdrantIndex
+    from kerv_cli.methods.heisd.qdrant import QdrantIndex
 
     vectors, asked, real = vectors_of("random", 8), [], local_server.query_points
     monkeypatch.setattr(local_server, "query_points", lambda *a, **more: (asked.append(more), real(*a, **more))[1])
@@ -120,7 +120,7 @@ def test_a_server_is_asked_for_exact_search(local_server: Any, monkeypatch: pyte
 
 def test_the_engines_files_go_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("qdrant_edge")
-    from kerv_cli.methods.retrieval.qdrant import EmbeddedEngine
+    from kerv_cli.methods.heisd.qdrant import EmbeddedEngine
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     engine = EmbeddedEngine(3)
@@ -134,7 +134,7 @@ def test_the_engines_files_go_with_it(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_server_that_does_not_answer_gets_one_line() -> None:
     pytest.importorskip("qdrant_client")
-    from kerv_cli.methods.retrieval.qdrant import QdrantIndex
+    from kerv_cli.methods.heisd.qdrant import QdrantIndex
 
     with socket.socket() as taken:  # a port where nobody listens
         taken.bind(("127.0.0.1", 0))

@@ -29,7 +29,7 @@ from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
-from kerv_cli.training.loop import Job, Loop, Metrics, digest, read_state, schedule, write_state
+from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -49,17 +49,27 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+class Sums:
+    """A linear layer learns the sum of three numbers."""
+
+    def __init__(self) -> None:
+        self.module = nn.Linear(3, 1)
+        self.data = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def loss(self, indices: torch.Tensor, step: int) -> tuple[torch.Tensor, Metrics]:
+        x = self.data[indices]
+        return ((self.module(x) - x.sum(-1, keepdim=True)) ** 2).mean(), {}
+
+    def validate(self, module: nn.Module) -> Metrics:
+        return {"score": -float(next(module.parameters()).detach().sum())}
+
+
 def quadratic(folder: Path, identity: str = "a") -> Loop:
     torch.manual_seed(0)
-    module = nn.Linear(3, 1)
-    data = torch.randn(50, 3, generator=torch.Generator().manual_seed(1))
-
-    def loss(indices: torch.Tensor, step: int) -> tuple[torch.Tensor, Metrics]:
-        x = data[indices]
-        return ((module(x) - x.sum(-1, keepdim=True)) ** 2).mean(), {}
-
-    job = Job(module, 50, loss, lambda m: {"score": -float(m.weight.detach().sum())}, lambda m, metrics: None)
-    return Loop(job, TINY, folder, identity)
+    return Loop(Sums(), lambda module, metrics: None, TINY, folder, identity)
 
 
 @pytest.mark.bits
@@ -71,8 +81,8 @@ def test_an_interrupted_run_resumes_bit_for_bit(tmp_path: Path) -> None:
         cut.run(lambda step, metrics: interrupt() if step == 10 else None)
     resumed = quadratic(tmp_path / "cut")
     resumed.run()
-    for name, tensor in whole.job.module.state_dict().items():
-        assert torch.equal(tensor, resumed.job.module.state_dict()[name])
+    for name, tensor in whole.module.state_dict().items():
+        assert torch.equal(tensor, resumed.module.state_dict()[name])
         assert torch.equal(whole.ema[name], resumed.ema[name])
     assert (tmp_path / "whole/log.csv").read_text() == (tmp_path / "cut/log.csv").read_text()
 
@@ -100,8 +110,8 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
     resumed = quadratic(tmp_path / "cut")
     resumed.run(lambda step, metrics: steps.append(step))
     assert steps[0] == last + 1
-    for name, tensor in whole.job.module.state_dict().items():
-        assert torch.equal(tensor, resumed.job.module.state_dict()[name])
+    for name, tensor in whole.module.state_dict().items():
+        assert torch.equal(tensor, resumed.module.state_dict()[name])
 
 
 def test_one_request_that_arrives_twice_is_one_and_a_run_without_validation_says_so(tmp_path: Path) -> None:
@@ -160,8 +170,7 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(
 
     def saving(folder: Path) -> Loop:
         loop = quadratic(folder)
-        save = replace(loop.job, save=lambda module, metrics: save_tensors(folder / "best", module.state_dict()))
-        loop.job = save
+        loop.save = lambda module, metrics: save_tensors(folder / "best", module.state_dict())
         return loop
 
     saving(tmp_path / "whole").run()

@@ -95,12 +95,13 @@ def test_training_changes_the_new_target_and_not_the_old_one(results: Path) -> N
     before = load_file(results / "artifacts/target/old/model.safetensors")
     run = TargetRun(settings(results))
     run.load(lambda done, total: None)
-    assert run.samples is not None
-    assert run.samples.chunks.shape[1:] == (8, 4)
-    assert run.samples.words[0].tolist() == WORDS.encode("pull the drawer open", 10)
+    samples = run.learnt.training  # type: ignore[attr-defined]
+    assert samples.chunks.shape[1:] == (8, 4)
+    assert samples.words[0].tolist() == WORDS.encode("pull the drawer open", 10)
     run.train(lambda step, metrics: None)
-    assert run.init_target is not None
-    assert all(torch.equal(run.init_target.state_dict()[k], v) for k, v in before.items())
+    assert all(
+        torch.equal(load_file(results / "artifacts/target/old/model.safetensors")[k], v) for k, v in before.items()
+    )
     after = load_file(run.folder / "model.safetensors")
     assert not torch.equal(before["head.weight"], after["head.weight"])
 

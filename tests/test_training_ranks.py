@@ -20,8 +20,8 @@ from kerv_cli.cli.app import app
 from kerv_cli.lab.policy import decoder_for
 from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
-from kerv_cli.training.imitation import sample_weights
-from kerv_cli.training.loop import Job
+from kerv_cli.training.imitation import task_borders
+from kerv_cli.training.loop import draw_samples
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds import spec_of
@@ -81,9 +81,7 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     generator = torch.Generator().manual_seed(0)
 
     def share(balance: float) -> float:
-        nothing = (lambda i, s: (torch.zeros(()), {}), lambda m: {}, lambda m, x: None)
-        job = Job(torch.nn.Linear(1, 1), 1000, *nothing, sample_weights(tasks, balance))
-        return float(tasks[job.batch(20_000, generator)].double().mean())
+        return float(tasks[draw_samples(1000, 20_000, generator, task_borders(tasks, balance))].double().mean())
 
     assert share(0.0) == pytest.approx(0.1, abs=0.01)
     assert share(1.0) == pytest.approx(0.5, abs=0.02)

@@ -18,9 +18,8 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
-from kerv_cli.methods.heisd.rules import SkipLevels, VerifySkip
+from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
-from kerv_cli.methods.retrieval.datastore import RetrievalProposer
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -172,12 +171,15 @@ def swept(blocks: list[list[int]], **feedback: float) -> dict[int, list[tuple[in
     prompt = random_prompt(target, 2)
     store = stored(target, prompt, np.arange(64).reshape(4, 16))
     prompts = {seed: prompt + 0.4 * random_prompt(target, 100 + seed) for block in blocks for seed in block}
-    every = [float(store.query(store.key(x, target), "t", 1).similarity[0]) for x in prompts.values()]
+    every = [
+        float(store.query(store.key_of(store.pooled(x, target).numpy()), "t", 1).similarity[0])
+        for x in prompts.values()
+    ]
     level = float(np.median(every))
     records = {}
     for block in blocks:
         retrieval = RetrievalProposer(store, target, 1, 16)
-        levels = SkipLevels(level - 0.2, level, level + 0.2)
+        levels = (level - 0.2, level, level + 0.2)
         skip = VerifySkip(SimilaritySkipSettings(max_skips=2, **feedback), retrieval, levels)
         decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
         for seed in block:

@@ -40,7 +40,6 @@ OWN = (
     "kerv_cli.methods.sp_vla",
     "kerv_cli.methods.agreement",
     "kerv_cli.methods.watch",
-    "kerv_cli.methods.retrieval",
     "kerv_cli.methods.heisd",
     "kerv_cli.methods.jacobi",
     "kerv_cli.methods.merged",
@@ -64,7 +63,8 @@ PREFILL, STATES = "prefill", "states"
 
 
 TRAITS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "artifact", "drafter", "column"), ()),
+    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "drafter", "column"), ()),
+    "artifact": ("sees",),
     "proposer": ("when", "chains", "sides", "remembers"),
     "boundary": ("chooses",),
     "skip": ("takes_draft", "merges", "parallel", "watches"),
@@ -100,8 +100,8 @@ class Part:
     target, environment, stress, executor, column or command. build: `module:function` or `module:Class.method`; its
     arguments are documented where the kind is used, of a method's parts in `methods/context.py`.
     settings: dataclass of its settings, with defaults; limits by `limits.number`. needs: artifact kinds that these
-    settings need. check: raises UsageError for settings that do not fit together. colour: 0xRRGGBB of its rows, lines
-    and timeline.
+    settings need, of an artifact those that it is made from. check: raises UsageError for settings that do not fit
+    together. colour: 0xRRGGBB of its rows, lines and timeline.
     traits: further properties that the kind asks for, e.g. when a proposer can draft.
     """
 

@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import write_json
 from kerv_cli.methods.artifacts import Artifact, MadeFor, check_sources
 from kerv_cli.methods.heisd.rules import LEAST, BoundaryRanges
 from kerv_cli.methods.kinematics.prediction import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
@@ -191,8 +190,3 @@ class CalibrationArtifact(Artifact[Calibration]):
     def made_for(self, description: Calibration) -> MadeFor:
         """The target that it was made for."""
         return description.target
-
-
-def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes `calibration` atomically."""
-    write_json(path, asdict(calibration))

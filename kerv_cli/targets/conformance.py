@@ -42,8 +42,8 @@ def check_target(target: Target, observation: Observation, seed: int = 0) -> lis
         return findings
     checks: list[tuple[str, Callable[[], str]]] = [
         ("causality", trial.causality),
-        ("cache, token by token", trial.token_by_token),
-        ("cache, several tokens", trial.several_tokens),
+        ("cache, token by token", lambda: trial.pieces([1] * 6, "token by token")),
+        ("cache, several tokens", lambda: trial.pieces([1, 5, 3], "several tokens")),
         ("tree attention", trial.tree),
         ("commit of a path", trial.commit),
         ("draft in the prefill", trial.prefill_draft),
@@ -160,16 +160,11 @@ class Trial:
             first += tokens
         return cache, hidden
 
-    def token_by_token(self) -> str:
-        """Autoregressive decoding equals one forward."""
-        _, hidden = self.cached([1] * 6)
-        self.same(torch.cat(hidden, 1), self.plain(self.tokens[:, :6])[:, -6:], "token by token behind a cache")
-        return self.says()
-
-    def several_tokens(self) -> str:
-        """A chain behind a cache, as one forward verifies it."""
-        _, hidden = self.cached([1, 5, 3])
-        self.same(torch.cat(hidden, 1), self.plain(self.tokens)[:, -9:], "several tokens behind a cache")
+    def pieces(self, lengths: Sequence[int], what: str) -> str:
+        """Tokens behind a cache, in pieces as decoding and verifying forward them, equal one forward."""
+        _, hidden = self.cached(lengths)
+        size = sum(lengths)
+        self.same(torch.cat(hidden, 1), self.plain(self.tokens[:, :size])[:, -size:], f"{what} behind a cache")
         return self.says()
 
     def drafted(self) -> Tensor:

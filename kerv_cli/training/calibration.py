@@ -6,16 +6,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
-from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
@@ -25,12 +26,11 @@ from kerv_cli.methods.calibration import (
     Demonstrations,
     SkipSection,
     Variability,
-    save_calibration,
 )
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.observations import check_frames, check_shown, instruction_of
+from kerv_cli.training.observations import check_shown
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
@@ -38,58 +38,38 @@ from kerv_cli.training.predictor_fit import (
     prediction_errors,
     read_windows,
 )
+from kerv_cli.training.recorded import observations_of
 from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
-from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
 
 
-def reference_level(levels: Sequence[float], least: float) -> float:
-    """K_S: the median K of pre-sampled decodes, at least `least` so that it can divide.
-
-    Raises:
-        ValueError: `levels` is empty.
-    """
-    if not levels:
-        raise ValueError("no decode compared a draft with a target token")
-    return max(float(np.median(levels)), least)
-
-
 def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
-    """K of up to `decodes` decodes, spread evenly over the observations of a demonstration.
+    """K of up to `decodes` decodes, spread evenly over the observations of a demonstration; errors as
+    `observations_of`.
 
     The decoder sees every executed action in between, so that methods with a history have one.
     """
-    instruction, width = instruction_of(episode.task), len(space.proprioception)
-    chosen = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
-    levels, first = [], 0
+    rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
+    steps, levels, first = episode.frame_steps[rows], [], 0
     decoder.reset(episode.task, episode.seed, episode.end_effector[0])
-    for index in chosen:
-        step = int(episode.frame_steps[index])
+    for step, observation in zip(steps, observations_of(decoder.target, episode, steps, space), strict=True):
         for t in range(first, step):
             decoder.observe(episode.executed[t], episode.end_effector[t + 1])
-        first, state = step, episode.states[step]
-        images = dict.fromkeys(decoder.cameras, episode.frames[index])
-        record = decoder.decode(Observation(state[:width], state, instruction, images))
+        first = step
+        record = decoder.decode(observation)
         if record.variability is not None:
             levels.append(record.variability)
     return levels
 
 
-@dataclass(frozen=True)
-class PathReader(DemoDataset):
-    """A dataset that keeps the end-effector path of every episode it loads, so that each file is read only once."""
-
-    paths: dict[int, np.ndarray] = field(default_factory=dict)  # index -> (T, 3) float32, metres
-
-    def load(self, index: int) -> DemoEpisode:
-        """Reads an episode and stores its path; errors as `DemoDataset.load`."""
-        episode = super().load(index)
-        self.paths[index] = episode.end_effector.copy()
-        return episode
+def distribution(levels: Sequence[float], least: float) -> Variability:
+    """K_S, the median of pre-sampled levels of K but at least `least`, so that it can divide, and their percentiles."""
+    low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
+    return Variability(max(float(np.median(levels)), least), len(levels), low, high, top)
 
 
 class CalibrationRun:
@@ -104,8 +84,8 @@ class CalibrationRun:
     """
 
     def __init__(self, settings: CalibrateSettings) -> None:
+        settings, self.dataset = demos_for(settings)
         self.settings = settings
-        self.dataset = demos_for(settings)
         self.tasks = resolve_tasks(settings.task or list(self.dataset.manifest.tasks))
         self.artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
         self.description = self.artifacts.description
@@ -125,7 +105,6 @@ class CalibrationRun:
         if self.stored:
             self.artifacts.check(["datastore"])
         self.windows: Windows | None = None
-        self.paths: list[np.ndarray] = []  # of the training episodes
         self.notes: list[str] = []
 
     def plan(self) -> str:
@@ -141,11 +120,9 @@ class CalibrationRun:
     def load(self, progress: Progress) -> None:
         """Reads the actions and paths of the chosen episodes."""
         s = self.settings
-        reader = PathReader(self.dataset.path, self.dataset.manifest, self.dataset.episodes)
         self.windows = read_windows(
-            reader, self.chosen, self.description.actions, s.history, s.window, self.description.chunk, progress
+            self.dataset, self.chosen, self.description.actions, s.history, s.window, self.description.chunk, progress
         )
-        self.paths = [reader.paths[index] for index, held_out in self.chosen.items() if not held_out]
 
     def boundary(self, progress: Progress) -> BoundarySection:
         """Ranges of R and D over every window of every training episode, in metres; none is left out.
@@ -153,16 +130,17 @@ class CalibrationRun:
         Raises:
             CheckpointError: no path bends, or none moves.
         """
-        windows, ranges = self.settings.boundary_windows, {}
+        assert self.windows is not None
+        windows, paths, ranges = self.settings.boundary_windows, self.windows.paths, {}
 
-        def paths(before: int) -> Iterator[np.ndarray]:
-            for done, path in enumerate(self.paths, before + 1):
+        def counted(before: int) -> Iterator[np.ndarray]:
+            for done, path in enumerate(paths, before + 1):
                 yield path
-                progress(done, len(self.paths) * len(windows))
+                progress(done, len(paths) * len(windows))
 
         for number, window in enumerate(windows):
-            ranges[str(window)] = BoundaryRanges.fit(paths(number * len(self.paths)), window)
-        return BoundarySection(len(self.paths), ranges)
+            ranges[str(window)] = BoundaryRanges.fit(counted(number * len(paths)), window)
+        return BoundarySection(len(paths), ranges)
 
     def skip(self, progress: Progress) -> SkipSection | None:
         """Skip levels of the tasks, from the target's datastore; None without a datastore."""
@@ -181,7 +159,6 @@ class CalibrationRun:
         if not self.settings.decodes:
             return {}
         decoder, space = self.decoder(), self.dataset.manifest.observation
-        pixels = self.description.settings.get("image_size", 0)
         share = math.ceil(self.settings.decodes / PRESAMPLED)
         # the smallest K above 0: one token of a chunk is off by one bin
         actions = self.description.actions
@@ -189,22 +166,16 @@ class CalibrationRun:
         variability: dict[str, Variability] = {}
         for number, name in enumerate(self.tasks):
             levels: list[float] = []
-            for index in self._training_episodes(name):
-                episode = self.dataset.load(index)
-                if decoder.cameras and self.description.family == "compact":  # others resize their images
-                    check_frames(episode, pixels)
+            for index in (i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name):
                 budget = min(share, self.settings.decodes - len(levels))
-                levels += presample(decoder, episode, space, budget)
+                levels += presample(decoder, self.dataset.load(index), space, budget)
                 if len(levels) >= self.settings.decodes:
                     break
             if not levels:
                 raise KervError(f"{name}: no decode compared a draft with a target token, so there is no K for K_S")
-            variability[name] = spread(levels, least)
+            variability[name] = distribution(levels, least)
             progress(number + 1, len(self.tasks))
         return variability
-
-    def _training_episodes(self, name: str) -> list[int]:
-        return [i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name]
 
     def decoder(self) -> Decoder:
         """The decoder of pre-sampling: the settings' proposer, acceptance and threshold."""
@@ -239,7 +210,7 @@ class CalibrationRun:
             **sections,
             provenance={**origin, "kept": earlier} if earlier else origin,
         )
-        save_calibration(self.path, calibration)
+        write_json(self.path, asdict(calibration))
         return calibration
 
     def _fill_empty(self, sections: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -263,9 +234,3 @@ class CalibrationRun:
                 origins[name] = before.get(name, origin) if isinstance(before, dict) else origin
             self.notes.append(f"{reasons.get(name, name)}; {'kept from the earlier run' if section else 'left empty'}")
         return sections, origins
-
-
-def spread(levels: Sequence[float], least: float) -> Variability:
-    """K_S and the quartiles of pre-sampled levels of K."""
-    low, high, top = np.percentile(levels, [25, 75, 90]).tolist()
-    return Variability(reference_level(levels, least), len(levels), low, high, top)

@@ -20,7 +20,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDatastoreSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.retrieval.datastore import (
+from kerv_cli.methods.heisd.datastore import (
     PAYLOAD,
     PROJECTION,
     VECTORS,
@@ -31,8 +31,7 @@ from kerv_cli.methods.retrieval.datastore import (
     projected,
     prompt_key,
 )
-from kerv_cli.training.coverage import subset
-from kerv_cli.training.demonstrations import demos_for
+from kerv_cli.training.demonstrations import demos_for, subset
 from kerv_cli.training.imitation import WITHIN
 from kerv_cli.training.observations import check_shown, read_chunks
 from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
@@ -90,8 +89,8 @@ class DatastoreBuild:
     """
 
     def __init__(self, settings: BuildDatastoreSettings) -> None:
-        self.settings = settings
-        self.dataset = subset(demos_for(settings), (), settings.starts)
+        settings, dataset = demos_for(settings)
+        self.settings, self.dataset = settings, subset(dataset, (), settings.starts)
         tasks = sorted(resolve_tasks(settings.task or list(self.dataset.manifest.tasks)))
         self.device, _ = set_up(settings.runtime)
         self.artifacts = Artifacts(settings.results, settings.policy, device=self.device, dtype=settings.runtime.dtype)
@@ -106,15 +105,16 @@ class DatastoreBuild:
             self.folder = artifact(settings.results, "datastore", settings.name)
         description = self.artifacts.description
         check_shown(self.dataset, description)
-        self.chosen = {name: self._episodes_of(name) for name in tasks}
+        entries = self.dataset.episodes  # of every task the first ones by seed
+        by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)
+        most = settings.episodes or None
+        self.chosen = {name: [i for i in by_seed if entries[i].task == name][:most] for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
-        _refuse_foreign(self.folder)
-
-    def _episodes_of(self, name: str) -> list[int]:
-        """Indices of the task's episodes in the dataset, by seed."""
-        entries = self.dataset.episodes
-        indices = sorted((i for i, e in enumerate(entries) if e.task == name), key=lambda i: entries[i].seed)
-        return indices[: self.settings.episodes or None]
+        if self.folder.is_file() or (self.folder.is_dir() and any(self.folder.iterdir())):
+            manifest = self.folder / "manifest.json"
+            content = read_json(manifest) if manifest.is_file() else None
+            if not isinstance(content, dict) or content.get("kind") != "datastore":
+                raise UsageError(f"{self.folder} exists and is no datastore: give the new one another name")
 
     @property
     def seeds(self) -> dict[str, list[int]]:
@@ -227,17 +227,3 @@ def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
         "similarity": float(np.median(np.concatenate(similarities))),
         "query_ms": 1000 * float(np.median(seconds)),
     }
-
-
-def _refuse_foreign(folder: Path) -> None:
-    """Refuses to replace a folder that is not a datastore.
-
-    Raises:
-        UsageError: `folder` holds something else.
-    """
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    manifest = folder / "manifest.json"
-    content = read_json(manifest) if manifest.is_file() else None
-    if not isinstance(content, dict) or content.get("kind") != "datastore":
-        raise UsageError(f"{folder} exists and is no datastore: give the new one another name")

@@ -1,26 +1,31 @@
-"""Which demonstrations a command learns from: one dataset, or several that add up."""
+"""The demonstrations that a command learns from: one dataset, or several that add up, of some of the tasks or of one
+side of the initial range."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import TypeVar
 
-from kerv_cli.base.errors import CheckpointError
+import numpy as np
+
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import artifact, find_target, results_dir
-from kerv_cli.base.settings import DEFAULT_TASKS, PolicySettings
+from kerv_cli.base.settings import (
+    DEFAULT_TASKS,
+    BuildDatastoreSettings,
+    CalibrateSettings,
+    PrepareSettings,
+    TrainDrafterSettings,
+)
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
-
-class OfTarget(Protocol):
-    """Settings of what is made for a target from demonstrations."""
-
-    results: str
-    policy: PolicySettings
-    demos: str
-    task: list[str]
+S = TypeVar("S", CalibrateSettings, BuildDatastoreSettings, TrainDrafterSettings, PrepareSettings)
+"""Settings of what is made for a target from demonstrations."""
+ALL, HALF = "all", "half"
 
 
 def name_of(tasks: Sequence[str]) -> str:
@@ -58,31 +63,62 @@ def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> 
     return f"record them with '{' '.join(['kerv demos', *words])}'{others}"
 
 
-def demos_for(settings: OfTarget) -> DemoDataset:
+def demos_for(settings: S) -> tuple[S, DemoDataset]:
     """The demonstrations that something is made from for a target: those that it was trained on, where none are named.
-    Fills what the settings leave open: their name, and, where they have tasks that the target does not know, the tasks
-    that it does; no task stands for all.
+    Also the settings with what they leave open: the demonstrations' name, and, where those have tasks that the target
+    does not know, the tasks that it does; no task stands for all.
 
     Raises:
         UsageError: no such target. CheckpointError: as `open_demos`.
     """
-    folder = find_target(settings.results, settings.policy.target)
-    target = described(folder, "target", TargetDescription)
-    tasks = settings.task or target.tasks
+    target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
     recorded = target.provenance.get("demos") if not settings.demos else None
     config = recorded.get("config") if isinstance(recorded, dict) else None
     episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
-    settings.demos = settings.demos or target.demos or name_of(())
-    dataset = open_demos(settings.results, settings.demos, tasks, episodes)
+    name, tasks = settings.demos or target.demos or name_of(()), settings.task
+    dataset = open_demos(settings.results, name, tasks or target.tasks, episodes)
     there = list(dataset.manifest.tasks)
     same = dataset.manifest.environment == target.environment  # else the spaces differ, which is said instead
-    for task in resolve_tasks(settings.task) if settings.task and same else ():
+    for task in resolve_tasks(tasks) if tasks and same else ():
         if task not in there:
             raise CheckpointError(
                 f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "
                 f"{', '.join(there)}, or record others with 'kerv demos task={task}' and name them by demos="
             )
-    known = resolve_tasks(target.tasks) if target.tasks and not settings.task else ()
-    if set(there) - set(known):
-        settings.task = settings.task or [task for task in there if task in known]
-    return dataset
+    trained = resolve_tasks(target.tasks) if target.tasks and not tasks else ()
+    if set(there) - set(trained):
+        tasks = tasks or [task for task in there if task in trained]
+    return replace(settings, demos=name, task=tasks), dataset
+
+
+def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> DemoDataset:
+    """The dataset with only the episodes of `tasks` (tasks and suites; none: all), and with starts=half only those that
+    begin on one side.
+
+    Raises:
+        UnknownName: no such task. CheckpointError: the dataset has none of a task.
+    """
+    if not tasks and starts == ALL:
+        return dataset
+    names = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
+    missing = [task for task in names if task not in dataset.manifest.tasks]
+    if missing:
+        raise CheckpointError(f"the demonstrations in {dataset.path} hold no episode of {missing[0]}")
+    chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in names]
+    if starts == HALF:
+        chosen = _one_side(dataset, chosen)
+    return replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
+
+
+def _one_side(dataset: DemoDataset, chosen: Sequence[int]) -> list[int]:
+    """The episodes in which the observation's first place, as a rule the object, begins at or below its median x over
+    the chosen episodes of the task."""
+    places = dataset.manifest.observation.places
+    if not places:
+        raise UsageError("starts=half: these demonstrations name no place that begins on one side")
+    begins = {index: float(dataset.load(index).states[0][places[0].first]) for index in chosen}
+    by_task: dict[str, list[float]] = {}
+    for index, x in begins.items():
+        by_task.setdefault(dataset.episodes[index].task, []).append(x)
+    medians = {task: float(np.median(values)) for task, values in by_task.items()}
+    return [index for index, x in begins.items() if x <= medians[dataset.episodes[index].task]]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -31,26 +31,22 @@ from kerv_cli.worlds.demos.episode_file import DemoEpisode
 RADII = {"strict": 0, "r3": 3, "r9": 9}
 
 
-class Decoded(Protocol):
-    """Samples with the target's tokens (n, N) and whether their episodes were perturbed (n,)."""
-
-    @property
-    def tokens(self) -> Tensor: ...
-
-    @property
-    def perturbed(self) -> Tensor: ...
-
-
 @dataclass(frozen=True)
-class EarlySamples(Rows):
-    """The target's greedy decodes of n observations, in episode order."""
+class Decodes(Rows):
+    """The target's greedy decodes of n observations, in episode order, with the actions before each."""
 
-    features: Tensor  # (n, F) float16, pooled prompts
     history: Tensor  # (n, h, D) float32, the last executed actions, normalised, oldest first
     valid: Tensor  # (n, h) float32, 0 where the episode had not begun yet
     tokens: Tensor  # (n, N) int64
     episodes: Tensor  # (n,) int64
     perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
+
+
+@dataclass(frozen=True)
+class EarlySamples(Decodes):
+    """What an early drafter learns from."""
+
+    features: Tensor  # (n, F) float16, pooled prompts
 
 
 @torch.inference_mode()
@@ -96,7 +92,7 @@ def evenly(steps: np.ndarray, share: float) -> np.ndarray:
 
 
 def columns_of(target: Target, episode: DemoEpisode, index: int, steps: np.ndarray, history: int) -> dict[str, Tensor]:
-    """The fields of `EarlySamples` that do not need the target, for some control steps (n,) of one episode."""
+    """The fields of `Decodes` that do not need the target, for some control steps (n,) of one episode."""
     executed = target.actions.normalise(episode.executed)
     histories = [padded(executed[:t], history, target.actions.dofs) for t in steps.tolist()]
     actions, valid = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
@@ -107,35 +103,46 @@ def columns_of(target: Target, episode: DemoEpisode, index: int, steps: np.ndarr
 class EarlyDistillation:
     """Loss and validation of one run. The target's tokens are the labels; neighbouring bins share probability."""
 
-    def __init__(
-        self, early: EarlyDrafter, training: EarlySamples, held_out: EarlySamples, train: TrainSettings
-    ) -> None:
-        self.module, self.training, self.held_out = early, training, held_out
-        self.device = early.mean.device
-        self.labels = soft_labels(early.actions.tokens, train.label_sigma).to(self.device)
+    def __init__(self, module: Any, training: Any, held_out: Any, train: TrainSettings) -> None:
+        """training, held_out: `EarlySamples`; of a scout `ScoutSamples`."""
+        self.module, self.training, self.held_out, self.train = module, training, held_out, train
+        drafter = self.drafter(module)
+        self.device, self.strict = drafter.mean.device, drafter.strict.cpu()
+        self.labels = soft_labels(drafter.actions.tokens, train.label_sigma).to(self.device)
 
     def __len__(self) -> int:
         return len(self.training)
 
-    def logits(self, early: EarlyDrafter, samples: EarlySamples, indices: Tensor) -> Tensor:
-        """The drafter's logits (B, N, V) for the samples at `indices` (B,)."""
+    def drafter(self, module: Any) -> EarlyDrafter:
+        """The network that drafts."""
+        return module
+
+    def outputs(self, module: Any, samples: Any, indices: Tensor) -> tuple[Tensor, ...]:
+        """What the module says of the samples at `indices` (B,): first of all its logits (B, N, V)."""
         inputs = (samples.features, samples.history, samples.valid)
-        return early(*(x[indices].to(self.device).float() for x in inputs))
+        return (module(*(x[indices].to(self.device).float() for x in inputs)),)
+
+    def token_loss(self, logits: Tensor, indices: Tensor) -> Tensor:
+        """Cross-entropy of logits (B, N, V) with the softened tokens of the target at `indices` (B,)."""
+        return token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Cross-entropy with the softened tokens of the target at `indices` (B,), and logged numbers."""
-        logits = self.logits(self.module, self.training, indices)
-        loss = token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
+        """The token loss at `indices` (B,), and logged numbers."""
+        loss = self.token_loss(self.outputs(self.module, self.training, indices)[0], indices)
         return loss, {"token_loss": float(loss.detach())}
 
     @torch.no_grad()
     def validate(self, module: nn.Module) -> Metrics:
         """Drafts of the held-out observations; plain and perturbed episodes count alike."""
-        assert isinstance(module, EarlyDrafter)
-        indices = torch.arange(len(self.held_out))
-        logits = torch.cat([self.logits(module, self.held_out, i).cpu() for i in indices.split(512)])
-        metrics = measure(logits, self.held_out, module.strict.cpu())
-        return {"score": metrics["accepted_r9"] + metrics["accepted_strict"], **metrics}
+        batches = (self.outputs(module, self.held_out, i) for i in torch.arange(len(self.held_out)).split(256))
+        logits, *rest = (torch.cat(parts).cpu() for parts in zip(*batches, strict=True))
+        metrics = measure(logits, self.held_out, self.strict)
+        score = metrics["accepted_r9"] + metrics["accepted_strict"]
+        return {"score": score, **metrics, **self.further_metrics(*rest)}
+
+    def further_metrics(self, *outputs: Tensor) -> Metrics:
+        """Metrics of the outputs behind the logits."""
+        return {}
 
 
 def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> Tensor:
@@ -146,7 +153,7 @@ def accepted_tokens(drafts: Tensor, teacher: Tensor, r: int, strict: Tensor) -> 
     return ((drafts - teacher).abs() <= limit).long().cumprod(1).sum(1)
 
 
-def measure(logits: Tensor, samples: Decoded, strict: Tensor) -> Metrics:
+def measure(logits: Tensor, samples: Decodes, strict: Tensor) -> Metrics:
     """logits (n, N, V), strict (N,) bool -> accepted tokens of N and the share of chunks accepted whole, at every
     radius; token accuracy."""
     kinds = [mask for mask in (samples.perturbed, ~samples.perturbed) if mask.any()]

@@ -24,13 +24,15 @@ from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.training.loop import Job, Metrics
+from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 WITHIN = 9
 """Bins; validation reports the share of tokens that are off by at most this many (the relaxed radius of Spec-VLA)."""
+VALIDATED = 2048
+"""Most samples of a validation."""
 
 
 @dataclass(frozen=True)
@@ -70,13 +72,13 @@ def load_samples(
     return Samples.joined(parts)
 
 
-def sample_weights(tasks: Tensor, balance: float) -> Tensor | None:
-    """(n,) float64: weight of each sample, by the index of its task (n,). A task of share p among the samples is drawn
-    in proportion to p^(1 − balance); None for balance 0, where all weights are equal."""
+def task_borders(tasks: Tensor, balance: float) -> Tensor | None:
+    """(n,) float64: `borders` of `draw_samples` by which a task of share p among the samples is drawn in proportion to
+    p^(1 − balance); None for balance 0, where all samples weigh alike. tasks (n,): index of each sample's task."""
     if balance == 0:
         return None
     shares = torch.bincount(tasks).double() / len(tasks)
-    return shares[tasks] ** -balance
+    return (shares[tasks] ** -balance).cumsum(0)
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
@@ -93,16 +95,26 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
 
 
 class Imitation:
-    """Losses and metrics of one training run."""
+    """Losses and metrics of one training run. closed_loop: a target's success in [0, 1], which then dominates the
+    score; None: not measured."""
 
-    def __init__(self, target: CompactTarget, samples: Samples, settings: TrainSettings, device: torch.device) -> None:
-        self.target, self.settings, self.device = target, settings, device
+    def __init__(
+        self,
+        target: CompactTarget,
+        samples: Samples,
+        settings: TrainSettings,
+        closed_loop: Callable[[CompactTarget], float] | None = None,
+    ) -> None:
+        self.module, self.settings, self.device, self.closed_loop = target, settings, target.device, closed_loop
         self.training, self.held_out = split(samples, settings.held_out)
-        self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(device)
+        self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(self.device)
+
+    def __len__(self) -> int:
+        return len(self.training)
 
     def tokens(self, samples: Samples, indices: Tensor) -> Tensor:
         """The chunks of `samples` at `indices` (B,) as tokens (B, N) int64."""
-        encoded = self.target.actions.encode(samples.chunks[indices].numpy())
+        encoded = self.module.actions.encode(samples.chunks[indices].numpy())
         return torch.from_numpy(encoded).flatten(1).to(self.device)
 
     @contextlib.contextmanager
@@ -118,14 +130,14 @@ class Imitation:
         """Token loss and weighted position loss at `indices` (B,); in the first `scene_steps` the position
         loss alone."""
         inputs = self.training.inputs(indices, self.device)
-        scene = self.settings.scene_weight if self.target.cameras else 0.0
+        scene = self.settings.scene_weight if self.module.cameras else 0.0
         with self.precision():
-            places = places_of(inputs.states, self.target.observation)
+            places = places_of(inputs.states, self.module.observation)
             if scene and step < self.settings.scene_steps:
-                loss = position_loss(self.target.encode_batch(inputs)[1], places)
+                loss = position_loss(self.module.encode_batch(inputs)[1], places)
                 return loss, {"position_loss": float(loss.detach())}
             tokens = self.tokens(self.training, indices)
-            logits, positions = self.target.teacher_forced(inputs, tokens)
+            logits, positions = self.module.teacher_forced(inputs, tokens)
             loss = token_loss(logits, tokens, self.labels)
             metrics = {"token_loss": float(loss.detach())}
             if scene:
@@ -135,10 +147,11 @@ class Imitation:
         return loss, metrics
 
     @torch.no_grad()
-    def validate(self, module: nn.Module, limit: int = 2048) -> Metrics:
-        """Teacher-forced metrics on held-out episodes; the score is minus the mean action L1."""
+    def validate(self, module: nn.Module) -> Metrics:
+        """Teacher-forced metrics on held-out episodes; the score is minus the mean action L1, plus ten times the
+        success where it is measured."""
         assert isinstance(module, CompactTarget)
-        chosen = torch.linspace(0, len(self.held_out) - 1, min(limit, len(self.held_out))).long()
+        chosen = torch.linspace(0, len(self.held_out) - 1, min(VALIDATED, len(self.held_out))).long()
         hits, close, errors, offsets = [], [], [], []
         actions = module.actions
         for indices in chosen.split(256):
@@ -164,6 +177,9 @@ class Imitation:
             medians = torch.cat(offsets).median(0).values.tolist()
             names = [place.name.replace(" ", "_") for place in module.observation.places]
             metrics |= {f"{name}_error_cm": 100 * e for name, e in zip(names, medians, strict=True)}
+        if self.closed_loop is not None:
+            metrics["closed_loop_success"] = self.closed_loop(module)
+            metrics["score"] += 10 * metrics["closed_loop_success"]
         return metrics
 
 
@@ -225,22 +241,3 @@ def continued_target(settings: TargetSettings, init: CompactTarget, camera: str)
 def vocabulary(environment: str) -> WordTokenizer:
     """Word tokenizer over the instructions of all tasks of an environment."""
     return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())
-
-
-def imitation_job(
-    run: Imitation,
-    save: Callable[[nn.Module, Metrics], None],
-    closed_loop: Callable[[CompactTarget], float] | None = None,
-) -> Job:
-    """The run as a `Job`. With `closed_loop` (returns success in [0, 1]) success dominates the score."""
-
-    def validate(module: nn.Module) -> Metrics:
-        metrics = run.validate(module)
-        if closed_loop is not None:
-            assert isinstance(module, CompactTarget)
-            metrics["closed_loop_success"] = closed_loop(module)
-            metrics["score"] += 10 * metrics["closed_loop_success"]
-        return metrics
-
-    weights = sample_weights(run.training.tasks, run.settings.balance)
-    return Job(run.target, len(run.training), run.loss, validate, save, weights)

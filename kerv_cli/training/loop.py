@@ -6,13 +6,13 @@ and history: an interrupted and resumed run writes the same bytes as an uninterr
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -29,31 +29,30 @@ from kerv_cli.training.ranks import ALONE, Ranks
 Metrics = dict[str, float]
 
 
-@dataclass(frozen=True)
-class Job:
-    """A module and its optimisation. samples: number of training samples. loss(batch indices, step) -> scalar loss and
-    logged numbers. validate(module) -> metrics of the EMA weights with a `score`, higher is better. save(module,
-    metrics) writes the best one. weights (samples,) float64: how often each sample is drawn, relative to the others;
-    None: all alike."""
+class Lesson(Protocol):
+    """What a module learns: its training samples, their loss and a validation."""
 
-    module: nn.Module
-    samples: int
-    loss: Callable[[Tensor, int], tuple[Tensor, Metrics]]
-    validate: Callable[[nn.Module], Metrics]
-    save: Callable[[nn.Module, Metrics], None]
-    weights: Tensor | None = None
+    @property
+    def module(self) -> nn.Module:
+        """What is trained, on its device."""
 
-    def batch(self, size: int, generator: torch.Generator) -> Tensor:
-        """(size,) int64: samples drawn with replacement."""
-        if self._borders is None:
-            return torch.randint(self.samples, (size,), generator=generator)
-        drawn = torch.rand(size, generator=generator, dtype=torch.float64) * self._borders[-1]
-        return torch.searchsorted(self._borders, drawn, right=True).clamp_(max=self.samples - 1)
+    def __len__(self) -> int:
+        """Number of training samples."""
 
-    @functools.cached_property
-    def _borders(self) -> Tensor | None:
-        """Sums of the weights up to each sample."""
-        return None if self.weights is None else self.weights.double().cumsum(0)
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """The samples of a batch (B,) -> scalar loss, and logged numbers."""
+
+    def validate(self, module: nn.Module) -> Metrics:
+        """Metrics of the EMA weights with a `score`, higher is better."""
+
+
+def draw_samples(samples: int, size: int, generator: torch.Generator, borders: Tensor | None = None) -> Tensor:
+    """(size,) int64 of `samples` samples, with replacement. borders (samples,) float64: the sums of their weights up to
+    each, increasing; None: all alike."""
+    if borders is None:
+        return torch.randint(samples, (size,), generator=generator)
+    numbers = torch.rand(size, generator=generator, dtype=torch.float64) * borders[-1]
+    return torch.searchsorted(borders, numbers, right=True).clamp_(max=samples - 1)
 
 
 @dataclass(frozen=True)
@@ -68,18 +67,29 @@ class Progress:
 
 
 class Loop:
-    """Runs a `Job`. folder: holds `resume.safetensors` and `log.csv`. identity: hash of everything that determines the
-    run; another run is never resumed. ranks: the rank of this process among those that train together."""
+    """Optimises a lesson's module. save: writes the best weights, which have these metrics. folder: holds
+    `resume.safetensors` and `log.csv`. identity: hash of everything that determines the run; another run is never
+    resumed. ranks: the rank of this process among those that train together. borders: as in `draw_samples`."""
 
-    def __init__(self, job: Job, settings: TrainSettings, folder: Path, identity: str, ranks: Ranks = ALONE) -> None:
-        self.job, self.settings, self.folder, self.identity, self.ranks = job, settings, folder, identity, ranks
+    def __init__(
+        self,
+        lesson: Lesson,
+        save: Callable[[nn.Module, Metrics], None],
+        settings: TrainSettings,
+        folder: Path,
+        identity: str,
+        ranks: Ranks = ALONE,
+        borders: Tensor | None = None,
+    ) -> None:
+        self.lesson, self.module, self.save, self.settings = lesson, lesson.module, save, settings
+        self.folder, self.identity, self.ranks, self.borders = folder, identity, ranks, borders
         self.step, self.best = 0, -math.inf
         self.history: list[Metrics] = []
-        decay = [p for p in job.module.parameters() if p.dim() >= 2]
-        rest = [p for p in job.module.parameters() if p.dim() < 2]
+        decay = [p for p in self.module.parameters() if p.dim() >= 2]
+        rest = [p for p in self.module.parameters() if p.dim() < 2]
         groups = [{"params": decay, "weight_decay": settings.weight_decay}, {"params": rest, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=settings.lr, betas=(0.9, 0.95), fused=True)
-        self.ema = {k: v.detach().clone() for k, v in job.module.state_dict().items()}
+        self.ema = {k: v.detach().clone() for k, v in self.module.state_dict().items()}
 
     def run(self, on_step: Callable[[int, Metrics], None] = lambda step, metrics: None) -> Metrics:
         """Trains to `settings.steps`, resuming what the folder holds -> metrics of the best checkpoint; empty on ranks
@@ -125,17 +135,17 @@ class Loop:
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
-        indices = self.ranks.share(self.job.batch(settings.batch, generator))
-        loss, metrics = self.job.loss(indices, self.step)
+        indices = self.ranks.share(draw_samples(len(self.lesson), settings.batch, generator, self.borders))
+        loss, metrics = self.lesson.loss(indices, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        mean, stopping = self.ranks.averaged(self.job.module.parameters(), (loss.item(), float(stop.requested)))
+        mean, stopping = self.ranks.averaged(self.module.parameters(), (loss.item(), float(stop.requested)))
         if not math.isfinite(mean):
             raise KervError(f"training diverged at step {self.step} (loss {mean}): lower train.lr")
-        nn.utils.clip_grad_norm_(self.job.module.parameters(), settings.clip)
+        nn.utils.clip_grad_norm_(self.module.parameters(), settings.clip)
         self.optimiser.step()
         decay = min(settings.ema, (1 + self.step) / (10 + self.step))
-        live = self.job.module.state_dict()
+        live = self.module.state_dict()
         with torch.no_grad():
             torch._foreach_lerp_([self.ema[k] for k in live], list(live.values()), 1 - decay)
         return {"loss": mean, **metrics}, stopping > 0
@@ -146,11 +156,11 @@ class Loop:
         Raises:
             KervError: a metric is not finite. StorageError: writing failed.
         """
-        module = self.job.module
+        module = self.module
         live = {k: v.detach().clone() for k, v in module.state_dict().items()}
         module.load_state_dict(self.ema)
         module.eval()
-        metrics = {"step": float(self.step), "train_loss": training["loss"], **self.job.validate(module)}
+        metrics = {"step": float(self.step), "train_loss": training["loss"], **self.lesson.validate(module)}
         broken = [name for name, value in metrics.items() if not math.isfinite(value)]
         if broken:
             raise KervError(
@@ -159,14 +169,14 @@ class Loop:
         self.history.append(metrics)
         if metrics["score"] >= self.best:
             self.best = metrics["score"]
-            self.job.save(module, metrics)
+            self.save(module, metrics)
         module.load_state_dict(live)
         module.train()
         self.store()
 
     def store(self) -> None:
         """Writes the resume file, then the log."""
-        tensors = {f"model.{k}": v for k, v in self.job.module.state_dict().items()}
+        tensors = {f"model.{k}": v for k, v in self.module.state_dict().items()}
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
@@ -198,7 +208,7 @@ class Loop:
             raise CheckpointError(
                 f"{self.folder} holds a run with other settings or data: choose another name=, or move it aside"
             )
-        self.job.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
+        self.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
         self.ema = {k[4:]: v.to(self.ema[k[4:]].device) for k, v in tensors.items() if k.startswith("ema.")}
         state: dict[int, dict[str, Tensor]] = {}
         for name, tensor in tensors.items():

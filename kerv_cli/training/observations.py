@@ -17,7 +17,7 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.worlds import spec_of, specs
+from kerv_cli.worlds import instruction_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import EncodedFrames
@@ -68,11 +68,6 @@ class Observations(Rows):
         return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
-def observed_steps(episode: DemoEpisode, settings: TargetSettings) -> np.ndarray:
-    """Control steps (n,) that such a policy learns from: those with a frame, for a state policy every step."""
-    return episode.frame_steps if settings.observation == "vision" else np.arange(episode.steps)
-
-
 def read_observations(
     episode: DemoEpisode,
     settings: TargetSettings,
@@ -80,13 +75,15 @@ def read_observations(
     words: WordTokenizer,
     chosen: slice | np.ndarray = slice(None),
 ) -> Observations:
-    """The observations of an episode that a policy of these settings learns from. chosen: which of them, default all.
+    """The observations of an episode that a policy of these settings learns from: those with a frame, for a state
+    policy every step. chosen: which of them, default all.
 
     Raises:
         CheckpointError: frames of another size than the policy takes.
     """
-    steps, frames = observed_steps(episode, settings)[chosen], None
-    if settings.observation == "vision":
+    sees, frames = settings.observation == "vision", None
+    steps = (episode.frame_steps if sees else np.arange(episode.steps))[chosen]
+    if sees:
         check_frames(episode, settings.image_size)
         pictures = episode.frames[chosen]
         frames = pictures if isinstance(pictures, EncodedFrames) else torch.from_numpy(pictures)
@@ -170,11 +167,6 @@ def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> No
     recorded = dataset.manifest.config["camera"]["name"]
     if recorded != camera:
         raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
-
-
-def instruction_of(name: str) -> str:
-    """The instruction of a task."""
-    return spec_of(name).task(name).instruction
 
 
 S = TypeVar("S", bound=Rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,7 +25,8 @@ DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)  # tried by the damp
 class Windows:
     """n moments of demonstrations: the actions before each and the expert's actions from there on, normalised.
 
-    past (n, window, D), future (n, H, D), task (n,) index into `tasks`, held_out (n,) bool by whole episodes.
+    past (n, window, D), future (n, H, D), task (n,) index into `tasks`, held_out (n,) bool by whole episodes. paths:
+    (T, 3) metres, of the end effector in every training episode.
     """
 
     past: np.ndarray
@@ -34,6 +35,7 @@ class Windows:
     held_out: np.ndarray
     tasks: tuple[str, ...]
     episodes: dict[str, dict[str, int]]  # task -> {"training": episodes, "held_out": episodes}
+    paths: list[np.ndarray] = field(default_factory=list)
 
     def where(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(past, future) of the moments in `mask`."""
@@ -78,20 +80,21 @@ def read_windows(
     """
     tasks = tuple(dict.fromkeys(dataset.episodes[i].task for i in chosen))
     counts = {task: {"training": 0, "held_out": 0} for task in tasks}
-    parts, labels, masks = [], [], []
+    parts, labels, masks, paths = [], [], [], []
     for done, (index, held_out) in enumerate(chosen.items(), 1):
         episode = dataset.load(index)
         past, future = episode_windows(episode, actions, history, window, horizon)
         parts.append((past.astype(np.float32), future.astype(np.float32)))
         labels.append(np.full(len(past), tasks.index(episode.task)))
         masks.append(np.full(len(past), held_out))
+        paths += [] if held_out else [episode.end_effector.copy()]
         counts[episode.task]["held_out" if held_out else "training"] += bool(len(past))
         on_progress(done, len(chosen))
     short = [task for task, count in counts.items() if not all(count.values())]
     if short:
         raise KervError(f"{', '.join(short)}: no training or no held-out episode is longer than a window of {window}")
     past, future = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Windows(past, future, np.concatenate(labels), np.concatenate(masks), tasks, counts)
+    return Windows(past, future, np.concatenate(labels), np.concatenate(masks), tasks, counts, paths)
 
 
 def choose_episodes(dataset: DemoDataset, tasks: Iterable[str], limit: int, share: float) -> dict[int, bool]:

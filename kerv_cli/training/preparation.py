@@ -18,10 +18,6 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.worlds import specs
 
-ORDER = ("drafter", "early", "scout", "datastore", "calibration", "certificate")
-"""A kind is made from those before it; kinds of parts that are not kerv's come last."""
-SEEING = ("scout", "certificate")
-"""Kinds that need a target with cameras: a scout drafts for one of the certificate's candidates."""
 THERE, MISSING = "there", "missing"
 
 
@@ -48,7 +44,7 @@ def plan(settings: PrepareSettings) -> list[Step]:
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
     spec = specs().get(description.environment)
-    played = spec is not None and not spec.world_class.endswith(":NoWorld")
+    played = spec is not None and bool(spec.world_class)
     kinds = needs(tuple(settings.methods), bool(description.cameras), played)
     steps: list[Step] = []
     for kind in kinds:
@@ -76,17 +72,23 @@ def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[st
     for name in methods:
         if name not in names:
             raise UnknownName("method", name, names)
+    artifacts = parts("artifact")
+    seeing = {kind for kind, part in artifacts.items() if part.traits.get("sees")}
     kinds: set[str] = set()
     for name in methods or names:
-        own = set(Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs)
-        if not sees and own & set(SEEING) and methods:
+        method = Method.of(compose("rollout", [f"method={name}"], RolloutSettings))
+        if methods and not sees and seeing & set(method.needs):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
-        kinds |= own
+        kinds |= set(method.needs)
     if "certificate" in kinds and sees and played:  # its candidates run before one of them is certified
         candidates = resolve([f"study={CalibrateSuccessSettings.groups['study']}"]).settings.values()
         kinds |= {kind for settings in candidates for kind in Method.of(settings).needs}
-    made = [kind for kind in dict.fromkeys((*ORDER, *parts("artifact"))) if kind in kinds and kind_of(kind).command]
-    return tuple(kind for kind in made if (sees or kind not in SEEING) and (played or kind != "certificate"))
+    if not sees:
+        kinds -= seeing
+    if not played:
+        kinds -= {"certificate"}
+    order = dict.fromkeys(kind for name, part in artifacts.items() for kind in (*part.needs(None), name))
+    return tuple(kind for kind in order if kind in kinds and kind_of(kind).command)
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
@@ -95,22 +97,22 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
     Raises:
         CheckpointError: a trained one is of another target.
     """
-    own, place = kind_of(kind), artifacts.path(kind)
-    if not own.json(place).is_file():
+    files, place = kind_of(kind), artifacts.path(kind)
+    if not files.json(place).is_file():
         return MISSING
     try:
-        described = own.checked(place, artifacts.description)
+        described = files.checked(place, artifacts.description)
         made = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
         artifacts.check(made[: made.index(kind) + 1])
     except CheckpointError as error:
-        if isinstance(kind_of(kind), Weights):
+        if isinstance(files, Weights):
             name = f"{kind}/{place.name}"
             raise CheckpointError(f"{str(error).split(': ')[0]}: remove it with 'kerv runs rm {name}'") from error
         return "of other artifacts"
     if kind == "calibration":
         lacks = [name for name, part in (("variability", "drafter"), ("skip", "datastore")) if part in kinds]
         return MISSING if any(not getattr(described, name) for name in lacks) else THERE
-    state = state_of(place, kind) if isinstance(kind_of(kind), Weights) else THERE
+    state = state_of(place, kind) if isinstance(files, Weights) else THERE
     return THERE if state == "complete" else state
 
 
@@ -119,4 +121,4 @@ def _seconds(kind: str, command: Sequence[str]) -> float:
     if command[0] != "train":
         return {"certificate": 120.0}.get(kind, 30.0)
     train = compose("train_drafter", command[2:], TrainDrafterSettings).train
-    return train.steps * {"drafter": 0.05, "scout": 0.4}.get(kind, 0.05)
+    return train.steps * {"scout": 0.4}.get(kind, 0.05)

@@ -41,7 +41,7 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
         **provenance(device),
     }
     made_for = MadeFor.of(artifacts.description)
-    own = asdict(DrafterSettings(kind="public", layers=shape.language.num_hidden_layers))
-    DrafterArtifact().save(folder, drafter, made_for, origin, settings=own, public=asdict(shape))
+    shapes = asdict(DrafterSettings(kind="public", layers=shape.language.num_hidden_layers))
+    DrafterArtifact().save(folder, drafter, made_for, origin, settings=shapes, public=asdict(shape))
     figures = {"parameters": parameters, "layers": shape.language.num_hidden_layers, **asdict(convention)}
     return folder, figures

@@ -64,18 +64,14 @@ ALONE = Ranks()
 """One process."""
 
 
-def this_rank() -> Ranks:
-    """The rank that torchrun gave this process, from its environment; without torchrun there is one process."""
-    return Ranks(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-
-
 def join(device: str, batch: int) -> tuple[str, Ranks]:
-    """Joins the other ranks -> (the device of this rank, the ranks). device: cpu or cuda; batch: samples of a step.
+    """Joins the other ranks that torchrun started, if it did -> (the device of this rank, the ranks). device: cpu or
+    cuda; batch: samples of a step.
 
     Raises:
         UsageError: the batch cannot be divided, or a numbered device for several ranks.
     """
-    ranks = this_rank()
+    ranks = Ranks(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     if ranks.size == 1:
         return device, ranks
     if batch % ranks.size:

@@ -20,7 +20,8 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import EncodesMany, Target
-from kerv_cli.training.observations import Rows, check_frames, instruction_of
+from kerv_cli.training.observations import Rows, check_frames
+from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 

@@ -9,10 +9,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import UnknownName, UsageError
@@ -25,19 +24,17 @@ from kerv_cli.methods.artifacts import MadeFor, Weights
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.coverage import subset
-from kerv_cli.training.demonstrations import demos_for, name_of, open_demos
+from kerv_cli.training.demonstrations import demos_for, name_of, open_demos, subset
 from kerv_cli.training.imitation import (
     Imitation,
-    Samples,
     check_init,
     continued_target,
-    imitation_job,
     load_samples,
     new_target,
+    task_borders,
     vocabulary,
 )
-from kerv_cli.training.loop import Job, Loop, Metrics
+from kerv_cli.training.loop import Lesson, Loop, Metrics
 from kerv_cli.training.observations import check_camera, check_shown, check_spaces
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
@@ -58,14 +55,9 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     return {k: v for k, v in settings.items() if k not in later or v != later[k]}
 
 
-def identity_of(**parts: Any) -> str:
-    """Hash of everything that determines a run's next step."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-
-
 class Run(ABC):
-    """A training run: `load` reads what it needs, `train` optimises and saves the best checkpoint in `folder`. `plan`
-    says in one line what would be done."""
+    """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
+    `plan` says in one line what would be done. borders: as in `draw_samples`."""
 
     kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
@@ -73,10 +65,8 @@ class Run(ABC):
     folder: Path
     device: str
     ranks: Ranks
-
-    @abstractmethod
-    def job(self) -> Job:
-        """A fresh module, its loss and its validation."""
+    learnt: Lesson
+    borders: Tensor | None = None
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
@@ -92,10 +82,11 @@ class Run(ABC):
         Raises:
             CheckpointError: the folder holds another run. KervError: training diverged. StorageError: writing failed.
         """
-        train, job = self.settings.train, self.job()
-        identity = identity_of(train=run_settings(train), demos=self.dataset.sha256, **self.identity())
-        job.module.train()
-        return Loop(job, train, self.folder, identity, self.ranks).run(on_step)
+        train = self.settings.train
+        parts = {"train": run_settings(train), "demos": self.dataset.sha256, **self.identity()}
+        identity = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        self.learnt.module.train()
+        return Loop(self.learnt, self.save, train, self.folder, identity, self.ranks, self.borders).run(on_step)
 
     def begin(self) -> None:
         """Chooses the device, and joins the other processes where torchrun started several.
@@ -158,21 +149,11 @@ class TargetRun(Run):
             )
         self.folder = artifact(settings.results, "target", settings.name)
         self.init = self.find_init()
-        self.check_demos()
-        self.samples: Samples | None = None
-        self.init_target: CompactTarget | None = None
-        self.init_hash: dict[str, str] = {}  # {"init": hash of its weights}; empty for a fresh run
-
-    def check_demos(self) -> None:
-        """Refuses demonstrations of another environment, or frames of another camera than the policy will be shown.
-
-        Raises:
-            CheckpointError: they are.
-        """
-        spec, camera = self.spec, self.world.camera.name
-        check_spaces(self.dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
-        if self.settings.target.observation == "vision":
+        camera = self.world.camera.name
+        check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")
+        if settings.target.observation == "vision":
             check_camera(self.dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
+        self.init_hash: dict[str, str] = {}  # {"init": hash of its weights}; empty for a fresh run
 
     def find_init(self) -> Path | None:
         """Folder of the target `train.init`; None for a fresh run.
@@ -203,31 +184,28 @@ class TargetRun(Run):
         )
 
     def load(self, progress: Progress) -> None:
-        """Reads the demonstrations and the weights of `train.init` into memory; progress(done, total).
+        """Reads the demonstrations and the weights of `train.init` into memory, and makes the target; progress(done,
+        total).
 
         Raises:
             CheckpointError: one of them is damaged or of another environment.
         """
         self.begin()
+        settings, camera, init = self.settings, self.world.camera.name, None
         if self.init is not None:
-            self.init_target, description = load_target(self.init)
+            init, description = load_target(self.init)
             self.init_hash = {"init": description.sha256}
             check_spaces(self.dataset, description.actions, description.observation, f"the target in {self.init}")
-        self.words = self.init_target.words if self.init_target else vocabulary(self.dataset.manifest.environment)
-        self.samples = load_samples(self.dataset, self.settings.target, self.words, self.tasks, progress)
-
-    def job(self) -> Job:
-        """See `Run.job`; validated in closed loop where the settings ask for it."""
-        assert self.samples is not None
-        settings, camera = self.settings, self.world.camera.name
-        if self.init_target is None:
-            seed = settings.train.seed
-            target = new_target(settings.target, self.dataset, self.samples, self.words, camera, seed)
+        words = init.words if init else vocabulary(self.dataset.manifest.environment)
+        samples = load_samples(self.dataset, settings.target, words, self.tasks, progress)
+        if init is None:
+            target = new_target(settings.target, self.dataset, samples, words, camera, settings.train.seed)
         else:
-            target = continued_target(settings.target, self.init_target, camera)
+            target = continued_target(settings.target, init, camera)
             freeze(target, settings.train.freeze)
-        run = Imitation(target.to(self.device), self.samples, settings.train, torch.device(self.device))
-        return imitation_job(run, self.save, self.closed_loop if settings.train.closed_loop else None)
+        closed_loop = self.closed_loop if settings.train.closed_loop else None
+        self.learnt = Imitation(target.to(self.device), samples, settings.train, closed_loop)
+        self.borders = task_borders(self.learnt.training.tasks, settings.train.balance)
 
     def identity(self) -> dict[str, Any]:
         """Shapes, tasks and the weights to begin with."""
@@ -257,23 +235,6 @@ class TargetRun(Run):
         return ends
 
 
-class Lesson(Protocol):
-    """What a drafter learns: its samples, loss and validation, as `Job` takes them."""
-
-    @property
-    def module(self) -> nn.Module:
-        """What is trained, on its device."""
-
-    def __len__(self) -> int:
-        """Number of training samples."""
-
-    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """See `Job.loss`."""
-
-    def validate(self, module: nn.Module) -> Metrics:
-        """See `Job.validate`."""
-
-
 class DrafterRun(Run):
     """Base of what `kerv train drafter` runs: weights that draft for a target, trained on demonstrations.
 
@@ -291,7 +252,6 @@ class DrafterRun(Run):
     target: Any  # a ReadableTarget
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
-        self.settings = settings
         if settings.train.init is not None:
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.train.freeze:
@@ -299,7 +259,8 @@ class DrafterRun(Run):
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
-        self.dataset = subset(demos_for(settings), settings.task, settings.starts)
+        self.settings, dataset = demos_for(settings)
+        self.dataset = subset(dataset, self.settings.task, settings.starts)
         description = read_target(self.target_folder)
         check_shown(self.dataset, description)
         description.check_autoregressive(
@@ -329,11 +290,6 @@ class DrafterRun(Run):
         self.begin()
         self.target, self.description = load_target(self.target_folder, self.device)
         self.learnt = self.lesson(progress)
-
-    def job(self) -> Job:
-        """See `Run.job`."""
-        lesson = self.learnt
-        return Job(lesson.module, len(lesson), lesson.loss, lesson.validate, self.save)
 
     def identity(self) -> dict[str, Any]:
         """Shapes and the target's weights."""

@@ -11,16 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from kerv_cli.base.settings import TrainSettings
 from kerv_cli.engine.batched import greedy
+from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.network import Scout
 from kerv_cli.methods.scout.proposer import ScoutArtifact, check_sees
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.early_distillation import columns_of, evenly, measure, share_of
-from kerv_cli.training.imitation import position_loss, soft_labels, token_loss
+from kerv_cli.training.early_distillation import Decodes, EarlyDistillation, columns_of, evenly, share_of
+from kerv_cli.training.imitation import position_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, read_observations, split
 from kerv_cli.training.recorded import BATCH
@@ -29,14 +29,9 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 
 
 @dataclass(frozen=True)
-class ScoutSamples(Observations):
-    """Observations, and what the target says of them. history, valid, episodes, perturbed: as in `EarlySamples`."""
+class ScoutSamples(Observations, Decodes):
+    """What a scout learns from: observations, and what the target says of them."""
 
-    history: Tensor
-    valid: Tensor
-    episodes: Tensor
-    perturbed: Tensor
-    tokens: Tensor  # (n, N) int64
     places: Tensor  # (n, K, 3) float32, metres
 
 
@@ -66,47 +61,34 @@ def teach_scout(
     return ScoutSamples.joined(parts)
 
 
-class ScoutDistillation:
-    """Loss and validation of one run. The target's tokens are the labels; neighbouring bins share probability."""
+class ScoutDistillation(EarlyDistillation):
+    """Loss and validation of one run: those of an early drafter, and the positions."""
 
-    def __init__(self, scout: Scout, training: ScoutSamples, held_out: ScoutSamples, train: TrainSettings) -> None:
-        self.module: nn.Module = scout
-        self.scout, self.training, self.held_out, self.train = scout, training, held_out, train
-        self.device = scout.centre.device
-        self.labels = soft_labels(scout.drafter.actions.tokens, train.label_sigma).to(self.device)
+    def drafter(self, module: Scout) -> EarlyDrafter:
+        """The network behind the scout's eyes."""
+        return module.drafter
 
-    def __len__(self) -> int:
-        return len(self.training)
-
-    def outputs(self, scout: Scout, samples: ScoutSamples, indices: Tensor) -> tuple[Tensor, Tensor]:
+    def outputs(self, module: Scout, samples: ScoutSamples, indices: Tensor) -> tuple[Tensor, ...]:
         """Logits (B, N, V) and positions (B, K, 3) for the samples at `indices` (B,)."""
         past = (samples.history[indices].to(self.device), samples.valid[indices].to(self.device))
-        logits, places = scout(samples.inputs(indices, self.device), *past)
-        return logits, places
+        return module(samples.inputs(indices, self.device), *past)
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Cross-entropy with the softened tokens and the weighted position loss at `indices` (B,)."""
+        """The token loss and the weighted position loss at `indices` (B,)."""
         labels = self.training.places[indices].to(self.device)
         if step < self.train.scene_steps:
-            loss = position_loss(self.scout.see(self.training.inputs(indices, self.device))[1], labels)
+            loss = position_loss(self.module.see(self.training.inputs(indices, self.device))[1], labels)
             return loss, {"position_loss": float(loss.detach())}
-        logits, places = self.outputs(self.scout, self.training, indices)
-        token = token_loss(logits, self.training.tokens[indices].to(self.device), self.labels)
-        position = position_loss(places, labels)
+        logits, places = self.outputs(self.module, self.training, indices)
+        token, position = self.token_loss(logits, indices), position_loss(places, labels)
         metrics = {"token_loss": float(token.detach()), "position_loss": float(position.detach())}
         return token + self.train.scene_weight * position, metrics
 
-    @torch.no_grad()
-    def validate(self, module: nn.Module) -> Metrics:
-        """Drafts and positions of the held-out observations; plain and perturbed episodes count alike."""
-        assert isinstance(module, Scout)
-        batches = torch.arange(len(self.held_out)).split(256)
-        drafts, places = zip(*(self.outputs(module, self.held_out, i) for i in batches), strict=True)
-        metrics = measure(torch.cat(drafts).cpu(), self.held_out, module.drafter.strict.cpu())
-        error = (torch.cat(places).cpu() - self.held_out.places).norm(dim=-1).median(0).values
-        names = [place.name.replace(" ", "_") for place in module.observation.places]
-        metrics |= {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
-        return {"score": metrics["accepted_r9"] + metrics["accepted_strict"], **metrics}
+    def further_metrics(self, *outputs: Tensor) -> Metrics:
+        """Median errors of the positions."""
+        error = (outputs[0] - self.held_out.places).norm(dim=-1).median(0).values
+        names = [place.name.replace(" ", "_") for place in self.module.observation.places]
+        return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
 class ScoutRun(DrafterRun):

@@ -16,7 +16,7 @@ from kerv_cli.base.errors import UnknownName
 from kerv_cli.methods.calibration import NEVER, SkipLevel, SkipSection
 
 if TYPE_CHECKING:
-    from kerv_cli.methods.retrieval.datastore import Datastore
+    from kerv_cli.methods.heisd.datastore import Datastore
 
 ENTRIES = 4000  # looked up per task, evenly spread; on MT10, levels from 1000 did not hold on other episodes
 LEAST = 20  # entries above a level; fewer do not support it

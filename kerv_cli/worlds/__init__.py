@@ -43,6 +43,11 @@ def spec_of(task: str) -> EnvironmentSpec:
     return owners[0]
 
 
+def instruction_of(task: str) -> str:
+    """The instruction of a task; errors as `spec_of`."""
+    return spec_of(task).task(task).instruction
+
+
 def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
     """Full task names for a list of tasks and suites (`MT10`, `mt50`): order kept, duplicates dropped.
 

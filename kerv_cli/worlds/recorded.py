@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import Part, register
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.spec import EnvironmentSpec, Task
@@ -22,9 +21,7 @@ def register_recorded(
     """Registers the environment of a recorded dataset. name: an identifier; instructions: task -> instruction."""
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
     suite = {name.upper(): tuple(tasks)}
-    _SPECS[name] = EnvironmentSpec(
-        name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,), f"{__name__}:NoWorld"
-    )
+    _SPECS[name] = EnvironmentSpec(name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,))
     register(Part("environment", name, f"{__name__}:{name}"))
     return _SPECS[name]
 
@@ -33,10 +30,3 @@ def __getattr__(name: str) -> EnvironmentSpec:
     if name not in _SPECS:
         raise AttributeError(name)
     return _SPECS[name]
-
-
-class NoWorld:
-    """The world class of a recorded environment; opening it is refused."""
-
-    def __init__(self, spec: EnvironmentSpec, *rest: object) -> None:
-        raise UsageError(f"{spec.name} is a recording: nothing can be executed in it")

@@ -153,11 +153,11 @@ class EnvironmentSpec:
     begins with the proprioception. tasks: by full name. suites: name in capitals -> full task names. difficulties:
     groups of tasks, in the order of tables. horizon: control steps of an episode, the most that the simulator runs.
     cameras: names; the first is the default. seeds: see `Seeds`. world_class, expert_class: `module:class`, called
-    with (spec, task, camera, horizon) and with (spec, task); an environment may have no experts. upside_down: cameras
-    whose raw images are rotated by 180 degrees. suffix: ending of all full task names, which users may leave out.
-    packages: those whose versions determine the physics. grip: actions of the strict DoFs that close and that open the
-    gripper; empty where there is none. experts: task -> name of its expert, where that is another than the simulator's
-    own: it determines what a recording holds and what policy=expert does.
+    with (spec, task, camera, horizon) and with (spec, task); a recording has no world, an environment may have no
+    experts. upside_down: cameras whose raw images are rotated by 180 degrees. suffix: ending of all full task names,
+    which users may leave out. packages: those whose versions determine the physics. grip: actions of the strict DoFs
+    that close and that open the gripper; empty where there is none. experts: task -> name of its expert, where that is
+    another than the simulator's own: it determines what a recording holds and what policy=expert does.
     """
 
     name: str
@@ -168,7 +168,7 @@ class EnvironmentSpec:
     difficulties: tuple[str, ...]
     horizon: int
     cameras: tuple[str, ...]
-    world_class: str
+    world_class: str = ""
     expert_class: str = ""
     upside_down: tuple[str, ...] = ()
     suffix: str = ""
@@ -242,8 +242,10 @@ class EnvironmentSpec:
         """A world of the task; its simulator is built at the first reset.
 
         Raises:
-            UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
+            UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run, or a recording.
         """
+        if not self.world_class:
+            raise UsageError(f"{self.name} is a recording: nothing can be executed in it")
         return load(self.world_class)(self, task, camera, horizon)
 
     def expert(self, task: str) -> Expert:

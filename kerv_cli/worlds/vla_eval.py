@@ -97,8 +97,8 @@ class MetaWorld(StepBenchmark):
         numbers = np.asarray(action.get("actions", action.get("action")), dtype=np.float64)
         space = self.spec.actions
         if numbers.shape != (space.dofs,) or not np.isfinite(numbers).all():
-            wanted = f"{space.dofs} finite numbers ({', '.join(space.names)})"
-            raise ValueError(f"Meta-World takes {wanted}, the model server sent an array of shape {numbers.shape}")
+            expected = f"{space.dofs} finite numbers ({', '.join(space.names)})"
+            raise ValueError(f"Meta-World takes {expected}, the model server sent an array of shape {numbers.shape}")
         observation = self.world.step(numbers)
         done, success = self.world.done, self.world.succeeded
         self._recorder.record_step(success=success, action=numbers, state=observation.proprioception)

@@ -10,7 +10,7 @@ from kerv_cli.base.registry import NoSettings, add
 
 
 class Everything:
-    """The `Index` protocol of `kerv_cli/methods/retrieval/search.py`."""
+    """The `Index` protocol of `kerv_cli/methods/heisd/datastore.py`."""
 
     def __init__(self, seeds: np.ndarray, shards: Mapping[str, slice]) -> None:
         self.seeds, self.shards = seeds, shards

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.files import read_json
 from kerv_cli.base.manifests import read
-from kerv_cli.engine.attention import attention_mask
 from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import Language
 from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, conversion, open_shards, sizes_of
-from kerv_cli.targets.openvla.trunk import KeyValueCache, LlamaLayer, run_layers
+from kerv_cli.targets.openvla.trunk import LlamaLayer, run_layers
 
 POSITIONS, MASKS = ("sequence", "text"), ("causal", "prompt")
 EMBEDDING = "embed_tokens.weight"
@@ -59,7 +59,7 @@ class PublicShape:
     skipped: int
 
 
-class DraftCache(KeyValueCache):
+class DraftCache(Cache):
     """A cache that remembers where the prompt ended. prompt: its tokens."""
 
     prompt = 0
@@ -76,8 +76,8 @@ class PublicDrafter(nn.Module):
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> DraftCache:
         """An empty cache. fixed: of fixed shapes; default: on CUDA."""
-        weight = self.fc.weight
-        return DraftCache(self.shape.language, batch, capacity, weight, weight.is_cuda if fixed is None else fixed)
+        weight, sizes = self.fc.weight, self.shape.language.cache_sizes(batch, capacity)
+        return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
 
     def draft_position(self, index: int) -> int:
         """Rotary position of the drafted token at `index` of the sequence."""

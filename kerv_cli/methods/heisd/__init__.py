@@ -1,15 +1,43 @@
-"""HeiSD (docs/methods.md §2.1, §4.3, §4.4): retrieval and the drafter on two sides of a boundary, acceptance by
-kinematic groups, and execution without verification where a stored observation is similar. Settings and registration.
-"""
+"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval from a datastore, retrieval and the drafter on two sides of a
+boundary, acceptance by kinematic groups, and execution without verification where a stored observation is similar.
+Settings and registration."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.base.registry import STATES, add
+from kerv_cli.base.registry import PREFILL, STATES, add
 
-_RULES = "kerv_cli.methods.heisd.rules:"
+_DATASTORE, _RULES = "kerv_cli.methods.heisd.datastore:", "kerv_cli.methods.heisd.rules:"
+
+
+# --- the datastore and what drafts from it (§4.1, §4.2)
+
+
+@dataclass
+class RetrievalProposerSettings:
+    """The nearest stored chunks of the task as one tree (§4.2)."""
+
+    kind: str = "retrieval"
+    neighbours: int = number(5, 1, MOST_TOKENS)  # stored chunks
+    nodes: int = number(50, 1, MOST_TOKENS)  # tree nodes
+
+
+@dataclass
+class QdrantSearchSettings:
+    """The Qdrant engine (the extra: pip install 'kerv[qdrant]')."""
+
+    kind: str = "qdrant"
+    url: str | None = None  # a server, e.g. http://localhost:6333; None: the engine in this process
+
+
+add("artifact", "datastore", _DATASTORE + "DatastoreArtifact")
+_retrieval = (_RULES + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
+add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
+# what searches: every backend finds the same neighbours
+add("datastore", "exact", _DATASTORE + "ExactIndex")
+add("datastore", "qdrant", "kerv_cli.methods.heisd.qdrant:qdrant_index", QdrantSearchSettings)
 
 
 @dataclass

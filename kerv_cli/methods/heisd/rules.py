@@ -1,4 +1,4 @@
-"""HeiSD's hybrid proposer, acceptance rules, verify-skip and boundaries (docs/methods.md §2.1, §4.3, §4.4).
+"""HeiSD's proposers, acceptance rules, verify-skip and boundaries (docs/methods.md §2.1, §4.2 to §4.4).
 
 A boundary chooses the side that drafts, retrieval or the drafter. R is the radius of curvature of the measured
 end-effector path, D its length. A straight, fast reach (large R, large D) repeats demonstrated motion; a tight or slow
@@ -7,21 +7,28 @@ path is precise work, for which the drafter is better.
 
 from __future__ import annotations
 
+import functools
 import math
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.acceptance import Acceptance, Accepted, Strict, accept_by_group
 from kerv_cli.engine.chunk import Choice, Chunk, Mode
-from kerv_cli.engine.draft import Draft, TokenTree
+from kerv_cli.engine.draft import ROOT, Draft, TokenTree
 from kerv_cli.engine.parts import Skip
-from kerv_cli.engine.proposer import Proposer
+from kerv_cli.engine.proposer import ChainProposer, Proposer
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.heisd import (
@@ -32,13 +39,150 @@ from kerv_cli.methods.heisd import (
     SequenceAcceptanceSettings,
     SimilaritySkipSettings,
 )
-from kerv_cli.methods.retrieval.datastore import RetrievalProposer
+from kerv_cli.methods.heisd.datastore import Datastore, Neighbours
 from kerv_cli.methods.spec_vla.rules import Relaxed
 
+CROSS = 0.1  # probability that a path of retrieved groups changes to other neighbours
 LEAST = 3  # positions; fewer have no curvature
 STILL = 1e-3  # metres; a hand with a shorter path counts as still (in Meta-World a control step at full speed is 10 mm)
 COINCIDENT = 1e-7  # metres of spread; below it float32 positions are the same point
 STRAIGHT = 1e-6  # spread across the path by the spread along it; below it the points lie on a line
+
+
+def neighbour_tree(
+    chunks: np.ndarray,
+    start: int,
+    space: ActionSpace,
+    nodes: int = 50,
+    depth: int | None = None,
+    cross: float = CROSS,
+) -> Draft:
+    """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
+
+    chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
+    neighbour's next one, but a group of strict DoFs always comes from a neighbour that has the group before it, too.
+    The tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
+
+    Within `nodes` the most probable groups are kept (*ours*): the i-th neighbour weighs 1 / i, and a path changes to
+    other neighbours with probability `cross`; 0 merges whole chunks only.
+    """
+    stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
+    continuations = _Continuations(chunks.tolist(), list(space.segments(start, stop)), cross)
+    tokens: list[int] = []
+    parents: list[int] = []
+    children: dict[tuple[int, int], int] = {}
+    waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
+    order = count()
+
+    def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
+        for surprise, group, members, common in continuations.on(level, last, whole):
+            heappush(waiting, (cost + surprise, next(order), parent, level, group, members, common))
+
+    offer(ROOT, 0, continuations.everyone, continuations.everyone, 0.0)
+    while waiting and len(tokens) < nodes:
+        cost, _, node, level, group, last, whole = heappop(waiting)
+        if len(tokens) + len(group) - _shared(children, node, group) > nodes:
+            continue  # a group is in the tree as a whole or not at all
+        for token in group:
+            if (node, token) not in children:
+                children[node, token] = len(tokens)
+                tokens.append(token)
+                parents.append(node)
+            node = children[node, token]
+        offer(node, level + 1, last, whole, cost)
+    return Draft.of(tokens, parents)
+
+
+@functools.lru_cache(maxsize=4096)
+def _weight(members: int) -> float:
+    """Bit set of neighbours -> sum of their weights; the i-th neighbour, counted from 1, weighs 1 / i."""
+    return sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
+
+
+class _Continuations:
+    """The groups that may follow a path. A path is described by two sets of neighbours: `last`, those that have its
+    last group, and `whole`, those among them that have all its groups."""
+
+    def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
+        self.everyone = (1 << len(rows)) - 1
+        self.cross = cross
+        self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
+        for first, last, strict in cuts:
+            givers: dict[tuple[int, ...], int] = {}
+            for i, row in enumerate(rows):
+                group = tuple(row[first:last])
+                givers[group] = givers.get(group, 0) | 1 << i
+            self.levels.append((strict, list(givers.items())))
+
+    def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
+        """Yields (−log probability, the group's tokens, the two sets of the lengthened path), best neighbour first."""
+        if level == len(self.levels):
+            return
+        strict, givers = self.levels[level]
+        pool = self.everyone
+        if strict:
+            pool = last
+            givers = [(group, members & last) for group, members in givers if members & last]
+            givers.sort(key=lambda way: way[1] & -way[1])
+        cross, of_whole, of_pool = self.cross, _weight(whole), _weight(pool)
+        for group, members in givers:
+            common = members & whole
+            probability = (1 - cross) * _weight(common) / of_whole + cross * _weight(members) / of_pool
+            if probability > 0:
+                yield -math.log(probability), group, members, common or members
+
+
+def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
+    """Number of the group's leading tokens that the tree already has below `node`."""
+    for depth, token in enumerate(group):
+        if (node, token) not in children:
+            return depth
+        node = children[node, token]
+    return len(group)
+
+
+class RetrievalProposer(ChainProposer):
+    """The nearest stored chunks of the task, merged by kinematic group (docs/methods.md §4.2)."""
+
+    name = "retrieval"
+
+    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
+        self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
+        self.waits = target.device.type == "cpu"
+        self._nearest: tuple[Chunk, Neighbours] | None = None
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> RetrievalProposer:
+        """proposer=retrieval, and retrieval's side of hybrid: settings of either have neighbours and nodes."""
+        return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
+
+    def neighbours(self, chunk: Chunk) -> Neighbours:
+        """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
+        if self._nearest is None or self._nearest[0] is not chunk:
+            self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
+        assert self._nearest is not None
+        return self._nearest[1]
+
+    def prepare(self, chunk: Chunk) -> None:
+        """Adds the pooled prompt, which the search key is made of, to `chunk.reads`."""
+        if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
+            vector = self.datastore.pooled(chunk.prompt, self.target)
+            chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
+
+    def _search(self, chunk: Chunk, pooled: np.ndarray) -> None:
+        key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
+        self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+        chunk.similarity = float(self._nearest[1].similarity[0])
+
+    def propose(self, chunk: Chunk, depth: int) -> Draft:
+        """The neighbours' chunks as one tree, merged by kinematic group."""
+        chunks = self.neighbours(chunk).chunks[:, : chunk.size]
+        return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
+        start = len(chunk.tokens)
+        return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
 
 
 class HybridProposer(Proposer):
@@ -75,13 +219,6 @@ class HybridProposer(Proposer):
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Tells the side that drafts."""
         self.side.committed(chunk, first, hidden, target_tokens)
-
-
-def retrieval_of(context: Context) -> RetrievalProposer:
-    """The retrieval of the method's proposer, where that retrieves; else a new one of the nearest neighbour."""
-    proposer: Proposer | None = context.built["proposer"]
-    side = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
-    return side if isinstance(side, RetrievalProposer) else RetrievalProposer.of_nearest(context)
 
 
 @dataclass(frozen=True)
@@ -133,23 +270,6 @@ class ByProposer:
         return self.others.judge(tree, target_tokens, start, r)
 
 
-@dataclass(frozen=True)
-class SkipLevels:
-    """The task's least similarity s_min and the bounds within which feedback moves it; cosines.
-
-    Raises:
-        UsageError: they are not in order.
-    """
-
-    low: float
-    s_min: float
-    high: float
-
-    def __post_init__(self) -> None:
-        if not self.low <= self.s_min <= self.high:
-            raise UsageError(f"verify-skip: s_min {self.s_min} does not lie in {self.low}…{self.high}")
-
-
 class VerifySkip(Skip):
     """Executes the best neighbour's chunk without verification where its similarity is at least s_min.
 
@@ -159,20 +279,25 @@ class VerifySkip(Skip):
     it falls by `down` times it. Results then depend on the order of episodes and on the evaluator's flag.
     """
 
-    def __init__(self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: SkipLevels) -> None:
-        self.settings, self.retrieval, self.levels = settings, retrieval, levels
-        self.s_min = levels.s_min
+    def __init__(
+        self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: tuple[float, float, float]
+    ) -> None:
+        """levels: the task's s_min between the bounds within which feedback moves it, cosines: (low, s_min, high)."""
+        self.settings, self.retrieval = settings, retrieval
+        self.low, self.s_min, self.high = levels
         self.in_a_row = 0
         self.ended: set[int] = set()  # seeds of stored episodes that were executed to their end
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
         """skip=similarity; it shares the retrieval of the method's proposer, where that retrieves."""
-        retrieval = retrieval_of(context)
+        proposer: Proposer | None = context.built["proposer"]
+        retrieval = proposer.sides["retrieval"] if isinstance(proposer, HybridProposer) else proposer
+        if not isinstance(retrieval, RetrievalProposer):
+            retrieval = RetrievalProposer(context.artifact("datastore"), context.target, neighbours=1, nodes=1)
         if settings.s_min is not None:
-            return cls(settings, retrieval, SkipLevels(settings.s_min, settings.s_min, settings.s_min))
-        levels = context.calibration.skip_levels(context.task, retrieval.datastore.content)
-        return cls(settings, retrieval, SkipLevels(*levels))
+            return cls(settings, retrieval, (settings.s_min,) * 3)
+        return cls(settings, retrieval, context.calibration.skip_levels(context.task, retrieval.datastore.content))
 
     def begin(self, task: str, seed: int) -> None:
         """An episode begins."""
@@ -181,9 +306,9 @@ class VerifySkip(Skip):
 
     def finish(self, success: bool) -> None:
         """An episode ended."""
-        span = self.levels.high - self.levels.low
+        span = self.high - self.low
         s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
-        self.s_min = min(self.levels.high, max(self.levels.low, s_min))
+        self.s_min = min(self.high, max(self.low, s_min))
 
     def take(self, chunk: Chunk) -> bool:
         """Fills the chunk with the best neighbour's tokens if it may be executed unverified -> whether it did."""

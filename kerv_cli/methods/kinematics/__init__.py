@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 _PREDICTION = "kerv_cli.methods.kinematics.prediction:"
 
-add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact")
+_sources = ("drafter", "datastore")  # each has a section
+add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact", needs=_sources)
 
 # --- predictors, and proposers that draft by them (§3.1, §6)
 

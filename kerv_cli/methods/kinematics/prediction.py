@@ -73,8 +73,8 @@ def motion_model(order: int, damping: float = 1.0) -> tuple[np.ndarray, np.ndarr
 
 
 @functools.lru_cache(maxsize=64)
-def filter_states(ratio: float, window: int, order: int, damping: float) -> tuple[np.ndarray, ...]:
-    """The filter's state after 1, 2, … `window` actions, each (order, m): column i is what action i contributes.
+def filter_state(ratio: float, window: int, order: int, damping: float) -> np.ndarray:
+    """The filter's state after `window` actions (order, window): column i is what action i contributes.
 
     ratio: q / r. The filter begins on the first action with state [a₀, 0(, 0)] and covariance r · I; it then predicts
     and updates once per further action.
@@ -86,7 +86,6 @@ def filter_states(ratio: float, window: int, order: int, damping: float) -> tupl
     model.F, model.H = transition, np.eye(1, order)
     model.P, model.Q, model.R = np.eye(order), ratio * noise, np.eye(1)  # in units of r
     state = np.eye(order, 1)
-    states = [state]
     for i in range(1, window):
         state = transition @ np.pad(state, ((0, 0), (0, 1)))
         model.predict()
@@ -94,14 +93,13 @@ def filter_states(ratio: float, window: int, order: int, damping: float) -> tupl
         innovation = -state[0]
         innovation[i] += 1.0
         state = state + model.K @ innovation[None]
-        states.append(state)
-    return tuple(states)
+    return state
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int, order: int = 2, damping: float = 1.0) -> np.ndarray:
     """(horizon, window): row h − 1 times the window, oldest first, is the filter's prediction h steps ahead."""
     transition, _ = motion_model(order, damping)
-    state = filter_states(q / r, window, order, damping)[-1]
+    state = filter_state(q / r, window, order, damping)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 

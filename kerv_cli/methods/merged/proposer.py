@@ -15,8 +15,8 @@ from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyProposer
+from kerv_cli.methods.heisd import RetrievalProposerSettings
 from kerv_cli.methods.merged import MergedProposerSettings
-from kerv_cli.methods.retrieval import RetrievalProposerSettings
 
 
 class MergedProposer(Proposer):

@@ -12,7 +12,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.record import Round
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.retrieval.datastore import prompt_key
+from kerv_cli.methods.heisd.datastore import prompt_key
 from kerv_cli.methods.self_cache import SelfCacheSettings
 
 KEY = ("scene", "proprioception")

@@ -12,7 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from kerv_cli.targets.compact.cache import Cache, Slots
+from kerv_cli.targets.attention import Cache, Slots
 
 _AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets of verifications; those of prefills follow with the first ones
 _WARM_UP = 3  # runs before a capture: libraries choose kernels and allocate workspaces

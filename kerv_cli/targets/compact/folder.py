@@ -31,8 +31,8 @@ def save_target(
         *("compact", asdict(target.settings), environment, target.actions, target.observation),
         *(target.cameras, target.words.words, provenance),
     )
-    known = {"state_range": state_range} if state_range else {}
-    return save_module(folder, "target", target, {**fields, **known}, stored)
+    measured = {"state_range": state_range} if state_range else {}
+    return save_module(folder, "target", target, {**fields, **measured}, stored)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:

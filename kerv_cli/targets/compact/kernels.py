@@ -76,6 +76,15 @@ def gain_of(norm: nn.RMSNorm) -> Tensor:
     return norm.weight * norm.weight.shape[0] ** 0.5
 
 
+def with_pairs(qkv: Tensor, channels: int) -> Tensor:
+    """qkv (3 E, I), heads of C = `channels` -> the same with each two numbers that RoPE rotates, of queries and keys,
+    side by side."""
+    width = qkv.shape[0] // 3
+    pairs = torch.arange(channels).view(2, -1).t().flatten()
+    qk = qkv[: 2 * width].unflatten(0, (-1, channels))[:, pairs].flatten(0, 1)
+    return torch.cat([qk, qkv[2 * width :]])
+
+
 class FastConv:
     """A convolution on channels-last maps of one fixed size, with a blocked weight and a fused function `pointwise`."""
 

@@ -30,7 +30,7 @@ class Packable(nn.Module):
 
     def pack_weights(self) -> Packed | None:
         """Packed weights of this module, which is frozen on a CPU; None where they would not be faster. `pack` asks for
-        them where its table has none of this type."""
+        those of types that it does not know."""
         return None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache, singledispatch
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,10 +21,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import load_state
-from kerv_cli.targets.compact.cache import Cache
 from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
-from kerv_cli.targets.compact.kernels import FastConv, FastLinear, RowNorm, gain_of, has_blocked_layouts
+from kerv_cli.targets.compact.kernels import FastConv, FastLinear, RowNorm, gain_of, has_blocked_layouts, with_pairs
 from kerv_cli.targets.compact.packable import Packable, Packed
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.row_step import RowLayer, RowLayers
@@ -80,13 +80,11 @@ class PackedLayer:
 
     def __init__(self, layer: Layer) -> None:
         self.heads, self.channels = layer.heads, layer.channels
-        width = self.width = layer.heads * layer.channels
+        self.width = layer.heads * layer.channels
         self.scale = layer.channels**-0.5
         self.norm = RowNorm(layer.attention_norm)
         qkv = layer.qkv.weight * gain_of(layer.attention_norm)
-        pairs = torch.arange(self.channels).view(2, -1).t().flatten()
-        qk = qkv[: 2 * width].view(2 * self.heads, self.channels, width)[:, pairs].reshape(2 * width, width)
-        self.qkv = FastLinear(torch.cat([qk, qkv[2 * width :]]))
+        self.qkv = FastLinear(with_pairs(qkv, self.channels))
         self.out = FastLinear(layer.out.weight)
         self.gate_up = FastLinear(layer.gate_up.weight * gain_of(layer.feed_norm))
         self.down = FastLinear(layer.down.weight)
@@ -290,27 +288,16 @@ class PackedPrompt(Packed):
         return [tokens for tokens, _ in views], [points for _, points in views]
 
 
-@singledispatch
 def packed_weights(part: Packable) -> Packed | None:
-    """Packed weights by the type of a frozen part on a CPU; None where they would not be faster. A type that is not
-    registered here gives its own."""
+    """Packed weights of a frozen part on a CPU, by its type; None where they would not be faster."""
+    if isinstance(part, LayerStack):
+        if part.norm.weight.dtype == torch.float32:
+            return PackedLayers(part)
+        if part.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
+            return BlockedLayers(part.rotary, part.layers, part.norm)  # type: ignore[arg-type]
+        return None
+    if isinstance(part, VisionEncoder):
+        return PackedVision(part) if has_blocked_layouts() and part.columns.dtype == torch.float32 else None
+    if isinstance(part, CompactTarget):
+        return PackedPrompt(part) if part.cameras and part.dtype == torch.float32 else None
     return part.pack_weights()
-
-
-@packed_weights.register
-def _(stack: LayerStack) -> Packed | None:
-    if stack.norm.weight.dtype == torch.float32:
-        return PackedLayers(stack)
-    if stack.norm.weight.dtype == torch.bfloat16 and multiplies_bfloat16():
-        return BlockedLayers(stack.rotary, stack.layers, stack.norm)  # type: ignore[arg-type]
-    return None
-
-
-@packed_weights.register
-def _(vision: VisionEncoder) -> Packed | None:
-    return PackedVision(vision) if has_blocked_layouts() and vision.columns.dtype == torch.float32 else None
-
-
-@packed_weights.register
-def _(target: CompactTarget) -> Packed | None:
-    return PackedPrompt(target) if target.cameras and target.dtype == torch.float32 else None

@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.cache import Cache
-from kerv_cli.targets.compact.kernels import RowNorm, has_blocked_layouts
+from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.compact.kernels import RowNorm, has_blocked_layouts, with_pairs
 from kerv_cli.targets.compact.trunk import Layer, PackedStack, Rotary
 
 ROWS = 32  # for which the layout is chosen; measured, 154 M weights: one row 27 ms, 31 rows 33 ms, 47 rows 41 ms
@@ -45,17 +45,15 @@ class BlockedLinear:
 
 
 class BlockedLayer:
-    """Packed weights of a decoder layer; RoPE's two halves lie side by side, as in `packed.PackedLayer`."""
+    """Packed weights of a decoder layer; the halves that RoPE rotates lie side by side, see `with_pairs`."""
 
     def __init__(self, layer: Layer) -> None:
         self.heads, self.channels = layer.heads, layer.channels
-        width = self.width = layer.heads * layer.channels
+        self.width = layer.heads * layer.channels
         self.scale = layer.channels**-0.5
         self.norm = RowNorm(layer.attention_norm)
         qkv = layer.qkv.weight.float() * full_gain(layer.attention_norm)
-        pairs = torch.arange(self.channels).view(2, -1).t().flatten()
-        qk = qkv[: 2 * width].view(2 * self.heads, self.channels, width)[:, pairs].reshape(2 * width, width)
-        self.qkv = BlockedLinear(torch.cat([qk, qkv[2 * width :]]))
+        self.qkv = BlockedLinear(with_pairs(qkv, self.channels))
         self.out = BlockedLinear(layer.out.weight)
         self.gate_up = BlockedLinear(layer.gate_up.weight.float() * full_gain(layer.feed_norm))
         self.down = BlockedLinear(layer.down.weight)

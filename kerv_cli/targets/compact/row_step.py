@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.targets.compact.cache import Cache
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.kernels import FastLinear, row_product
 
 

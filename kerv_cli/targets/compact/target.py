@@ -24,7 +24,7 @@ from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.base.views import frame_shape, views_of
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.compact.cache import Cache
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.features import (
     hand_features,
     places_of,
@@ -55,7 +55,9 @@ class CompactTarget(Packable):
 
     cameras: of a vision policy, the one whose images it reads; each of its views (`views_of`) has an encoder and vision
     tokens of its own. frame_shape: of those images. segments: slice of the prompt by the name of its part.
-    sha256: of the weights it was loaded with, else empty.
+    sha256: of the weights it was loaded with, else empty. chunk: H, control steps it was trained to decode at once.
+    parallel: whether it decodes by `parallel_pass` alone; it has not learnt to continue action tokens. width: E. heads,
+    feed_forward: attention heads and hidden units of the trunk's layers, and of a drafter's.
     """
 
     centre: Tensor
@@ -72,6 +74,8 @@ class CompactTarget(Packable):
         super().__init__()
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
+        self.chunk, self.parallel = s.chunk, s.parallel
+        self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
         self.cameras = (camera,) if s.observation == "vision" else ()
         views = len(views_of(camera)) if self.cameras else 0
         self.segments, self.frame_shape = _segments(s, views), frame_shape(camera, s.image_size)
@@ -103,31 +107,6 @@ class CompactTarget(Packable):
         if s.parallel:
             queries = self.embedding.weight.data.mean(0).repeat(s.chunk * actions.dofs, 1)
             self.queries = nn.Parameter(queries + 0.02 * torch.randn_like(queries))
-
-    @property
-    def chunk(self) -> int:
-        """H, control steps it was trained to decode at once."""
-        return self.settings.chunk
-
-    @property
-    def parallel(self) -> bool:
-        """Whether it decodes by `parallel_pass` alone; it has not learnt to continue action tokens."""
-        return self.settings.parallel
-
-    @property
-    def width(self) -> int:
-        """E."""
-        return self.settings.width
-
-    @property
-    def heads(self) -> int:
-        """A, attention heads of the trunk; a drafter has as many."""
-        return self.settings.heads
-
-    @property
-    def feed_forward(self) -> int:
-        """Hidden units of the trunk's feed-forward parts; a drafter has as many."""
-        return self.settings.feed_forward
 
     @property
     def max_prompt(self) -> int:
@@ -187,11 +166,8 @@ class CompactTarget(Packable):
                     f"the image of camera '{camera}' has shape {image.shape}, the target takes {self.frame_shape}"
                 )
             images = upload(image, self.device).permute(2, 0, 1)[None]
-        return Inputs(images, felt, state, self.words_of(observation.instruction))
-
-    def words_of(self, instruction: str) -> Tensor:
-        """The instruction's word ids (1, L) int64."""
-        return upload([self.words.encode(instruction, self.settings.instruction_tokens)], self.device)
+        words = self.words.encode(observation.instruction, self.settings.instruction_tokens)
+        return Inputs(images, felt, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
         """The prompt's embeddings (1, P, E); errors as `inputs`."""

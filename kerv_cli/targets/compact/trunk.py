@@ -16,8 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.engine.attention import attention_mask, rotate
-from kerv_cli.targets.compact.cache import Cache, Slots
+from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate
 from kerv_cli.targets.compact.captured import CapturedCache
 from kerv_cli.targets.compact.packable import Packable, Packed, wants_gradient
 

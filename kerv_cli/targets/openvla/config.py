@@ -81,6 +81,10 @@ class Language:
         """Channels of a head."""
         return self.hidden_size // self.num_attention_heads
 
+    def cache_sizes(self, batch: int, capacity: int) -> tuple[int, int, int, int, int]:
+        """The sizes of a `Cache` of this model: layers, B, heads of keys and values, slots, channels."""
+        return self.num_hidden_layers, batch, self.key_value_heads, capacity, self.channels
+
 
 @dataclass(frozen=True)
 class Shape:

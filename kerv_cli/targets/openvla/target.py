@@ -21,12 +21,12 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.transfer import upload
+from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.openvla.config import Shape, read_shape
 from kerv_cli.targets.openvla.image import Normalisation, check_image, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import OpenVLAModel, load_model, open_shards
 from kerv_cli.targets.openvla.prompt import Prompter
-from kerv_cli.targets.openvla.trunk import KeyValueCache
 
 
 @dataclass(frozen=True)
@@ -123,13 +123,13 @@ class OpenVLATarget:
         """Action tokens (B, T) int64 -> (B, T, E)."""
         return self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
 
-    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> KeyValueCache:
+    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
         """An empty cache. fixed: every forward has the same shapes; default: on CUDA."""
         fixed = self.action_rows.is_cuda if fixed is None else fixed
-        return KeyValueCache(self.shape.language, batch, capacity, self.action_rows, fixed)
+        return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
 
     def forward(
-        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
+        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """Hidden states (B, T, E) of x (B, T, E) at `positions` (T,), behind the cached tokens."""
         return self.model.language_model.model(x, positions, cache, seen)

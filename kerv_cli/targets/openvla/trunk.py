@@ -1,4 +1,4 @@
-"""The language model of OpenVLA: Llama-2 with a cache in fixed buffers and tree attention.
+"""The language model of OpenVLA: Llama-2 with tree attention over a key/value cache.
 
 Modules are named as in the published checkpoints, so that weights can stay where the file's memory map has them.
 
@@ -12,32 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.engine.attention import Buffered, attention_mask, rotate
+from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate
 from kerv_cli.targets.openvla.config import Language
-
-
-class KeyValueCache(Buffered):
-    """Keys and values of every layer (layers, 2, B, K, capacity, C); slots 0 … length − 1 are valid.
-
-    fixed: every forward writes at a tensor of slots and attends to the whole capacity under a mask, so that its shapes
-    do not depend on the length; otherwise slices are used, which is faster on a CPU.
-    """
-
-    def __init__(self, language: Language, batch: int, capacity: int, like: Tensor, fixed: bool) -> None:
-        shape = (language.num_hidden_layers, 2, batch, language.key_value_heads, capacity, language.channels)
-        self.buffer = like.new_zeros(shape)
-        self.capacity, self.fixed = capacity, fixed
-        self.length = 0
-
-    def write(self, layer: int, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """k, v (B, K, T, C) behind the valid slots -> the keys and values to attend to."""
-        keys, values = self.buffer[layer]
-        stop = self.length + k.shape[2]
-        if self.fixed:
-            slots = torch.arange(self.length, stop, device=k.device)
-            return keys.index_copy_(2, slots, k), values.index_copy_(2, slots, v)
-        keys[:, :, self.length : stop], values[:, :, self.length : stop] = k, v
-        return keys[:, :, :stop], values[:, :, :stop]
 
 
 def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -66,16 +42,17 @@ class LlamaAttention(nn.Module):
         x: Tensor,
         rotary: tuple[Tensor, Tensor],
         mask: Tensor | None,
-        cache: KeyValueCache | None = None,
-        layer: int = 0,
+        cache: Tensor | None = None,
+        slots: Slots | None = None,
     ) -> Tensor:
-        """x (B, T, E) -> (B, T, E); without a cache and a mask attention is causal."""
+        """x (B, T, E) -> (B, T, E); without a cache and a mask attention is causal. cache: (2, B, K, capacity, C) of
+        this layer, written at `slots`."""
         batch, tokens, width = x.shape
         q = rotate(self.q_proj(x).view(batch, tokens, self.heads, -1).transpose(1, 2), *rotary)
         k = rotate(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
         v = self.v_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2)
-        if cache is not None:
-            k, v = cache.write(layer, k, v)
+        if cache is not None and slots is not None:
+            k, v = slots.write(cache, k, v)
         causal = mask is None and tokens > 1
         shared = self.shared != self.heads
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
@@ -114,11 +91,11 @@ class LlamaLayer(nn.Module):
         x: Tensor,
         rotary: tuple[Tensor, Tensor],
         mask: Tensor | None,
-        cache: KeyValueCache | None = None,
-        layer: int = 0,
+        cache: Tensor | None = None,
+        slots: Slots | None = None,
     ) -> Tensor:
-        """x (B, T, E) -> (B, T, E)."""
-        x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, layer)
+        """x (B, T, E) -> (B, T, E); arguments as in `LlamaAttention`."""
+        x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
         return x + self.mlp(self.post_attention_layernorm(x))
 
 
@@ -127,7 +104,7 @@ def run_layers(
     language: Language,
     x: Tensor,
     positions: Tensor,
-    cache: KeyValueCache | None,
+    cache: Cache | None,
     seen: np.ndarray | Tensor | None,
     mask: Tensor | None = None,
 ) -> Tensor:
@@ -135,8 +112,9 @@ def run_layers(
     `attention_mask`; mask: one that is given instead."""
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
     mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
-    for number, layer in enumerate(layers):
-        x = layer(x, rotary, mask, cache, number)
+    slots = Slots(cache, x.shape[1]) if cache is not None else None
+    for i, layer in enumerate(layers):
+        x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
     if cache is not None:
         cache.length += x.shape[1]
     return x
@@ -153,7 +131,7 @@ class LlamaModel(nn.Module):
         self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
 
     def forward(
-        self, x: Tensor, positions: Tensor, cache: KeyValueCache | None = None, seen: np.ndarray | Tensor | None = None
+        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
         """x (B, T, E) at `positions` (T,) -> hidden states behind the final norm (B, T, E)."""
         return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))

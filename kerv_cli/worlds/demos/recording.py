@@ -10,6 +10,7 @@ On disk: `recording.json` (configuration and versions), `episodes/<task>/<seed:0
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
@@ -27,13 +28,12 @@ from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.processes import begin_worker, check_workers
-from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.camera import CameraConfig, choose_backend
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, entry_of, episode_path, totals, with_environment
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
-from kerv_cli.worlds.spec import EnvironmentSpec, Expert, World
+from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 _SEEDS_PER_JOB = 5
 _EXTRA_ATTEMPTS = 20
@@ -155,7 +155,9 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None 
         labels.append(label)
         executed.append(action)
         observation = world.step(action)
-    labels += _tail_labels(world, expert, observation, config.tail)
+    for _ in range(config.tail):
+        labels.append(expert(observation))
+        observation = world.step(labels[-1])
     return DemoEpisode(
         task=world.task,
         seed=seed,
@@ -168,14 +170,6 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None 
         executed=np.array(executed, dtype=np.float32),
         initial_state=world.initial_state,
     )
-
-
-def _tail_labels(world: World, expert: Expert, observation: Observation, tail: int) -> list[NDArray[np.float64]]:
-    labels = []
-    for _ in range(tail):
-        labels.append(expert(observation))
-        observation = world.step(labels[-1])
-    return labels
 
 
 def record(
@@ -241,7 +235,9 @@ def _collect(
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
             if on_progress is not None:
                 on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
-        seeds = {task: _next_seeds(config, len(entries[task]), seeds[task]) for task in config.tasks}
+        # one new seed per failure, in order: the outcome does not depend on how the work is divided
+        stops = {task: block.stop + config.episodes - len(entries[task]) for task, block in seeds.items()}
+        seeds = {task: range(block.stop, min(stops[task], config.seed_limit)) for task, block in seeds.items()}
     return entries, failed
 
 
@@ -251,11 +247,6 @@ def _jobs(seeds: Mapping[str, range]) -> list[tuple[str, range]]:
         for task, block in seeds.items()
         for start in range(0, len(block), _SEEDS_PER_JOB)
     ]
-
-
-def _next_seeds(config: DemoConfig, successes: int, last: range) -> range:
-    # One new seed per failure, in order: the outcome does not depend on how the work is divided.
-    return range(last.stop, min(last.stop + config.episodes - successes, config.seed_limit))
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
@@ -344,8 +335,10 @@ def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Act
     path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
     if failure.exists():
         return None
-    episode = _valid_episode(path, task, seed, config.spec)
-    if episode is None:
+    episode = None
+    with contextlib.suppress(CheckpointError):  # missing or damaged: it is recorded anew
+        episode = load_episode(path, config.spec.actions, config.spec.observation)
+    if episode is None or (episode.task, episode.seed) != (task, seed):
         episode = run_expert(_world_for(task, config), seed, config, actor)
         if episode is None:
             write_json(failure, {"task": task, "seed": seed, "perturbed": is_perturbed(seed, config.perturbed)})
@@ -367,11 +360,3 @@ def _release_world() -> None:
     if _world is not None:
         _world.close()
     _world = None
-
-
-def _valid_episode(path: Path, task: str, seed: int, spec: EnvironmentSpec) -> DemoEpisode | None:
-    try:
-        episode = load_episode(path, spec.actions, spec.observation)
-    except CheckpointError:
-        return None
-    return episode if (episode.task, episode.seed) == (task, seed) else None

@@ -66,7 +66,7 @@ def check(settings: StressSettings, spec: EnvironmentSpec) -> None:
     """
     if not settings.active:
         return
-    able = set(getattr(load(spec.world_class), STRESSABLE, ()))
+    able = set(getattr(load(spec.world_class), STRESSABLE, ())) if spec.world_class else set()
     if any(group.name == "position" for group in spec.actions.groups):
         able.add("position")
     for need in needs_of(settings.kind):

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from kerv_cli.worlds.stress.base import ModelChanges, Stress, level_of
-from kerv_cli.worlds.stress.turning import turned_quaternion
 from kerv_cli.worlds.vectors import unit_vector
 
 
@@ -36,4 +36,6 @@ class CameraJitter(Stress):
         changes.keep(model.cam_pos, model.cam_quat)
         for camera in range(model.ncam):
             model.cam_pos[camera] += unit_vector(random, 3) * level.metres
-            model.cam_quat[camera] = turned_quaternion(random, model.cam_quat[camera], np.deg2rad(level.degrees))
+            turn = Rotation.from_rotvec(unit_vector(random, 3) * np.deg2rad(level.degrees))  # in the camera's own frame
+            turned = Rotation.from_quat(model.cam_quat[camera], scalar_first=True) * turn
+            model.cam_quat[camera] = turned.as_quat(scalar_first=True)

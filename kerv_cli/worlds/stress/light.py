@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from kerv_cli.worlds.stress.base import ModelChanges, Stress, either, level_of
-from kerv_cli.worlds.stress.turning import turned
+from kerv_cli.worlds.vectors import unit_vector
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,6 @@ class Light(Stress):
         for strength in strengths:
             strength[...] *= gain
         for lamp in range(model.nlight):
-            turn = turned(random, np.deg2rad(level.degrees))
+            turn = Rotation.from_rotvec(unit_vector(random, 3) * np.deg2rad(level.degrees)).as_matrix()
             for vector in (model.light_dir[lamp], model.light_pos[lamp]):
                 vector[:] = sum((turn * vector).T)  # in this order on every CPU; `turn @ vector` is OpenBLAS's

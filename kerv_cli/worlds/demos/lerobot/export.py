@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, visible, write_folder, write_json
 from kerv_cli.base.views import VIEWS
-from kerv_cli.worlds import spec_of
+from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import encode_png
@@ -116,7 +116,7 @@ class Export:
         self.episodes.append(
             {
                 "episode_index": len(self.episodes),
-                "tasks": [_instruction(episode.task)],
+                "tasks": [instruction_of(episode.task)],
                 "length": len(episode.frames),
                 "data/chunk_index": 0,
                 "data/file_index": file,
@@ -134,7 +134,8 @@ class Export:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
-            with atomic_path(layout.data_path(self.folder, file)) as temporary, contextlib.ExitStack() as stack:
+            path = self.folder / layout.DATA.format(chunk_index=0, file_index=file)
+            with atomic_path(path) as temporary, contextlib.ExitStack() as stack:
                 writer, size = None, 0
                 while index < total and size <= layout.FILE_MB * 2**20:
                     table = self.table(self.dataset.load(index), file)
@@ -151,14 +152,21 @@ class Export:
         manifest = self.dataset.manifest
         observation, actions = manifest.observation, manifest.actions
         image = {"dtype": "image", "shape": list(self.size), "names": ["height", "width", "channels"]}
+        vectors = {
+            layout.STATE: observation.proprioception,
+            layout.ENVIRONMENT: [f"state_{i}" for i in range(observation.state)],
+            layout.ACTION: actions.names,
+            layout.EXECUTED: actions.names,
+        }
         features = {
             **dict.fromkeys(self.image_keys, image),
-            layout.STATE: layout.numbers("float32", list(observation.proprioception)),
-            layout.ENVIRONMENT: layout.numbers("float32", [f"state_{i}" for i in range(observation.state)]),
-            layout.ACTION: layout.numbers("float32", list(actions.names)),
-            layout.EXECUTED: layout.numbers("float32", list(actions.names)),
+            **{
+                name: {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+                for name, names in vectors.items()
+            },
             layout.DONE: {"dtype": "bool", "shape": [1], "names": None},
-            **layout.counters(),
+            **{name: {"dtype": "int64", "shape": [1], "names": None} for name in layout.COUNTERS},
+            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         }
         return {
             "codebase_version": layout.VERSION,
@@ -178,7 +186,7 @@ class Export:
 
     def write_meta(self) -> None:
         """Tasks, episodes, statistics and, last, the description: without it there is no dataset."""
-        names = pd.Index([_instruction(task) for task in self.tasks], name="task")
+        names = pd.Index([instruction_of(task) for task in self.tasks], name="task")
         with atomic_path(self.folder / layout.TASKS) as temporary:
             pd.DataFrame({"task_index": list(self.tasks.values())}, index=names).to_parquet(temporary)
         with atomic_path(self.folder / layout.EPISODES.format(chunk_index=0, file_index=0)) as temporary:
@@ -198,7 +206,7 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
     config = dataset.manifest.config
     rate = dataset.manifest.actions.control_hz / int(config["frame_stride"])
     names = dict.fromkeys(entry.task for entry in dataset.episodes)
-    if len({_instruction(name) for name in names}) < len(names):
+    if len({instruction_of(name) for name in names}) < len(names):
         raise UsageError("two tasks have the same instruction, which LeRobot tells tasks apart by: export them apart")
     tasks = {name: number for number, name in enumerate(names)}
     results: list[Export] = []
@@ -210,7 +218,3 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
 
     write_folder(folder, fill, replace=True)
     return results[0]
-
-
-def _instruction(task: str) -> str:
-    return spec_of(task).task(task).instruction

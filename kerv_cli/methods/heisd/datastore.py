@@ -1,5 +1,5 @@
-"""Retrieval: action chunks of the demonstrations, searched by the target's own encoding of the observation
-(docs/methods.md §4.1, §4.2; HeiSD).
+"""The datastore: action chunks of the demonstrations, searched by the target's own encoding of the observation
+(docs/methods.md §4.1; HeiSD).
 
 The key is the target's own prompt, pooled: of each chosen segment the mean token, L2-normalised, and the whole
 normalised again; optionally projected onto the directions that hold nearly all of the keys. The default is the scene
@@ -14,12 +14,10 @@ On disk: `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `project
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from heapq import heappop, heappush
-from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -30,21 +28,17 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.files import read_table, regular
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.draft import ROOT, Draft
-from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.engine.transfer import read
 from kerv_cli.methods.artifacts import Artifact, Request
-from kerv_cli.methods.context import Context
-from kerv_cli.methods.retrieval.search import ExactIndex, Index, best
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
-CROSS = 0.1  # probability that a path changes to other neighbours
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
+ROUNDING = 1e-5  # bounds the rounding of a float32 product of unit vectors
+OUTLINE = 24  # directions that hold nearly all of a shard's keys: of MT10's, all but 5e-4 of their squared length
+SAMPLE = 256  # rows that the directions are taken from
 
 
 @dataclass(frozen=True)
@@ -136,6 +130,94 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
             )
 
 
+class Index(Protocol):
+    """Finds candidate rows; it may return more than k, `best` ranks them."""
+
+    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
+        """Rows, ascending, among which are the task's k best for key (d,) float32; `without`: seed passed over."""
+
+
+def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The k best of `rows`, ascending -> (rows, scores float32), best first, equal scores in the rows' order.
+
+    The last bit of a float32 product depends on a row's place in the matrix, so rows are compared in float64.
+    """
+    scores = np.einsum("ij,j->i", vectors[rows].astype(np.float64), key.astype(np.float64)).astype(np.float32)
+    order = np.argsort(-scores, kind="stable")[:k]
+    return rows[order], scores[order]
+
+
+def slack(longest: float, key: np.ndarray) -> float:
+    """Bound of the rounding error between two float32 scores. longest: norm of the longest vector. key: (d,)."""
+    return ROUNDING * longest * math.sqrt(key @ key)
+
+
+def length_of_longest(vectors: np.ndarray) -> float:
+    """Largest Euclidean norm among the rows of vectors (n, d); 0 without rows."""
+    return float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A shard projected on p orthonormal directions: v = inside + rest, so v · key ≤ inside · inside' + |rest| |rest'|,
+    primes for the key's parts."""
+
+    vectors: np.ndarray  # (n, d) float32
+    directions: np.ndarray  # (d, p)
+    outline: np.ndarray  # (p + 1, n): coordinates inside, then the length of the rest
+    longest: float
+
+    @classmethod
+    def of(cls, vectors: np.ndarray) -> Outline:
+        """Outline of vectors (n, d): directions from the SVD of an evenly spaced sample of rows."""
+        sample = vectors[:: max(1, len(vectors) // SAMPLE)]
+        directions = np.linalg.svd(sample, full_matrices=False)[2][:OUTLINE].T
+        inside = vectors @ directions
+        rest = np.linalg.norm(vectors - inside @ directions.T, axis=1)
+        outline = np.vstack([inside.T, rest])
+        return cls(vectors, np.ascontiguousarray(directions), outline, length_of_longest(vectors))
+
+    def candidates(self, key: np.ndarray, k: int, passed: np.ndarray | None) -> np.ndarray:
+        """Rows, ascending, among which are the k best for key (d,). passed: (n,) bool, rows passed over."""
+        inside = key @ self.directions
+        rest = key - self.directions @ inside
+        bounds = np.concatenate((inside, [math.sqrt(rest @ rest)]), dtype=np.float32) @ self.outline
+        if passed is not None:
+            bounds[passed] = -np.inf
+        if k >= len(bounds) - (0 if passed is None else np.count_nonzero(passed)):
+            return np.flatnonzero(bounds > -np.inf)
+        first = (bounds >= np.partition(bounds, -k)[-k]).nonzero()[0]
+        least = (self.vectors[first] @ key).min()  # k rows score this much
+        return (bounds >= least - slack(self.longest, key)).nonzero()[0]
+
+
+class ExactIndex:
+    """datastore=exact, the default: in this process, numpy.
+
+    Between two searches the target's weights displace the vectors from the processor's cache, so reading all of them
+    costs memory bandwidth. An outline, a few numbers per row, gives an upper bound of its score; only the vectors whose
+    bound reaches the k-th best score are read.
+    """
+
+    def __init__(
+        self,
+        vectors: np.ndarray,
+        seeds: np.ndarray,
+        shards: Mapping[str, slice],
+        digest: str = "",
+        settings: Any = None,
+    ) -> None:
+        """vectors (rows, d) float32, seeds (rows,), shards: task -> rows; digest, search: read by other searches."""
+        self.seeds, self.shards = seeds, shards
+        self.outlines = {task: Outline.of(vectors[shard]) for task, shard in shards.items()}
+
+    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
+        """See `Index`; from the task's outline."""
+        shard = self.shards[task]
+        passed = None if without is None else self.seeds[shard] == without
+        return self.outlines[task].candidates(key, k, passed) + shard.start
+
+
 @dataclass(frozen=True)
 class Neighbours:
     """The k nearest entries, best first; equal scores in the datastore's order."""
@@ -191,10 +273,6 @@ class Datastore:
     def content(self) -> str:
         """SHA-256 over keys, chunks and target, see `Manifest.content`."""
         return self.manifest.content
-
-    def key(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
-        """prompt (1, P, E) of the target -> (d,) float32."""
-        return self.key_of(self.pooled(prompt, target).cpu().numpy())
 
     def pooled(self, prompt: Tensor, target: ReadableTarget) -> Tensor:
         """prompt (1, P, E) of the target -> pooled (p,) float32 for `key_of`, on the device."""
@@ -269,148 +347,3 @@ class DatastoreArtifact(Artifact[Manifest]):
     def load(self, path: Path, request: Request) -> Datastore:
         """The datastore, opened."""
         return Datastore.open(path, request.description, request.search)
-
-
-def neighbour_tree(
-    chunks: np.ndarray,
-    start: int,
-    space: ActionSpace,
-    nodes: int = 50,
-    depth: int | None = None,
-    cross: float = CROSS,
-) -> Draft:
-    """The neighbours' chunks behind `start` committed tokens as one tree by kinematic group (docs/methods.md §4.2).
-
-    chunks: (k, N) tokens, best neighbour first. A path is made of whole groups: behind each it may go on with any
-    neighbour's next one, but a group of strict DoFs always comes from a neighbour that has the group before it, too.
-    The tree has at most `nodes` nodes and reaches `depth` tokens deep (default: to the chunk's end).
-
-    Within `nodes` the most probable groups are kept (*ours*): the i-th neighbour weighs 1 / i, and a path changes to
-    other neighbours with probability `cross`; 0 merges whole chunks only.
-    """
-    stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
-    continuations = _Continuations(chunks.tolist(), list(space.segments(start, stop)), cross)
-    tokens: list[int] = []
-    parents: list[int] = []
-    children: dict[tuple[int, int], int] = {}
-    waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
-    order = count()
-
-    def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
-        for surprise, group, members, common in continuations.on(level, last, whole):
-            heappush(waiting, (cost + surprise, next(order), parent, level, group, members, common))
-
-    offer(ROOT, 0, continuations.everyone, continuations.everyone, 0.0)
-    while waiting and len(tokens) < nodes:
-        cost, _, node, level, group, last, whole = heappop(waiting)
-        if len(tokens) + len(group) - _shared(children, node, group) > nodes:
-            continue  # a group is in the tree as a whole or not at all
-        for token in group:
-            if (node, token) not in children:
-                children[node, token] = len(tokens)
-                tokens.append(token)
-                parents.append(node)
-            node = children[node, token]
-        offer(node, level + 1, last, whole, cost)
-    return Draft.of(tokens, parents)
-
-
-class _Weights(dict[int, float]):
-    """Bit set of neighbours -> sum of their weights; the i-th neighbour, counted from 1, weighs 1 / i."""
-
-    def __missing__(self, members: int) -> float:
-        weight = sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
-        self[members] = weight
-        return weight
-
-
-class _Continuations:
-    """The groups that may follow a path. A path is described by two sets of neighbours: `last`, those that have its
-    last group, and `whole`, those among them that have all its groups."""
-
-    def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
-        self.everyone = (1 << len(rows)) - 1
-        self.cross, self.weights = cross, _Weights()
-        self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
-        for first, last, strict in cuts:
-            givers: dict[tuple[int, ...], int] = {}
-            for i, row in enumerate(rows):
-                group = tuple(row[first:last])
-                givers[group] = givers.get(group, 0) | 1 << i
-            self.levels.append((strict, list(givers.items())))
-
-    def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
-        """Yields (−log probability, the group's tokens, the two sets of the lengthened path), best neighbour first."""
-        if level == len(self.levels):
-            return
-        strict, givers = self.levels[level]
-        pool = self.everyone
-        if strict:
-            pool = last
-            givers = [(group, members & last) for group, members in givers if members & last]
-            givers.sort(key=lambda way: way[1] & -way[1])
-        weights, cross = self.weights, self.cross
-        of_whole, of_pool = weights[whole], weights[pool]
-        for group, members in givers:
-            common = members & whole
-            probability = (1 - cross) * weights[common] / of_whole + cross * weights[members] / of_pool
-            if probability > 0:
-                yield -math.log(probability), group, members, common or members
-
-
-def _shared(children: Mapping[tuple[int, int], int], node: int, group: Sequence[int]) -> int:
-    """Number of the group's leading tokens that the tree already has below `node`."""
-    for depth, token in enumerate(group):
-        if (node, token) not in children:
-            return depth
-        node = children[node, token]
-    return len(group)
-
-
-class RetrievalProposer(ChainProposer):
-    """The nearest stored chunks of the task, merged by kinematic group (docs/methods.md §4.2)."""
-
-    name = "retrieval"
-
-    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
-        self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
-        self.waits = target.device.type == "cpu"
-        self._nearest: tuple[Chunk, Neighbours] | None = None
-
-    @classmethod
-    def build(cls, settings: Any, context: Context) -> RetrievalProposer:
-        """proposer=retrieval, and retrieval's side of hybrid: settings of either have neighbours and nodes."""
-        return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
-
-    @classmethod
-    def of_nearest(cls, context: Context) -> RetrievalProposer:
-        """Retrieval of the one best chunk."""
-        return cls(context.artifact("datastore"), context.target, 1, 1)
-
-    def neighbours(self, chunk: Chunk) -> Neighbours:
-        """The task's nearest entries to this observation; searched once per chunk. Sets `chunk.similarity`."""
-        if self._nearest is None or self._nearest[0] is not chunk:
-            self._search(chunk, read(self.datastore.pooled(chunk.prompt, self.target))[0])
-        assert self._nearest is not None
-        return self._nearest[1]
-
-    def prepare(self, chunk: Chunk) -> None:
-        """Adds the pooled prompt, which the search key is made of, to `chunk.reads`."""
-        if not self.waits and (self._nearest is None or self._nearest[0] is not chunk):
-            vector = self.datastore.pooled(chunk.prompt, self.target)
-            chunk.reads.append((vector, lambda pooled: self._search(chunk, pooled)))
-
-    def _search(self, chunk: Chunk, pooled: np.ndarray) -> None:
-        key = self.datastore.key_of(pooled.astype(np.float32, copy=False))
-        self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
-        chunk.similarity = float(self._nearest[1].similarity[0])
-
-    def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The neighbours' chunks as one tree, merged by kinematic group."""
-        chunks = self.neighbours(chunk).chunks[:, : chunk.size]
-        return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
-
-    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Each neighbour's remaining tokens as a chain of its own, best neighbour first."""
-        start = len(chunk.tokens)
-        return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()

@@ -1,8 +1,8 @@
 """Search by Qdrant (docs/methods.md §4.1): its engine in this process, or a server. The extra: kerv[qdrant].
 
-Qdrant searches exactly within a task. Its results are ranked again by `search.best`, so that the neighbours equal those
-of exact search. The engine keeps its files in a temporary folder of this process; a server's collection is named by the
-datastore's hash and is reused by later processes.
+Qdrant searches exactly within a task. Its results are ranked again by `datastore.best`, so that the neighbours equal
+those of exact search. The engine keeps its files in a temporary folder of this process; a server's collection is named
+by the datastore's hash and is reused by later processes.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from kerv_cli.base.errors import StorageError, UsageError
-from kerv_cli.methods.retrieval import QdrantSearchSettings
-from kerv_cli.methods.retrieval.search import best, length_of_longest, slack
+from kerv_cli.methods.heisd import QdrantSearchSettings
+from kerv_cli.methods.heisd.datastore import best, length_of_longest, slack
 
 BATCH = 131_072  # numbers sent at once: below a server's limit for one request
 MARGIN = 8  # rows requested beyond k, so that ties at the k-th place seldom need a second search
@@ -91,15 +91,10 @@ class QdrantIndex:
 def qdrant_index(
     vectors: np.ndarray, seeds: np.ndarray, shards: Mapping[str, slice], digest: str, settings: QdrantSearchSettings
 ) -> QdrantIndex:
-    """datastore=qdrant; errors as `QdrantIndex`."""
-    check_qdrant(settings)
-    return QdrantIndex(vectors, seeds, shards, digest, settings.url)
-
-
-def check_qdrant(settings: QdrantSearchSettings) -> None:
-    """Raises UsageError where the packages of the extra are not installed."""
+    """datastore=qdrant; errors as `QdrantIndex`, and UsageError where the packages of the extra are not installed."""
     if find_spec("qdrant_client" if settings.url else "qdrant_edge") is None:
         raise UsageError("datastore=qdrant needs the extra: pip install 'kerv[qdrant]'")
+    return QdrantIndex(vectors, seeds, shards, digest, settings.url)
 
 
 class EmbeddedEngine:
