@@ -20,7 +20,7 @@ import pandas as pd
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.places import check_writable, results_dir
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import ServeSettings
 from kerv_cli.cli.rollout import planned_cells, run_cells
 from kerv_cli.cli.sweep import covered_cells, run_covered
@@ -101,10 +101,8 @@ def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
     """
     typed = as_words(*words, **settings)
     resolved = resolve_rollout(typed, grid)
-    results = next(iter(resolved.settings.values())).results
-    check_writable(results)
     arguments = ["rollout", *(["-m"] if grid else []), *typed]
-    return Study(run_cells(resolved, planned_cells(resolved), results, arguments))
+    return Study(run_cells(resolved, planned_cells(resolved), arguments))
 
 
 def sweep(study: str | Path, *words: str, **settings: Any) -> Study:

@@ -204,15 +204,16 @@ def rerun(
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
     if run.command[:2] == ("runs", "import"):
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
-    from kerv_cli.cli.again import plan_again, run_again
+    from kerv_cli.cli.again import cells_again, run_again, store_again
     from kerv_cli.report.compare import same_tokens
 
-    again = plan_again(run, results)
+    cells = cells_again(run, results)
+    store = store_again(run, results, cells)
     if plan:
-        episodes = sum(len(cell.seeds) for cell in again.cells)
-        typer.echo(f"{run.id} again as {again.store.name}: {len(again.cells)} cells, {episodes} episodes")
+        episodes = sum(len(cell.seeds) for cell in cells)
+        typer.echo(f"{run.id} again as {store.name}: {len(cells)} cells, {episodes} episodes")
         return
-    entry = run_again(again, results)
+    entry = run_again(run, store, cells)
     same, shared = same_tokens(run, entry)
     if as_json:
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})

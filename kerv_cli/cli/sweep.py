@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.errors import Interrupted
-from kerv_cli.base.places import check_writable
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
 
     from pandas import DataFrame
 
-    from kerv_cli.base.settings import RuntimeSettings
     from kerv_cli.lab.events import Outcome
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
@@ -58,7 +55,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         return
     store, covered = covered_cells(resolved, words)
     if plan:
-        print_sweep_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
+        print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
         return
     outcome = run_covered(resolved, covered, store, words)
     _tell(outcome, resolved, covered.cells, store, words, as_json)
@@ -79,19 +76,15 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore
     """The study's store, and its cells as those on disk and those to run, after everything that can be refused without
     running was. Says what has no effect and which cells disagree. words: of the command."""
     from kerv_cli.cli.rollout import planned_cells
-    from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import idle_overrides
     from kerv_cli.lab.reuse import Stock, cover, disagreements
     from kerv_cli.lab.store import StudyStore
 
     print_notes(idle_overrides(resolved))
-    first = next(iter(resolved.settings.values()))
-    check_executor(first.runtime)
-    check_writable(first.results)
     cells = planned_cells(resolved)
-    store = StudyStore(first.results, resolved.study.name)
+    store = StudyStore(resolved.first.results, resolved.study.name)
     stock = Stock(store)
-    covered = cover(cells, stock, resolved.rerun, store.interrupted_since(["sweep", *words]))
+    covered = cover(cells, stock, resolved.sweep.rerun, store.interrupted_since(["sweep", *words]))
     _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
     return store, covered
 
@@ -151,35 +144,19 @@ def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json:
 
 def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
     """Runs what is not complete yet; says what differs from what it was before. Raises Interrupted: Ctrl-C."""
-    from kerv_cli.cli.progress import ProgressDisplay
-    from kerv_cli.lab.execute import execute
+    from kerv_cli.cli.running import running
     from kerv_cli.lab.reuse import Stock, disagreements, take_over
-    from kerv_cli.lab.run import CellRunner, reference_decode
-    from kerv_cli.report.viewing import save_recording
 
-    runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
     cells = covered.cells
     take_over(store, covered)
-    if resolved.until == "done":
+    if resolved.sweep.until == "done":
         store.write_plan(resolved.study, cells)
     store.note_command(["sweep", *words])
-    here = runtime.executor == "local" and runtime.workers == 1
-    with ProgressDisplay(console(stderr=True)) as display:
-        runner = CellRunner(store.rollouts, save_recording, on_step=display.on_step if here else None)
-        try:
-            if resolved.until == "decided":
-                outcome = _until_decided(resolved, cells, store, lambda part: execute(
-                    part, runner, store, runtime, display, reference_decode))  # fmt: skip
-            else:
-                outcome = execute(cells, runner, store, runtime, display, reference_decode)
-        except KeyboardInterrupt:
-            count = sum(store.has_cell(cell.id) for cell in cells)
-            raise Interrupted(
-                f"interrupted: {count} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
-            ) from None
+    with running(store, cells, resolved.first.runtime) as run:
+        outcome = _until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
     if not outcome.failed:
         store.note_finished()
-    if resolved.rerun != "never":
+    if resolved.sweep.rerun != "never":
         _warn(disagreements(outcome.done, Stock(store, others=False)))
     return outcome
 
@@ -192,9 +169,9 @@ def _until_decided(
     from kerv_cli.report import decide
     from kerv_cli.report.tables import load_study
 
-    study, margin = resolved.study, resolved.loss / 100
+    study, margin = resolved.study, resolved.sweep.loss / 100
     blocks = decide.looks_of(cells, study.block)
-    typer.echo(decide.rule(resolved.loss, len(blocks)), err=True)
+    typer.echo(decide.rule(resolved.sweep.loss, len(blocks)), err=True)
     latest: dict[str, decide.Verdict] = {}
     planned: list[Cell] = []
     total = Outcome()
@@ -210,7 +187,7 @@ def _until_decided(
         verdicts = decide.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
         typer.echo(f"look {look} of {len(blocks)}: {decide.summary(verdicts)}", err=True)
         latest |= {verdict.label: verdict for verdict in verdicts}
-        decide.write_verdicts(store.root, latest, resolved.loss, len(blocks))
+        decide.write_verdicts(store.root, latest, resolved.sweep.loss, len(blocks))
         open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decide.OPEN]
         if not open_labels:
             break
@@ -274,7 +251,7 @@ def _tell(
                 from kerv_cli.report.report import report
 
                 report(store.root.parent.parent, store.name)
-            tell_end(table, store, resolved.loss)
+            tell_end(table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder, Watcher
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
-from kerv_cli.lab.resolve import known_tasks, tasks_of
+from kerv_cli.lab.resolve import tasks_of
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.worlds import spec_of
@@ -43,12 +42,6 @@ def artifacts_of(settings: RolloutSettings | ServeSettings) -> Artifacts:
 def is_expert(settings: RolloutSettings) -> bool:
     """Whether the policy is the environment's scripted expert."""
     return settings.policy.kind == EXPERT
-
-
-def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
-    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
-    trained_on = known_tasks(settings)
-    return [task for task in tasks if trained_on and task not in trained_on]
 
 
 def check(settings: RolloutSettings) -> dict[str, str]:
