@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,8 +22,8 @@ from kerv_cli.base.settings import (
     TrainTargetSettings,
 )
 from kerv_cli.base.spaces import Observation
-from kerv_cli.base.views import frame_shape
 from kerv_cli.bench.machine import median_seconds
+from kerv_cli.lab.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
@@ -216,9 +215,7 @@ def _drafter(target: Any) -> Drafter:
 
 def blank(target: Any) -> Observation:
     """A black image and zeros."""
-    size, space = target.settings.image_size, target.observation
-    images = {name: np.zeros(frame_shape(name, size), np.uint8) for name in target.cameras}
-    return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+    return still_observation(target, target.observation, target.settings.image_size)
 
 
 def fastest(device: torch.device) -> torch.dtype:

@@ -30,7 +30,7 @@ from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, EpisodeRecord
 from kerv_cli.lab.identity import ENGINE, OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
-from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, table_bytes
+from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row
 from kerv_cli.lab.served import Served, path_of, read_served
 from kerv_cli.lab.store import StudyStore
 
@@ -311,14 +311,13 @@ class _SidePlan:
     def write(self, store: StudyStore) -> None:
         """Writes the cells that have episodes."""
         for cell, one, episodes in self.there:
-            kept = [self._served(one, episode) for episode in episodes]
-            pairs = list(zip(episodes, kept, strict=True))
-            found = [_row(cell, one, *pair) for pair in pairs]
+            pairs = [(episode, self._served(one, episode)) for episode in episodes]
+            rows = [_row(cell, one, *pair) for pair in pairs]
             tables = {
-                "episodes.parquet": table_bytes(pa.Table.from_pylist(found, schema=EPISODE_SCHEMA)),
-                "decodes.parquet": table_bytes(_decodes(cell, pairs)),
+                "episodes.parquet": pa.Table.from_pylist(rows, schema=EPISODE_SCHEMA),
+                "decodes.parquet": _decodes(cell, pairs),
             }
-            seconds = sum(row["seconds"] for row in found)
+            seconds = sum(row["seconds"] for row in rows)
             store.write_tables(cell, tables, self._status(one, episodes, seconds))
 
     def _served(self, one: Evaluation, episode: Episode) -> Served | None:

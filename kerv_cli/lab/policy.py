@@ -39,11 +39,6 @@ def artifacts_of(settings: RolloutSettings | ServeSettings) -> Artifacts:
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
-def is_expert(settings: RolloutSettings) -> bool:
-    """Whether the policy is the environment's scripted expert."""
-    return settings.policy.kind == EXPERT
-
-
 def check(settings: RolloutSettings) -> dict[str, str]:
     """Refuses settings that cannot run, before anything heavy starts -> the identity of their results: hashes of
     everything that determines these besides the settings, and what is observed.
@@ -57,7 +52,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     check_stress(settings.world.stress, spec)
-    if is_expert(settings):
+    if settings.policy.kind == EXPERT:
         _check_expert(settings, spec)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
@@ -163,7 +158,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         UsageError, CheckpointError: as `check`.
     """
     spec = spec_of(task)
-    if is_expert(settings):
+    if settings.policy.kind == EXPERT:
         decoder: ActionDecoder = ExpertDecoder()
     else:
         artifacts = artifacts_of(settings)
@@ -194,7 +189,7 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
     """
     if settings.rollout.clock == WAITS:
         return None
-    target = None if is_expert(settings) else artifacts_of(settings).description
+    target = None if settings.policy.kind == EXPERT else artifacts_of(settings).description
     measured = 0.0
     if clock.calibrates(settings):
         runtime = settings.runtime

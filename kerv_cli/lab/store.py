@@ -339,11 +339,12 @@ class StudyStore:
         }
         return self.write_tables(cell, rows.tables_of(records, at, cell.repeat), {**sums, **status})
 
-    def write_tables(self, cell: Cell, tables: Mapping[str, bytes], status: Mapping[str, Any]) -> bool:
+    def write_tables(self, cell: Cell, tables: Mapping[str, pa.Table], status: Mapping[str, Any]) -> bool:
         """Writes a complete cell of these tables; returns and raises as `write_cell`. status: its entries, sums over
         the episodes among them."""
         config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
-        files = {"config.yaml": to_yaml(config).encode(), **tables}
+        files = {"config.yaml": to_yaml(config).encode()}
+        files |= {name: rows.table_bytes(table) for name, table in tables.items()}
         hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
         full: dict[str, Any] = {"format": FORMAT, "state": "complete", **status, "files": hashes}
         full["sha256"] = _seal(full)
