@@ -64,7 +64,8 @@ PREFILL, STATES = "prefill", "states"
 
 
 TRAITS: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "artifact", "drafter", "column"), ()),
+    **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "drafter", "column"), ()),
+    "artifact": ("sees", "by_task"),
     "proposer": ("when", "chains", "sides", "remembers"),
     "boundary": ("chooses",),
     "skip": ("takes_draft", "merges", "parallel", "watches"),

@@ -24,12 +24,10 @@ from kerv_cli.cli.common import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import pandas as pd
-
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.tables import StudyData
+    from kerv_cli.report.tables import Row, StudyData
 
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
@@ -141,61 +139,55 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) 
 
 
 def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+    from kerv_cli.report.measures import MICRO
     from kerv_cli.report.summary import summary_table
     from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
 
     data = load_study(store)
     recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
-    table = study_table(data)
+    table, per_task = study_table(data), rows_of(per_task_table(data))
+    whole = rows_of(table, MICRO)
     if as_json:
-        per_task = rows_of(per_task_table(data))
-        settings = rows_of(table[table["averaging"] == table["averaging"].iloc[0]])
-        print_json({"run": store.name, "folder": store.root, "settings": settings, "tasks": per_task,
+        print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
                     "recordings": recordings})  # fmt: skip
         return
     if len(data.plan.labels) > 1:
         console().print(summary_table(table))
     else:
-        _single(data)
+        _single(data, per_task, whole[0])
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
     if recordings:
         typer.echo(f"{len(recordings)} recordings; open one with: {called()} view {recordings[0]}")
 
 
-def _single(data: StudyData) -> None:
+def _single(data: StudyData, per_task: list[Row], whole: Row) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.engine.record import PHASES
     from kerv_cli.lab.identity import batch_of
     from kerv_cli.report.measures import is_timed
 
-    episodes = data.episodes
-    cell = data.plan.cells[0]
-    tasks = list(dict.fromkeys(episodes["task"]))
-    names = (*tasks, "all") if len(tasks) > 1 else tasks
-    rows = [(name, *_figures(episodes[(episodes["task"] == name) | (name == "all")])) for name in names]
+    episodes, cell = data.episodes, data.plan.cells[0]
+    by_task = {row["task"]: row for row in per_task}
+    figures = [(task, by_task[task]) for task in dict.fromkeys(episodes["task"])]
+    if len(figures) > 1:
+        figures.append(("all", whole))
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = cell.identity.get("observation", "")
-    stress = _stressed(cell.settings)
-    print_table(headers, rows, f"{cell.label}, observation {observation}{stress}, seeds {seeds}")
-    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-    seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+    title = f"{cell.label}, observation {observation}{_stressed(cell.settings)}, seeds {seeds}"
+    print_table(headers, ((name, *_figures(row)) for name, row in figures), title)
     if not is_timed(episodes):
         typer.echo(f"not timed: {batch_of(cell.settings)} episodes at a time, for success alone")
         return
+    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
+    seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
     rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
     print_table(("phase", "ms per decode", "share"), rows, "time by phase")
 
 
-def _figures(episodes: pd.DataFrame) -> list[str]:
-    from kerv_cli.report.measures import is_timed
+def _figures(row: Row) -> list[str]:
+    from kerv_cli.report.tables import is_number
 
-    steps, rounds = episodes["steps"].sum(), episodes["verifications"].sum()
-    per_round = [f"{episodes[name].sum() / rounds:.2f}" if rounds else "–" for name in ("committed", "accepted")]
-    return [
-        f"{episodes['success'].sum()}/{len(episodes)}",
-        f"{steps / len(episodes):.0f}",
-        f"{episodes['forwards'].sum() / steps:.2f}",
-        *per_round,
-        f"{1000 * (episodes['seconds'] / episodes['steps']).mean():.2f}" if is_timed(episodes) else "–",
-    ]
+    rates = (row[name] for name in ("forwards_per_step", "AL", "accepted_per_round", "time_per_step_ms"))
+    successes, steps = f"{row['successes']}/{row['episodes']}", f"{row['steps'] / row['episodes']:.0f}"
+    return [successes, steps, *(f"{rate:.2f}" if is_number(rate) else "–" for rate in rates)]

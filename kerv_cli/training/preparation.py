@@ -9,7 +9,7 @@ from pathlib import Path
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.registry import parts
+from kerv_cli.base.registry import find, parts
 from kerv_cli.base.settings import CalibrateSuccessSettings, PrepareSettings, RolloutSettings, TrainDrafterSettings
 from kerv_cli.lab.catalogue import state_of
 from kerv_cli.lab.resolve import resolve
@@ -17,11 +17,10 @@ from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.worlds import specs
+from kerv_cli.worlds.recorded import NO_WORLD
 
 ORDER = ("drafter", "early", "scout", "datastore", "calibration", "certificate")
 """A kind is made from those before it; kinds of parts that are not kerv's come last."""
-SEEING = ("scout", "certificate")
-"""Kinds that need a target with cameras: a scout drafts for one of the certificate's candidates."""
 THERE, MISSING = "there", "missing"
 
 
@@ -48,7 +47,7 @@ def plan(settings: PrepareSettings) -> list[Step]:
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
     spec = specs().get(description.environment)
-    played = spec is not None and not spec.world_class.endswith(":NoWorld")
+    played = spec is not None and spec.world_class != NO_WORLD
     kinds = needs(tuple(settings.methods), bool(description.cameras), played)
     steps: list[Step] = []
     for kind in kinds:
@@ -79,14 +78,19 @@ def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[st
     kinds: set[str] = set()
     for name in methods or names:
         own = set(Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs)
-        if not sees and own & set(SEEING) and methods:
+        if not sees and methods and any(_needs_cameras(kind) for kind in own):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= own
     if "certificate" in kinds and sees and played:  # its candidates run before one of them is certified
         candidates = resolve([f"study={CalibrateSuccessSettings.groups['study']}"]).settings.values()
         kinds |= {kind for settings in candidates for kind in Method.of(settings).needs}
     made = [kind for kind in dict.fromkeys((*ORDER, *parts("artifact"))) if kind in kinds and kind_of(kind).command]
-    return tuple(kind for kind in made if (sees or kind not in SEEING) and (played or kind != "certificate"))
+    return tuple(kind for kind in made if (sees or not _needs_cameras(kind)) and (played or kind != "certificate"))
+
+
+def _needs_cameras(kind: str) -> bool:
+    """Whether a target without cameras cannot have it: a scout drafts for one of the certificate's candidates."""
+    return bool(find("artifact", kind).traits.get("sees"))
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:

@@ -14,6 +14,7 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.spec import EnvironmentSpec, Task
 
 _SPECS: dict[str, EnvironmentSpec] = {}
+NO_WORLD = f"{__name__}:NoWorld"
 
 
 def register_recorded(
@@ -22,9 +23,7 @@ def register_recorded(
     """Registers the environment of a recorded dataset. name: an identifier; instructions: task -> instruction."""
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
     suite = {name.upper(): tuple(tasks)}
-    _SPECS[name] = EnvironmentSpec(
-        name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,), f"{__name__}:NoWorld"
-    )
+    _SPECS[name] = EnvironmentSpec(name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,), NO_WORLD)
     register(Part("environment", name, f"{__name__}:{name}"))
     return _SPECS[name]
 

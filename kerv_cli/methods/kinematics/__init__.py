@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _PREDICTION = "kerv_cli.methods.kinematics.prediction:"
 
-add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact")
+add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact", by_task=True)
 
 # --- predictors, and proposers that draft by them (§3.1, §6)
 
