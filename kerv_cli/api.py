@@ -99,9 +99,9 @@ def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
         UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
         Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
     """
-    typed = as_words(*words, **settings)
-    resolved = resolve_rollout(typed, grid)
-    arguments = ["rollout", *(["-m"] if grid else []), *typed]
+    overrides = as_words(*words, **settings)
+    resolved = resolve_rollout(overrides, grid)
+    arguments = ["rollout", *(["-m"] if grid else []), *overrides]
     return Study(run_cells(resolved, planned_cells(resolved), arguments))
 
 
@@ -115,10 +115,10 @@ def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
     Raises:
         UsageError, CheckpointError, Interrupted: as `rollout`. KervError: cells failed; the others are kept.
     """
-    typed = as_words(f"study={study}", *words, **settings)
-    resolved = resolve(typed)
-    store, covered = covered_cells(resolved, typed)
-    failed = run_covered(resolved, covered, store, typed).failed
+    overrides = as_words(f"study={study}", *words, **settings)
+    resolved = resolve(overrides)
+    store, covered = covered_cells(resolved, overrides)
+    failed = run_covered(resolved, covered, store, overrides).failed
     if failed:
         cell, reason = failed[0].cell, failed[0].reason
         raise KervError(f"{len(failed)} of {len(covered.cells)} cells failed, {cell.label} on {cell.task}: {reason}")

@@ -45,10 +45,10 @@ class UnknownName(UsageError):
     """A name that no registry knows; the message lists the nearest ones, or says what replaces it. more: behind
     them, in brackets."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str], more: str = "") -> None:
-        known = list(known)
-        near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+    def __init__(self, kind: str, name: str, names: Iterable[str], more: str = "") -> None:
+        names = list(names)
+        near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names)}"
         gone = GONE.get((kind.split(".")[0], name))
         hint = f"{hint} ({more})" if more else hint
         super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")

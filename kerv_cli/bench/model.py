@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,13 +23,13 @@ from kerv_cli.base.settings import (
     TrainTargetSettings,
 )
 from kerv_cli.base.spaces import Observation
-from kerv_cli.bench.machine import median_seconds
+from kerv_cli.bench.machine import median_seconds, product_with
 from kerv_cli.lab.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
-from kerv_cli.targets.compact.packed import FastLinear, pack
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, BlockedLinear, multiplies_bfloat16
+from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
 from kerv_cli.training.imitation import vocabulary
@@ -225,12 +226,11 @@ def fastest(device: torch.device) -> torch.dtype:
         return torch.bfloat16
     if not multiplies_bfloat16():
         return torch.float32
-    weight, row = torch.ones(8192, 4096), torch.ones(1, 4096)
-    half, full = BlockedLinear(weight), FastLinear(weight)
-    seconds = {
-        torch.bfloat16: median_seconds(lambda: half(row.bfloat16()), device, 7),
-        torch.float32: median_seconds(lambda: full(row), device, 7),
-    }
+    row = torch.ones(1, 4096)
+    seconds = {}
+    for dtype in (torch.bfloat16, torch.float32):
+        product = product_with(torch.ones(8192, 4096), dtype)
+        seconds[dtype] = median_seconds(functools.partial(product, row.to(dtype)), device, 7)
     return min(seconds, key=seconds.__getitem__)
 
 

@@ -179,8 +179,8 @@ def _disk(settings: DoctorSettings) -> Finding:
         check_writable(settings.results)
     except StorageError as error:
         return Finding("results", False, str(error))
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    free = shutil.disk_usage(there).free / 1e9
+    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(parent).free / 1e9
     return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
 
 

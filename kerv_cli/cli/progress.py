@@ -70,8 +70,8 @@ class ProgressDisplay:
             self._bar.update(self._task, completed=self._done, count=self._count, description=now)
         elif time.monotonic() - self._logged > LOG_SECONDS:
             self._logged = time.monotonic()
-            left = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
-            self.console.print(f"{self._count}, about {left / 60:.0f} min left; {now}", soft_wrap=True, highlight=False)
+            rest = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
+            self.console.print(f"{self._count}, about {rest / 60:.0f} min left; {now}", soft_wrap=True, highlight=False)
 
     @property
     def _done(self) -> float:
@@ -107,11 +107,11 @@ class ProgressDisplay:
 
     def _finish(self, cell: Cell, result: str) -> None:
         for name, block in list(self._running.items()):
-            left = block.without({cell.id})
-            if left is None:
+            rest = block.without({cell.id})
+            if rest is None:
                 del self._running[name]
             else:
-                self._running[name] = left
+                self._running[name] = rest
         self._finished += 1
         self._ended += len(cell.seeds)
         self._parts.pop(cell.id, None)

@@ -111,10 +111,10 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         rows = [] if table is None else rows_of(table)
         print_json({**_plain(run), "made_from": origin, "bytes": size, "settings": rows})
         return
-    typed = shlex.join(["kerv", *run.command]) if run.command else "unknown"
+    line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
-    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed} | parts).items():
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": line} | parts).items():
         typer.echo(f"{name:<9} {value}")
     if table is not None:
         console().print(summary_table(table))
@@ -159,8 +159,8 @@ def _print_differences(rows: list[Difference]) -> None:
     if not rows:
         typer.echo("no difference in settings, weights, machine or versions")
         return
-    shown = (("–" if value is None else value for value in (row.key, row.first, row.second)) for row in rows)
-    print_table(("setting", "first", "second"), shown)
+    cells = (("–" if value is None else value for value in (row.key, row.first, row.second)) for row in rows)
+    print_table(("setting", "first", "second"), cells)
 
 
 def _print_results(comparison: Comparison) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
@@ -92,14 +92,11 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore
 def _list_studies(as_json: bool) -> None:
     """Prints the studies of conf/ and how large each is."""
     from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
-    from kerv_cli.base.files import read_yaml_file
-    from kerv_cli.base.manifests import read
-    from kerv_cli.lab.resolve import tasks_of
+    from kerv_cli.lab.resolve import study_of_file, tasks_of
 
     rows, composer = [], Composer("rollout", RolloutSettings)
     for name in groups()["study"]:
-        path = conf_dir() / "study" / f"{name}.yaml"
-        study = read(StudySettings, {"name": name, **read_yaml_file(path)}, str(path))
+        study = study_of_file(conf_dir() / "study" / f"{name}.yaml")
         common = composer.compose(split_words(study.common))
         settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(tasks_of(common))
         rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))

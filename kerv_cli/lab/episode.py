@@ -98,9 +98,9 @@ class _Execution:
         else:
             self.in_hand = deque(clock.chunk(decode, self.actions[: decode.delay.observed]))
 
-    def until(self, left: int) -> None:
+    def until(self, rest: int) -> None:
         """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
-        while len(self.in_hand) > left and not self.world.done:
+        while len(self.in_hand) > rest and not self.world.done:
             self.step()
 
     def watched(self, decode: DecodeRecord, watcher: Watcher) -> DecodeRecord:

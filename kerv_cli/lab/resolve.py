@@ -60,7 +60,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     if file is not None:
         names = {_key(o).removeprefix("study.") for o in mine} & set(StudySettings.__dataclass_fields__)
         changes = {name: getattr(sweep.study, name) for name in names}
-        sweep.study = dataclasses.replace(_study_of_file(Path(file.split("=", 1)[1]).expanduser()), **changes)
+        sweep.study = dataclasses.replace(study_of_file(Path(file.split("=", 1)[1]).expanduser()), **changes)
     study = sweep.study
     study.name = study.name or next(o.split("=", 1)[1] for o in mine if o.startswith("study="))
     keys = {_key(o) for o in theirs}
@@ -117,10 +117,10 @@ def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
     Raises:
         UnknownName: no such task. CheckpointError: the target's description is damaged.
     """
-    return resolve_tasks(settings.task or list(known_tasks(settings)) or DEFAULT_TASKS)
+    return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
 
 
-def known_tasks(settings: RolloutSettings) -> tuple[str, ...]:
+def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     """Full names of the tasks that a rollout's target was trained on; none of the expert, and where it does not say or
     is not there, which `policy.check` refuses.
 
@@ -139,17 +139,17 @@ def known_tasks(settings: RolloutSettings) -> tuple[str, ...]:
 
 def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
     """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
-    known = known_tasks(settings)
-    return [task for task in tasks if known and task not in known]
+    trained = trained_tasks(settings)
+    return [task for task in tasks if trained and task not in trained]
 
 
 def _settle(settings: Iterable[RolloutSettings], first: RolloutSettings, narrows: bool = False) -> None:
     """Fills what the settings leave open, as `first` does: tasks, camera and horizon. narrows: of the tasks only those
     that its target was trained on stay, or where that are none, all that it was trained on."""
-    known = list(known_tasks(first)) if narrows else []
-    tasks = [task for task in tasks_of(first) if task in known] or known or list(tasks_of(first))
+    trained = list(trained_tasks(first)) if narrows else []
+    tasks = [task for task in tasks_of(first) if task in trained] or trained or list(tasks_of(first))
     for setting in settings:
-        setting.task = tasks if known else setting.task or tasks
+        setting.task = tasks if trained else setting.task or tasks
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
 
 
@@ -169,7 +169,7 @@ def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
     return reasons | {word: why for word, why in common[0].items() if all(word in idle for idle in common)}
 
 
-def _study_of_file(path: Path) -> StudySettings:
+def study_of_file(path: Path) -> StudySettings:
     """The study in a file. Raises UsageError: no such file, or it is no study."""
     value = _read_study(path)
     for key in value:
