@@ -127,9 +127,9 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) 
         Interrupted: Ctrl-C. KervError: an episode failed.
     """
     from kerv_cli.cli.running import running
-    from kerv_cli.lab.reuse import begin
+    from kerv_cli.lab.reuse import rollout_store
 
-    store, cells, done = begin(resolved.first.results, cells)
+    store, cells, done = rollout_store(resolved.first.results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
     store.begin(resolved.study, cells, arguments)
@@ -144,20 +144,19 @@ def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> No
     from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
 
     data = load_study(store)
-    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     table, per_task = study_table(data), rows_of(per_task_table(data))
     whole = rows_of(table, MICRO)
     if as_json:
         print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
-                    "recordings": recordings})  # fmt: skip
+                    "recordings": store.recordings})  # fmt: skip
         return
     if len(data.plan.labels) > 1:
         console().print(summary_table(table))
     else:
         _single(data, per_task, whole[0])
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
-    if recordings:
-        typer.echo(f"{len(recordings)} recordings; open one with: {called()} view {recordings[0]}")
+    if store.recordings:
+        typer.echo(f"{len(store.recordings)} recordings; open one with: {called()} view {store.recordings[0]}")
 
 
 def _single(data: StudyData, per_task: list[Row], whole: Row) -> None:

@@ -218,9 +218,8 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     if (table["label"] != table["baseline"]).any():
         typer.echo(f"verdict: {sentence(choices(table, None, loss)[0], loss, str(table['baseline'].iloc[0]))}")
     typer.echo(f"page: {store.root / 'report.html'}")
-    recordings = sorted(store.rollouts.glob("*.rrd"))
-    if recordings:
-        typer.echo(f"watch: {called()} view {recordings[0]}")
+    if store.recordings:
+        typer.echo(f"watch: {called()} view {store.recordings[0]}")
 
 
 def _tell(
@@ -230,12 +229,11 @@ def _tell(
 
     complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
     table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
-    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
         rows = [] if table is None else rows_of(table)
         print_json({"study": store.name, "folder": store.root, "cells": counts, "settings": rows,
-                    "recordings": recordings})  # fmt: skip
+                    "recordings": store.recordings})  # fmt: skip
     else:
         if table is not None:
             tell_table(table, store, words)

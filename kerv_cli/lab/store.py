@@ -404,6 +404,11 @@ class StudyStore:
             pa.default_memory_pool().release_unused()
         return results, [cell for cell in unique if cell.id not in results]
 
+    @property
+    def recordings(self) -> list[Path]:
+        """Its .rrd files, by name."""
+        return sorted(self.rollouts.glob("[!.]*.rrd"))
+
     def write_failure(self, name: str, text: str) -> None:
         """Stores the traceback of a cell that failed."""
         with atomic_path(self.failures / f"{name}.txt") as temporary:
@@ -465,13 +470,6 @@ def stores(results: Path | str, family: str = STUDIES) -> list[StudyStore]:
         clean(Path(results) / family)
     folders = visible(Path(results) / family)
     return [StudyStore(results, folder.name, family) for folder in folders if (folder / "plan.yaml").is_file()]
-
-
-def studies_of(store: StudyStore) -> list[StudyStore]:
-    """The other studies of the same results folder; none where the store is no study's."""
-    if store.family != STUDIES:
-        return []
-    return [other for other in stores(store.root.parent.parent) if other.name != store.name]
 
 
 def begun_studies(results: Path | str) -> list[str]:

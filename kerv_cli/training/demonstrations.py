@@ -4,23 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.places import artifact, find_target, results_dir
-from kerv_cli.base.settings import DEFAULT_TASKS, PolicySettings
+from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
-
-
-class OfTarget(Protocol):
-    """Settings of what is made for a target from demonstrations."""
-
-    results: str
-    policy: PolicySettings
-    demos: str
-    task: list[str]
 
 
 def name_of(tasks: Sequence[str]) -> str:
@@ -58,7 +48,7 @@ def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> 
     return f"record them with '{' '.join(['kerv demos', *words])}'{others}"
 
 
-def demos_for(settings: OfTarget) -> DemoDataset:
+def demos_for(settings: DemonstrationSettings) -> DemoDataset:
     """The demonstrations that something is made from for a target: those that it was trained on, where none are named.
     Fills what the settings leave open: their name, and, where they have tasks that the target does not know, the tasks
     that it does; no task stands for all.
