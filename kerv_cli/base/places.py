@@ -95,12 +95,18 @@ def find_target(results: str, name: str) -> Path:
             f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'kerv build policy "
             f"source={name}.tar.gz', or source= its URL"
         )
-    names = sorted({p.parent.parent.name for p in shipped_dir().glob("[!.]*/target/target.json")})
-    names += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json")})
+    names = target_names(results)
     raise UsageError(
         f"no target '{name}' in {', '.join(map(str, places))}: train it with 'kerv train target name={name}'"
-        + (f", or take one of {', '.join(dict.fromkeys(names))}" if names else "")
+        + (f", or take one of {', '.join(names)}" if names else "")
     )
+
+
+def target_names(results: str) -> list[str]:
+    """Names of the targets that are there: shipped ones, then those of the results folder."""
+    shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))
+    stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
+    return list(dict.fromkeys([*shipped, *stored]))
 
 
 def beside(target: Path, kind: str) -> Path:

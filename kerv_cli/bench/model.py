@@ -13,8 +13,7 @@ from torch import Tensor
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.files import visible
-from kerv_cli.base.places import results_dir, shipped_dir
+from kerv_cli.base.places import target_names
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.settings import (
     BenchSettings,
@@ -172,15 +171,10 @@ def open_model(settings: BenchSettings) -> Model:
         target: Any = artifacts.target
     except UsageError as error:
         if "/" not in settings.model and "is damaged" not in str(error):
-            raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
+            raise UnknownName("target", settings.model, [*target_names(settings.results), *shapes]) from error
         raise
     drafter = artifacts.load("drafter") if artifacts.path("drafter").exists() else _drafter(target)
     return Model(settings.model, target, drafter, blank(target), False)
-
-
-def _policies(results: str) -> list[str]:
-    folders = (results_dir(results) / "artifacts" / "target", shipped_dir())
-    return sorted(path.name for folder in folders for path in visible(folder) if path.is_dir())
 
 
 def _shape(settings: BenchSettings) -> Model:
