@@ -20,7 +20,7 @@ import pandas as pd
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.places import check_writable, results_dir
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import ServeSettings
 from kerv_cli.cli.rollout import planned_cells, run_cells
 from kerv_cli.cli.sweep import covered_cells, run_covered
@@ -99,12 +99,10 @@ def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
         UsageError: a setting that does not exist or cannot be. CheckpointError: no such policy, or a damaged one.
         Interrupted: Ctrl-C; complete episodes are kept. KervError: an episode failed.
     """
-    typed = as_words(*words, **settings)
-    resolved = resolve_rollout(typed, grid)
-    results = next(iter(resolved.settings.values())).results
-    check_writable(results)
-    arguments = ["rollout", *(["-m"] if grid else []), *typed]
-    return Study(run_cells(resolved, planned_cells(resolved), results, arguments))
+    overrides = as_words(*words, **settings)
+    resolved = resolve_rollout(overrides, grid)
+    arguments = ["rollout", *(["-m"] if grid else []), *overrides]
+    return Study(run_cells(resolved, planned_cells(resolved), arguments))
 
 
 def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
@@ -117,10 +115,10 @@ def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
     Raises:
         UsageError, CheckpointError, Interrupted: as `rollout`. KervError: cells failed; the others are kept.
     """
-    typed = as_words(f"study={study}", *words, **settings)
-    resolved = resolve(typed)
-    store, covered = covered_cells(resolved, typed)
-    failed = run_covered(resolved, covered, store, typed).failed
+    overrides = as_words(f"study={study}", *words, **settings)
+    resolved = resolve(overrides)
+    store, covered = covered_cells(resolved, overrides)
+    failed = run_covered(resolved, covered, store, overrides).failed
     if failed:
         cell, reason = failed[0].cell, failed[0].reason
         raise KervError(f"{len(failed)} of {len(covered.cells)} cells failed, {cell.label} on {cell.task}: {reason}")

@@ -22,7 +22,8 @@ from kerv_cli.base.settings import (
     PolicySettings,
     RolloutSettings,
 )
-from kerv_cli.lab.policy import check, decoder_for, unseen_tasks
+from kerv_cli.lab.policy import check, decoder_for
+from kerv_cli.lab.resolve import unseen_tasks
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.methods.early import EarlySettings

@@ -307,7 +307,7 @@ def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path: Path) -> None:
 
 
 def test_bash_completes_behind_an_equals_sign_without_a_start_up_file(tmp_path: Path) -> None:
-    from kerv_cli.cli.completing import script
+    from kerv_cli.cli.completion import script
 
     (tmp_path / "kerv").write_text(f'#!/bin/sh\nexec {sys.executable} -W ignore -c "{BE_KERV}" "$@"\n')
     (tmp_path / "kerv").chmod(0o755)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.settings import RolloutSettings, StudySettings
+from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.lab.identity import without_effect
 from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
 
@@ -37,5 +37,5 @@ def test_a_sweep_names_what_none_of_its_settings_reads() -> None:
     written = {"a": "method=ar threshold.r=3", "b": "method=spec_vla"}
     settings = {label: compose("rollout", text.split(), RolloutSettings) for label, text in written.items()}
     common = ("acceptance=relaxed", "policy.early=mine", "runtime.workers=2")
-    found = idle_overrides(ResolvedStudy(StudySettings(), settings, written, common=common))
+    found = idle_overrides(ResolvedStudy(SweepSettings(), settings, written, common))
     assert list(found) == ["a: threshold.r=3", "policy.early=mine"]

@@ -30,7 +30,7 @@ def recorded(tmp_path_factory):
     progress = []
     manifest = record(CONFIG, out, lambda done, total: progress.append((done, total)))
     assert progress[-1] == (6, 6)
-    assert manifest == read_file(DemoManifest, out / "manifest.json", "a manifest")
+    assert manifest == read_file(DemoManifest, out / "manifest.json")
     return out
 
 

@@ -19,7 +19,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.settings import RolloutSettings, RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.claims import is_claimed
-from kerv_cli.lab.events import CellDone, Event
+from kerv_cli.lab.events import CellEnd, Event
 from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import Cell
@@ -59,7 +59,7 @@ def test_a_cluster_loses_only_the_guilty_cells_and_resumes(cluster: RuntimeSetti
     assert [(cell.task, cell.label) for cell in sorted(outcome.done, key=lambda c: (c.task, c.label))] == [
         (task, label) for task in ("push-v3", "reach-v3") for label in ("ar", "naive_sd")
     ]
-    assert sum(isinstance(event, CellDone) for event in events) == 4
+    assert sum(isinstance(event, CellEnd) and not event.reason for event in events) == 4
     stored = [store.read_cell(cell.id) for cell in outcome.done]
     assert os.getpid() not in {cell.status["pid"] for cell in stored}
     assert {cell.status["executor"] for cell in stored} == {cluster.executor}
@@ -81,7 +81,7 @@ def test_an_interrupt_ends_a_clusters_work(cluster: RuntimeSettings, tmp_path: P
     cells = threshold_study(["reach-v3", "push-v3"])
 
     def interrupt(event: Event) -> None:
-        if isinstance(event, CellDone):
+        if isinstance(event, CellEnd):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

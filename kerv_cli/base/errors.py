@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class KervError(Exception):
     """A failure while a command ran. The message names cause, place and remedy in one line."""
 
     exit_code = 1
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpickled, (type(self), str(self))  # worker processes hand it on, whatever arguments its class takes
+
+
+def _unpickled(kind: type[KervError], message: str) -> KervError:
+    return kind.__new__(kind, message)
 
 
 class UsageError(KervError):
@@ -37,17 +45,13 @@ class UnknownName(UsageError):
     """A name that no registry knows; the message lists the nearest ones, or says what replaces it. more: behind
     them, in brackets."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str], more: str = "") -> None:
-        known = list(known)
-        self._arguments = (kind, name, known, more)
-        near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+    def __init__(self, kind: str, name: str, names: Iterable[str], more: str = "") -> None:
+        names = list(names)
+        near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names)}"
         gone = GONE.get((kind.split(".")[0], name))
         hint = f"{hint} ({more})" if more else hint
         super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")
-
-    def __reduce__(self) -> tuple[type[UnknownName], tuple[str, str, list[str], str]]:
-        return UnknownName, self._arguments  # pickled by these: worker processes hand it on
 
 
 class Interrupted(KervError):

@@ -79,7 +79,7 @@ def _without_unknown(hint: Any, value: Any) -> Any:
 _hints = functools.cache(get_type_hints)
 
 
-def read_file(kind: type[T], path: Path, what: str) -> T:
+def read_file(kind: type[T], path: Path) -> T:
     """The JSON file at `path` as an instance of `kind`; errors as `read`, and a missing or unreadable file."""
     return read(kind, read_mapping(path), str(path), tolerant=True)
 

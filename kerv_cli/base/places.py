@@ -39,12 +39,12 @@ def check_writable(results: str) -> None:
         StorageError: the disk is full or read-only, or permission is missing.
     """
     folder = results_dir(results)
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    if not there.is_dir():
-        raise UsageError(f"results={results}: {there} is a file, name a folder")
+    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not parent.is_dir():
+        raise UsageError(f"results={results}: {parent} is a file, name a folder")
     try:
         # nameless where the file system can: nothing stays when the process is killed here
-        with storage_errors(folder), tempfile.TemporaryFile(dir=there):
+        with storage_errors(folder), tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
         raise StorageError(f"cannot write {folder}: {error.strerror}") from error
@@ -95,12 +95,18 @@ def find_target(results: str, name: str) -> Path:
             f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'kerv build policy "
             f"source={name}.tar.gz', or source= its URL"
         )
-    known = sorted({p.parent.parent.name for p in shipped_dir().glob("[!.]*/target/target.json")})
-    known += sorted({p.parent.name for p in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json")})
+    names = target_names(results)
     raise UsageError(
         f"no target '{name}' in {', '.join(map(str, places))}: train it with 'kerv train target name={name}'"
-        + (f", or take one of {', '.join(dict.fromkeys(known))}" if known else "")
+        + (f", or take one of {', '.join(names)}" if names else "")
     )
+
+
+def target_names(results: str) -> list[str]:
+    """Names of the targets that are there: shipped ones, then those of the results folder."""
+    shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))
+    stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/target").glob("[!.]*/target.json"))
+    return list(dict.fromkeys([*shipped, *stored]))
 
 
 def beside(target: Path, kind: str) -> Path:

@@ -64,7 +64,7 @@ PREFILL, STATES = "prefill", "states"
 
 TRAITS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("acceptance", "threshold", "rectifier", "datastore", "drafter", "column"), ()),
-    "artifact": ("sees",),
+    "artifact": ("sees", "by_task"),
     "proposer": ("when", "chains", "sides", "remembers"),
     "boundary": ("chooses",),
     "skip": ("takes_draft", "merges", "parallel", "watches"),
@@ -144,9 +144,9 @@ def register(part: Part) -> Part:
         UsageError: another part of that kind has the name; no such kind, or its traits are not those of its kind.
     """
     check_traits(part)
-    there = _PARTS.setdefault(part.kind, {}).get(part.name)
-    if there is not None and there.build != part.build:
-        raise UsageError(f"{part.kind} '{part.name}' is registered twice: {there.build} and {part.build}")
+    other = _PARTS.setdefault(part.kind, {}).get(part.name)
+    if other is not None and other.build != part.build:
+        raise UsageError(f"{part.kind} '{part.name}' is registered twice: {other.build} and {part.build}")
     _PARTS[part.kind][part.name] = part
     return part
 
@@ -159,9 +159,9 @@ def check_traits(part: Part) -> None:
     """
     if part.kind not in TRAITS:
         raise UnknownName("kind of part", part.kind, TRAITS)
-    what, known = f"{part.kind} '{part.name}'", TRAITS[part.kind]
-    has = f"the traits of this kind are {', '.join(known)}" if known else "this kind has none"
-    unknown, required = [name for name in part.traits if name not in known], REQUIRED.get(part.kind)
+    what, traits = f"{part.kind} '{part.name}'", TRAITS[part.kind]
+    has = f"the traits of this kind are {', '.join(traits)}" if traits else "this kind has none"
+    unknown, required = [name for name in part.traits if name not in traits], REQUIRED.get(part.kind)
     if unknown:
         raise UsageError(f"{what} has an unknown trait {unknown[0]}: {has}")
     if required is not None and required not in part.traits:

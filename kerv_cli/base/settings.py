@@ -404,16 +404,23 @@ class DemosImportSettings(CommandSettings):
     tail: int = number(8, 0, 1024, help="copies of the last action behind an episode, for chunks at its end")
 
 
+@dataclass(kw_only=True)
+class DemonstrationSettings(TaskSettings):
+    """Settings of every command that makes something of a target and its demonstrations."""
+
+    groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
+
+    policy: PolicySettings = setting(PolicySettings, POLICY)
+    demos: str = setting("", TARGET_DEMOS)
+
+
 @dataclass
-class TrainDrafterSettings(RunSettings):
+class TrainDrafterSettings(DemonstrationSettings):
     """`kerv train drafter`: policy.target is imitated; policy.drafter, policy.early: name of the new one."""
 
     # drafter=early has optimisation settings of its own, so that it comes behind train
     groups: ClassVar = {"policy": "vision", "cover": "all", "train": "drafter", "drafter": "eagle", "runtime": "auto"}
 
-    policy: PolicySettings = setting(PolicySettings, POLICY)
-    demos: str = setting("", TARGET_DEMOS)
-    task: list[str] = setting([], "tasks and suites whose demonstrations are used; empty: those that the target knows")
     starts: str = choice("all", "all", "half", help=STARTS)
     log: str = choice("none", *TRACKERS, help=LOG)
     drafter: Any = setting(chosen("drafter", "eagle"), "its shapes and loss: eagle, early, scout")
@@ -421,15 +428,12 @@ class TrainDrafterSettings(RunSettings):
 
 
 @dataclass
-class PrepareSettings(RunSettings):
+class PrepareSettings(DemonstrationSettings):
     """`kerv prepare`: everything that methods need of policy.target."""
 
     groups: ClassVar = {"policy": "vision", "runtime": "auto"}
 
-    policy: PolicySettings = setting(PolicySettings, POLICY)
     methods: list[str] = setting([], "their names; empty: all")
-    demos: str = setting("", TARGET_DEMOS)
-    task: list[str] = setting([], "tasks and suites; empty: those that the target knows")
     steps: int = number(0, 0, 10**9, help="optimisation steps of each drafter; 0: those of kerv train drafter")
 
 
@@ -521,14 +525,12 @@ class BuildDrafterSettings(RunSettings):
 
 
 @dataclass
-class BuildDatastoreSettings(TaskSettings):
+class BuildDatastoreSettings(DemonstrationSettings):
     """`kerv build datastore` (docs/methods.md §4.1): policy.target gives the features and the tokens."""
 
     groups: ClassVar = {"policy": "vision", "cover": "all", "runtime": "cpu"}
 
-    policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: datastore/ beside the target")
-    demos: str = setting("", TARGET_DEMOS)
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     starts: str = choice("all", "all", "half", help=STARTS)
     stride: int = number(1, 1, 10_000, help="every so many of an episode's observations become entries")
@@ -538,14 +540,10 @@ class BuildDatastoreSettings(TaskSettings):
 
 
 @dataclass
-class CalibrateSettings(TaskSettings):
+class CalibrateSettings(DemonstrationSettings):
     """`kerv calibrate` (docs/methods.md §3, §4): noise of the predictors, K_S, boundary ranges and skip levels."""
 
-    groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
-
-    policy: PolicySettings = setting(PolicySettings, POLICY)
     name: str | None = setting(None, "default: beside the target")
-    demos: str = setting("", TARGET_DEMOS)
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes that the errors are measured on")
     # labels: clean; executed: noisy in perturbed episodes

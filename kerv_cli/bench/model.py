@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.files import visible
-from kerv_cli.base.places import results_dir, shipped_dir
+from kerv_cli.base.places import target_names
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.settings import (
     BenchSettings,
@@ -23,13 +22,13 @@ from kerv_cli.base.settings import (
     TrainTargetSettings,
 )
 from kerv_cli.base.spaces import Observation
-from kerv_cli.base.views import frame_shape
-from kerv_cli.bench.machine import median_seconds
+from kerv_cli.bench.machine import median_seconds, product_with
+from kerv_cli.lab.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
-from kerv_cli.targets.compact.packed import FastLinear, pack
-from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, BlockedLinear, multiplies_bfloat16
+from kerv_cli.targets.compact.packed import pack
+from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
 from kerv_cli.training.imitation import vocabulary
@@ -172,15 +171,10 @@ def open_model(settings: BenchSettings) -> Model:
         target: Any = artifacts.target
     except UsageError as error:
         if "/" not in settings.model and "is damaged" not in str(error):
-            raise UnknownName("target", settings.model, [*_policies(settings.results), *shapes]) from error
+            raise UnknownName("target", settings.model, [*target_names(settings.results), *shapes]) from error
         raise
     drafter = artifacts.load("drafter") if artifacts.path("drafter").exists() else _drafter(target)
     return Model(settings.model, target, drafter, blank(target), False)
-
-
-def _policies(results: str) -> list[str]:
-    folders = (results_dir(results) / "artifacts" / "target", shipped_dir())
-    return sorted(path.name for folder in folders for path in visible(folder) if path.is_dir())
 
 
 def _shape(settings: BenchSettings) -> Model:
@@ -216,9 +210,7 @@ def _drafter(target: Any) -> Drafter:
 
 def blank(target: Any) -> Observation:
     """A black image and zeros."""
-    size, space = target.settings.image_size, target.observation
-    images = {name: np.zeros(frame_shape(name, size), np.uint8) for name in target.cameras}
-    return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
+    return still_observation(target, target.observation, target.settings.image_size)
 
 
 def fastest(device: torch.device) -> torch.dtype:
@@ -228,12 +220,11 @@ def fastest(device: torch.device) -> torch.dtype:
         return torch.bfloat16
     if not multiplies_bfloat16():
         return torch.float32
-    weight, row = torch.ones(8192, 4096), torch.ones(1, 4096)
-    half, full = BlockedLinear(weight), FastLinear(weight)
-    seconds = {
-        torch.bfloat16: median_seconds(lambda: half(row.bfloat16()), device, 7),
-        torch.float32: median_seconds(lambda: full(row), device, 7),
-    }
+    row = torch.ones(1, 4096)
+    seconds = {}
+    for dtype in (torch.bfloat16, torch.float32):
+        product = product_with(torch.ones(8192, 4096), dtype)
+        seconds[dtype] = median_seconds(functools.partial(product, row.to(dtype)), device, 7)
     return min(seconds, key=seconds.__getitem__)
 
 

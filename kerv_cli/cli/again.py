@@ -4,73 +4,38 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import (
+    RuntimeSettings,
     StudySettings,
     TrainDrafterSettings,
     TrainTargetSettings,
     read_settings,
     settings_from,
 )
+from kerv_cli.cli.running import running
 from kerv_cli.lab.catalogue import ROLLOUT, RunEntry, description_of, find_run, store_of
-from kerv_cli.lab.execute import execute
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
 from kerv_cli.lab.policy import check
-from kerv_cli.lab.run import CellRunner, reference_decode
 from kerv_cli.lab.store import STUDIES, StudyStore, new_rollout, stores
-from kerv_cli.report.viewing import save_recording
 
 if TYPE_CHECKING:
     from kerv_cli.training.runs import DrafterRun, TargetRun
 
 
-@dataclass(frozen=True)
-class Again:
-    """A sweep or rollout that is to be repeated. cells: with ids of this code. store: a new one."""
-
-    run: RunEntry
-    study: StudySettings
-    cells: list[Cell]
-    store: StudyStore
-
-
-def plan_again(run: RunEntry, results: str) -> Again:
-    """The study, cells and store of a repetition: a new one, or that of one which was interrupted; nothing is run.
+def cells_again(run: RunEntry, results: str) -> list[Cell]:
+    """The cells of a sweep or rollout, with ids of this code.
 
     Raises:
         CheckpointError: the weights or the data that the run used are not there any more. UsageError: as
             `policy.check`.
     """
-    plan = store_of(run).read_plan()
-    cells = [_again(cell, results) for cell in plan.cells]
-    study = StudySettings(plan.name, plan.title, plan.baseline, axis=plan.axis)
-    if (begun := _begun(run, results, cells)) is not None:
-        return Again(run, dataclasses.replace(study, name=begun.name), cells, begun)
-    if run.kind == ROLLOUT:
-        return Again(run, study, cells, new_rollout(results, cells))
-    store = StudyStore(results, _free(Path(results).expanduser() / STUDIES, plan.name))
-    return Again(run, dataclasses.replace(study, name=store.name), cells, store)
-
-
-def _begun(run: RunEntry, results: str, cells: list[Cell]) -> StudyStore | None:
-    """The repetition of these cells that was interrupted."""
-    for store in stores(Path(results).expanduser(), run.folder.parent.name):
-        with contextlib.suppress(KervError):
-            if store.interrupted_since(_words(run)) and {cell.id for cell in store.read_plan().cells} == {
-                cell.id for cell in cells
-            }:
-                return store
-    return None
-
-
-def _words(run: RunEntry) -> list[str]:
-    return ["runs", "rerun", run.id]
+    return [_again(cell, results) for cell in store_of(run).read_plan().cells]
 
 
 def _again(cell: Cell, results: str) -> Cell:
@@ -86,19 +51,37 @@ def _again(cell: Cell, results: str) -> Cell:
     return make_cell(cell.label, cell.overrides, stored, identity, cell.task, cell.seeds, cell.repeat)
 
 
-def run_again(again: Again, results: str) -> RunEntry:
-    """Runs it in this process -> the new run.
+def store_again(run: RunEntry, results: str, cells: list[Cell]) -> StudyStore:
+    """Where a repetition of these cells is stored: a new store, or that of one which was interrupted."""
+    ids = {cell.id for cell in cells}
+    for store in stores(Path(results).expanduser(), run.folder.parent.name):
+        with contextlib.suppress(KervError):
+            if store.interrupted_since(_words(run)) and {cell.id for cell in store.read_plan().cells} == ids:
+                return store
+    if run.kind == ROLLOUT:
+        return new_rollout(results, cells)
+    return StudyStore(results, _free(Path(results).expanduser() / STUDIES, run.id))
+
+
+def _words(run: RunEntry) -> list[str]:
+    return ["runs", "rerun", run.id]
+
+
+def run_again(run: RunEntry, store: StudyStore, cells: list[Cell]) -> RunEntry:
+    """Runs the cells in this process -> the new run.
 
     Raises:
-        KervError: a cell failed.
+        KervError: a cell failed. Interrupted: Ctrl-C.
     """
-    again.store.begin(again.study, again.cells, _words(again.run))
-    runner = CellRunner(again.store.rollouts, save_recording, keep=True)
-    outcome = execute(again.cells, runner, again.store, gauge=reference_decode)
-    if outcome.failed:
-        raise KervError(outcome.failed[0].reason)
-    again.store.note_finished()
-    return find_run(results, again.store.name)
+    plan = store_of(run).read_plan()
+    study = StudySettings(store.name, plan.title, plan.baseline, axis=plan.axis)
+    store.begin(study, cells, _words(run))
+    with running(store, cells, RuntimeSettings()) as execute:
+        failed = execute(cells).failed
+    if failed:
+        raise KervError(failed[0].reason)
+    store.note_finished()
+    return find_run(store.root.parent.parent, store.name)
 
 
 def _free(folder: Path, name: str) -> str:

@@ -110,8 +110,8 @@ app = typer.Typer(
 )
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(chosen: bool) -> None:
+    if chosen:
         from kerv_cli.base.provenance import git_commit, versions
 
         names = ", ".join(f"{name} {number}" for name, number in versions().items())

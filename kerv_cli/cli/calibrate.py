@@ -150,7 +150,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     place = folder_of(resolved, settings.name)
     store, covered = covered_cells(resolved, theirs)
     if plan:
-        print_sweep_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
+        print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
         return
     outcome = run_covered(resolved, covered, store, theirs)
     if outcome.failed:

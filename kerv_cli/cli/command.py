@@ -62,28 +62,28 @@ def typer_command(part: Part) -> TyperCommand:
     """Typer's command of a registered one. Its module is imported now."""
     run = load(part.build)
     parameters = inspect.signature(run, eval_str=True).parameters
-    own = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _GIVEN]
+    more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
 
-    def called(overrides: list[str] | None = None, cfg: bool = False, **options: Any) -> None:
+    def callback(overrides: list[str] | None = None, cfg: bool = False, **options: Any) -> None:
         words, names = _divided(part, overrides or [], "names" in parameters)
         _check_bare(part, words)
-        given = {"words": words, "names": names, "cfg": cfg}
+        arguments = {"words": words, "names": names, "cfg": cfg}
         if "settings" in parameters or (cfg and "cfg" not in parameters):
-            given["settings"] = _composed(part, words, cfg)
-        run(**{name: value for name, value in given.items() if name in parameters}, **options)
+            arguments["settings"] = _composed(part, words, cfg)
+        run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
 
-    shown = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
-    called.__signature__ = inspect.Signature([_option("overrides", None, _words(part)), *shown, *own])  # type: ignore[attr-defined]
+    cfg_option = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
+    callback.__signature__ = inspect.Signature([_option("overrides", None, _words(part)), *cfg_option, *more])  # type: ignore[attr-defined]
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     help = "\n\n".join(filter(None, (inspect.cleandoc(part.traits.get("help", "")), part.traits.get("names"))))
-    single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(called)
+    single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(callback)
     made: Any = typer.main.get_command(single)
     made.part = part
     return made
 
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
-_GIVEN = ("settings", "words", "names", "cfg")
+_ARGUMENTS = ("settings", "words", "names", "cfg")
 _CFG = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
 
 
@@ -103,24 +103,24 @@ def complete(ctx: typer.Context, incomplete: str) -> list[str]:
     return completions(" ".join(ctx.command_path.split()[1:]), list(ctx.params.get("overrides") or []), incomplete)
 
 
-def completions(command: str, typed: Sequence[str], incomplete: str) -> list[str]:
+def completions(command: str, words: Sequence[str], incomplete: str) -> list[str]:
     """`me` -> `method=`; `method=s` -> every method that begins so; `threshold.` -> the keys of the chosen threshold.
 
     Args:
         command: e.g. `rollout`, `train drafter`.
-        typed: the overrides in front of it: a chosen part has keys of its own.
+        words: the overrides in front of it: a chosen part has keys of its own.
     """
     part = parts("command")[command]
     key, equals, _ = incomplete.partition("=")
     if equals:
-        words = [f"{key}={name}" for name in _values(part, key)]
+        candidates = [f"{key}={name}" for name in _values(part, key)]
     elif "." in incomplete:
-        words = [f"{name}=" for name in _keys(part, typed, incomplete)]
+        candidates = [f"{name}=" for name in _keys(part, words, incomplete)]
     else:
         keys = [] if part.settings is NoSettings else [f"{name}=" for name in top_keys(part)]
-        below = [] if typed else [one.name.removeprefix(f"{command} ") for one in commands_below(f"{command} ")]
-        words = [*part.traits.get("completes", list)(), *below, *keys]
-    return [word for word in dict.fromkeys(words) if word.startswith(incomplete)]
+        below = [] if words else [one.name.removeprefix(f"{command} ") for one in commands_below(f"{command} ")]
+        candidates = [*part.traits.get("completes", list)(), *below, *keys]
+    return [word for word in dict.fromkeys(candidates) if word.startswith(incomplete)]
 
 
 def _values(part: Part, key: str) -> list[str]:
@@ -143,13 +143,13 @@ def _values(part: Part, key: str) -> list[str]:
     return []
 
 
-def _keys(part: Part, typed: Sequence[str], incomplete: str) -> list[str]:
+def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
     """Dotted keys of the command with the parts that were chosen in front."""
     from kerv_cli.base.config import keys_of
 
     for name, schema in schemas_of(part):
         if incomplete.split(".")[0] in {at.name for at in fields(schema)}:
-            choices = [word for word in typed if word.split("=", 1)[0] in choices_of(schema)]
+            choices = [word for word in words if word.split("=", 1)[0] in choices_of(schema)]
             return keys_of(name.replace(" ", "_"), choices, schema)
     return []
 

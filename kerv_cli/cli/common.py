@@ -171,13 +171,13 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
 
 
 def _plain_lines(title: str) -> Callable[..., None]:
-    shown = -1
+    latest = -1
 
     def advance(done: int, total: int, text: str = "") -> None:
-        nonlocal shown
+        nonlocal latest
         part = (50 if total >= 2000 else 10) * done // max(1, total)
-        if part > shown:
-            shown = part
+        if part > latest:
+            latest = part
             typer.echo(f"{title} {done}/{total} {text}".rstrip(), err=True)
 
     return advance

@@ -16,7 +16,6 @@ from kerv_cli.cli.common import AsJson, print_json, print_table
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from kerv_cli.lab.store import StudyStore
     from kerv_cli.worlds.spec import EnvironmentSpec
 
 
@@ -53,8 +52,23 @@ def doctor(settings: DoctorSettings, repair: Repair = False, as_json: AsJson = F
 
 
 def _machine(settings: DoctorSettings) -> list[Finding]:
-    findings = [_versions(), *_rendering(settings), _torch(settings), *_policies(settings)]
-    return [*findings, _disk(settings), _left(settings), _display()]
+    from kerv_cli.base.provenance import versions
+    from kerv_cli.report.viewing.viewer import has_display
+    from kerv_cli.worlds import specs
+
+    numbers = ", ".join(f"{name} {number}" for name, number in versions().items())
+    display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
+    paths = _left_over(settings)
+    says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
+    return [
+        Finding("versions", True, numbers),
+        *(_drawn(spec, settings) for spec in specs().values()),
+        _torch(settings),
+        *_policies(settings),
+        _disk(settings),
+        Finding("left over", True, says),
+        Finding("display", True, display),
+    ]
 
 
 def _target(settings: DoctorSettings) -> list[Finding]:
@@ -93,20 +107,7 @@ def _environment(settings: DoctorSettings) -> list[Finding]:
     return check_environment(environments[settings.environment], settings.seed)
 
 
-def _versions() -> Finding:
-    from kerv_cli.base.provenance import versions
-
-    return Finding("versions", True, ", ".join(f"{name} {number}" for name, number in versions().items()))
-
-
-def _rendering(settings: DoctorSettings) -> list[Finding]:
-    """One finding per environment."""
-    from kerv_cli.worlds import specs
-
-    return [_drawn(f"rendering {spec.name}", spec, settings) for spec in specs().values()]
-
-
-def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
+def _drawn(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
     """Draws frames of a world and times them: a backend can load and still draw nothing."""
     import time
 
@@ -114,7 +115,7 @@ def _drawn(what: str, spec: EnvironmentSpec, settings: DoctorSettings) -> Findin
     from kerv_cli.base.settings import as_plain
     from kerv_cli.worlds.camera import CameraConfig, choose_backend
 
-    first = next(iter(spec.suites.values()), tuple(spec.tasks))[0]
+    what, first = f"rendering {spec.name}", next(iter(spec.suites.values()), tuple(spec.tasks))[0]
     try:
         backend = choose_backend()
         with spec.open_world(first, CameraConfig(**{**as_plain(settings.world.camera), "name": ""})) as world:
@@ -178,8 +179,8 @@ def _disk(settings: DoctorSettings) -> Finding:
         check_writable(settings.results)
     except StorageError as error:
         return Finding("results", False, str(error))
-    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    free = shutil.disk_usage(there).free / 1e9
+    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(parent).free / 1e9
     return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
 
 
@@ -194,22 +195,11 @@ def _left_over(settings: DoctorSettings) -> list[Path]:
     return [*left_over(root), *claims]
 
 
-def _stores(settings: DoctorSettings) -> list[StudyStore]:
-    from kerv_cli.base.places import results_dir
-    from kerv_cli.lab.store import ROLLOUTS, STUDIES, stores
-
-    return [store for family in (STUDIES, ROLLOUTS) for store in stores(results_dir(settings.results), family)]
-
-
-def _left(settings: DoctorSettings) -> Finding:
-    paths = _left_over(settings)
-    says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
-    return Finding("left over", True, says)
-
-
 def _repair(settings: DoctorSettings) -> None:
     """Removes the files of `_left_over` and prints their names; sets damaged cells aside."""
     from kerv_cli.base.leftovers import remove
+    from kerv_cli.base.places import results_dir
+    from kerv_cli.lab.store import ROLLOUTS, STUDIES, stores
 
     paths = _left_over(settings)
     for path in paths:
@@ -218,15 +208,9 @@ def _repair(settings: DoctorSettings) -> None:
     remaining = [path for path in paths if path.exists()]
     if remaining:
         raise StorageError(f"{remaining[0]} cannot be removed: permission denied?")
-    damages = [(store, name, error) for store in _stores(settings) for name, error in store.damages()]
+    every = [store for family in (STUDIES, ROLLOUTS) for store in stores(results_dir(settings.results), family)]
+    damages = [(store, name, error) for store in every for name, error in store.damages()]
     for store, name, error in damages:
         typer.echo(f"{str(error).split(': `')[0]}: it lies in {store.set_aside(name)} now, {store.how_to_run()}")
     aside = f", {len(damages)} damaged cells set aside" if damages else ""
     typer.echo(f"{len(paths)} left over files removed{aside}; everything else is complete or absent")
-
-
-def _display() -> Finding:
-    from kerv_cli.report.viewing.viewer import has_display
-
-    says = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
-    return Finding("display", True, says)

@@ -17,7 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from kerv_cli.lab import events
+from kerv_cli.lab.events import BlockStarted, BlockWaits, CellEnd, Event, SweepStarted
 from kerv_cli.lab.plan import Block, Cell
 
 LOG_SECONDS = 30.0
@@ -48,20 +48,16 @@ class ProgressDisplay:
         if self._bar is not None:
             self._bar.stop()
 
-    def __call__(self, event: events.Event) -> None:
-        if isinstance(event, events.SweepStarted):
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, SweepStarted):
             self._start(event)
-        elif isinstance(event, events.BlockStarted):
+        elif isinstance(event, BlockStarted):
             self._running[event.block.name] = event.block
-        elif isinstance(event, events.BlockWaits):
+        elif isinstance(event, BlockWaits):
             self._running.pop(event.block.name, None)
             self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
-        elif isinstance(event, events.CellDone):
+        else:
             self._finish(event.cell, _result(event))
-        elif isinstance(event, events.CellFailed):
-            self._finish(event.cell, f"[red]failed[/red]: {escape(event.reason)}")
-        elif isinstance(event, events.CellReused):
-            self._finish(event.cell, "completed by another sweep")
         self._refresh()
 
     def on_step(self, cell: Cell, seed: int, step: int) -> None:
@@ -74,8 +70,8 @@ class ProgressDisplay:
             self._bar.update(self._task, completed=self._done, count=self._count, description=now)
         elif time.monotonic() - self._logged > LOG_SECONDS:
             self._logged = time.monotonic()
-            left = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
-            self.console.print(f"{self._count}, about {left / 60:.0f} min left; {now}", soft_wrap=True, highlight=False)
+            rest = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
+            self.console.print(f"{self._count}, about {rest / 60:.0f} min left; {now}", soft_wrap=True, highlight=False)
 
     @property
     def _done(self) -> float:
@@ -85,7 +81,7 @@ class ProgressDisplay:
     def _count(self) -> str:
         return f"{int(self._done)}/{self._episodes} episodes"
 
-    def _start(self, event: events.SweepStarted) -> None:
+    def _start(self, event: SweepStarted) -> None:
         self._total, self._finished = event.total, 0
         self._episodes, self._ended = event.episodes, 0
         self._began = self._logged = time.monotonic()
@@ -111,11 +107,11 @@ class ProgressDisplay:
 
     def _finish(self, cell: Cell, result: str) -> None:
         for name, block in list(self._running.items()):
-            left = block.without({cell.id})
-            if left is None:
+            rest = block.without({cell.id})
+            if rest is None:
                 del self._running[name]
             else:
-                self._running[name] = left
+                self._running[name] = rest
         self._finished += 1
         self._ended += len(cell.seeds)
         self._parts.pop(cell.id, None)
@@ -133,8 +129,12 @@ class ProgressDisplay:
         self._bar.update(self._task, completed=self._done, description=now, count=self._count)
 
 
-def _result(event: events.CellDone) -> str:
-    if event.episodes == 1:
-        return f"{'success' if event.successes else 'failure'}, {event.seconds:.1f} s"
-    rate = event.seconds / max(1, event.episodes)
-    return f"{event.successes}/{event.episodes} succeeded, {rate:.1f} s per episode"
+def _result(end: CellEnd) -> str:
+    if end.reason:
+        return f"[red]failed[/red]: {escape(end.reason)}"
+    if end.reused:
+        return "completed by another sweep"
+    if end.episodes == 1:
+        return f"{'success' if end.successes else 'failure'}, {end.seconds:.1f} s"
+    rate = end.seconds / max(1, end.episodes)
+    return f"{end.successes}/{end.episodes} succeeded, {rate:.1f} s per episode"

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kerv_cli.base.errors import Interrupted, KervError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.cli.command import command
@@ -23,19 +22,12 @@ from kerv_cli.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Mapping
 
-    import pandas as pd
-
-    from kerv_cli.engine.record import EpisodeRecord
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
-    from kerv_cli.lab.run import CellRunner
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.tables import StudyData
-
-A = TypeVar("A")
-B = TypeVar("B")
+    from kerv_cli.report.tables import Row, StudyData
 
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
@@ -66,20 +58,18 @@ def rollout(
         return
     for label, settings in resolved.settings.items():
         print_notes(without_effect(settings, resolved.overrides[label].split()))
-    first = next(iter(resolved.settings.values()))
-    check_writable(first.results)
     cells = planned_cells(resolved)
     if plan:
         total = sum(len(cell.seeds) for cell in cells)
         names = ", ".join(f"{label}{_stressed(asdict(settings))}" for label, settings in resolved.settings.items())
-        tasks = resolve_tasks(first.task)
+        tasks = resolve_tasks(resolved.first.task)
         if as_json:
             print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
         else:
             typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, about {3 * total} s (a guess)")
         return
     arguments = ["rollout", *(["-m"] if multirun else []), *words]
-    store = run_cells(resolved, cells, first.results, arguments)
+    store = run_cells(resolved, cells, arguments)
     _tell(store, cells, as_json, in_same(words))
 
 
@@ -92,11 +82,15 @@ def _stressed(settings: Mapping[str, Any]) -> str:
 
 
 def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
-    """The cells of a study, after everything that can be refused without running was."""
+    """The cells of a study, after everything that can be refused without running was. Says on standard error what it
+    comes to, and which tasks a policy was not trained on."""
+    from kerv_cli.lab.executors import check_executor
+    from kerv_cli.lab.resolve import unseen_tasks
     from kerv_cli.worlds import resolve_tasks
 
-    study = resolved.study
-    first = next(iter(resolved.settings.values()))
+    study, first = resolved.study, resolved.first
+    check_executor(first.runtime)
+    check_writable(first.results)
     tasks = resolve_tasks(first.task)
     # before anything heavy loads
     what = next(iter(resolved.settings)) if len(resolved.settings) == 1 else f"{len(resolved.settings)} settings"
@@ -105,14 +99,17 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
     typer.echo(f"{what} of {first.policy.target} on {where}: {count} episodes", err=True)
     with at_work("loading the policy"):
         from kerv_cli.base.runtime import set_up
-        from kerv_cli.lab.plan import plan as plan_cells
+        from kerv_cli.lab.plan import plan
         from kerv_cli.lab.policy import check
 
         identities = {label: check(settings) for label, settings in resolved.settings.items()}
         for settings in resolved.settings.values():
             settings.runtime.device, _ = set_up(settings.runtime)
-    warn_unseen(resolved, tasks)
-    return plan_cells(
+    unseen = dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in resolved.settings.values())
+    for target, names in unseen:
+        if names:
+            typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
+    return plan(
         resolved.settings,
         tasks,
         identities.__getitem__,
@@ -123,146 +120,73 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
     )
 
 
-def warn_unseen(resolved: ResolvedStudy, tasks: tuple[str, ...]) -> None:
-    """Says on standard error which of these tasks a policy was not trained on."""
-    from kerv_cli.lab.policy import unseen_tasks
-
-    lines: set[str] = set()
-    for settings in resolved.settings.values():
-        unseen = unseen_tasks(settings, tasks)
-        line = f"kerv: warning: policy {settings.policy.target} was never trained on {', '.join(unseen)}"
-        if unseen and line not in lines:
-            lines.add(line)
-            typer.echo(line, err=True)
-
-
-def run_cells(resolved: ResolvedStudy, cells: list[Cell], results: str, arguments: list[str]) -> StudyStore:
-    """Runs the cells, going on where the same command was interrupted -> where they are stored.
+def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) -> StudyStore:
+    """Runs a rollout's cells, going on where the same command was interrupted -> where they are stored.
 
     Raises:
         Interrupted: Ctrl-C. KervError: an episode failed.
     """
-    from kerv_cli.cli.progress import ProgressDisplay
-    from kerv_cli.lab import events
-    from kerv_cli.lab.execute import execute
-    from kerv_cli.lab.reuse import begin
-    from kerv_cli.lab.run import CellRunner, close_worlds, reference_decode
-    from kerv_cli.report.viewing import save_recording
+    from kerv_cli.cli.running import running
+    from kerv_cli.lab.reuse import rollout_store
 
-    store, cells, done = begin(results, cells)
+    store, cells, done = rollout_store(resolved.first.results, cells)
     if done:
         typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
     store.begin(resolved.study, cells, arguments)
-    runtime = next(iter(resolved.settings.values())).runtime
-    with ProgressDisplay(console(stderr=True)) as display:
-
-        def on_event(event: events.Event) -> None:
-            if isinstance(event, events.CellFailed):
-                raise failure.error or KervError(event.reason)
-            display(event)
-
-        here = runtime.workers == 1
-        on_step = display.on_step if here else None
-        failure = _Remembering(CellRunner(store.rollouts, save_recording, keep=True, on_step=on_step))
-        try:
-            execute(cells, failure if here else failure.runner, store, runtime, on_event, reference_decode)
-        except KeyboardInterrupt:
-            count = sum(store.has_cell(cell.id) for cell in cells)
-            raise Interrupted(
-                f"interrupted: {count} of {len(cells)} episodes are kept in {store.root}, "
-                "the same command goes on there"
-            ) from None
-        finally:
-            close_worlds()
+    with running(store, cells, resolved.first.runtime) as run:
+        run(cells)
     return store
 
 
-class _Remembering:
-    """A CellRunner of this process that keeps the error of a setting that cannot be built or run, with its exit
-    code."""
-
-    def __init__(self, runner: CellRunner) -> None:
-        self.runner = runner
-        self.error: KervError | None = None
-
-    def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
-        run = self._call(self.runner, cell)
-        return lambda seed: self._call(run, seed)
-
-    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
-        """The episodes of `CellRunner.together`; keeps a KervError among them."""
-        try:
-            for cell, seed, end in self.runner.together(cells):
-                self.error = end if isinstance(end, KervError) else self.error
-                yield cell, seed, end
-        except KervError as error:
-            self.error = error
-            raise
-
-    def _call(self, call: Callable[[A], B], argument: A) -> B:
-        try:
-            return call(argument)
-        except KervError as error:
-            self.error = error
-            raise
-
-
 def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+    from kerv_cli.report.measures import MICRO
     from kerv_cli.report.summary import summary_table
     from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
 
     data = load_study(store)
-    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
-    table = study_table(data)
+    table, per_task = study_table(data), rows_of(per_task_table(data))
+    whole = rows_of(table, MICRO)
     if as_json:
-        per_task = rows_of(per_task_table(data))
-        settings = rows_of(table[table["averaging"] == table["averaging"].iloc[0]])
-        print_json({"run": store.name, "folder": store.root, "settings": settings, "tasks": per_task,
-                    "recordings": recordings})  # fmt: skip
+        print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
+                    "recordings": store.recordings})  # fmt: skip
         return
     if len(data.plan.labels) > 1:
         console().print(summary_table(table))
     else:
-        _single(data)
+        _single(data, per_task, whole[0])
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
-    if recordings:
-        typer.echo(f"{len(recordings)} recordings; open one with: {called()} view {recordings[0]}")
+    if store.recordings:
+        typer.echo(f"{len(store.recordings)} recordings; open one with: {called()} view {store.recordings[0]}")
 
 
-def _single(data: StudyData) -> None:
+def _single(data: StudyData, per_task: list[Row], whole: Row) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.engine.record import PHASES
     from kerv_cli.lab.identity import batch_of
     from kerv_cli.report.measures import is_timed
 
-    episodes = data.episodes
-    cell = data.plan.cells[0]
-    tasks = list(dict.fromkeys(episodes["task"]))
-    names = (*tasks, "all") if len(tasks) > 1 else tasks
-    rows = [(name, *_figures(episodes[(episodes["task"] == name) | (name == "all")])) for name in names]
+    episodes, cell = data.episodes, data.plan.cells[0]
+    by_task = {row["task"]: row for row in per_task}
+    figures = [(task, by_task[task]) for task in dict.fromkeys(episodes["task"])]
+    if len(figures) > 1:
+        figures.append(("all", whole))
     headers = ("task", "success", "steps", "forwards/step", "AL", "accepted/round", "ms/step")
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = cell.identity.get("observation", "")
-    stress = _stressed(cell.settings)
-    print_table(headers, rows, f"{cell.label}, observation {observation}{stress}, seeds {seeds}")
-    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-    seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+    title = f"{cell.label}, observation {observation}{_stressed(cell.settings)}, seeds {seeds}"
+    print_table(headers, ((name, *_figures(row)) for name, row in figures), title)
     if not is_timed(episodes):
         typer.echo(f"not timed: {batch_of(cell.settings)} episodes at a time, for success alone")
         return
+    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
+    seconds = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
     rows = [(name, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for name, s in seconds.items() if s]
     print_table(("phase", "ms per decode", "share"), rows, "time by phase")
 
 
-def _figures(episodes: pd.DataFrame) -> list[str]:
-    from kerv_cli.report.measures import is_timed
+def _figures(row: Row) -> list[str]:
+    from kerv_cli.report.tables import is_number
 
-    steps, rounds = episodes["steps"].sum(), episodes["verifications"].sum()
-    per_round = [f"{episodes[name].sum() / rounds:.2f}" if rounds else "–" for name in ("committed", "accepted")]
-    return [
-        f"{episodes['success'].sum()}/{len(episodes)}",
-        f"{steps / len(episodes):.0f}",
-        f"{episodes['forwards'].sum() / steps:.2f}",
-        *per_round,
-        f"{1000 * (episodes['seconds'] / episodes['steps']).mean():.2f}" if is_timed(episodes) else "–",
-    ]
+    rates = (row[name] for name in ("forwards_per_step", "AL", "accepted_per_round", "time_per_step_ms"))
+    successes, steps = f"{row['successes']}/{row['episodes']}", f"{row['steps'] / row['episodes']:.0f}"
+    return [successes, steps, *(f"{rate:.2f}" if is_number(rate) else "–" for rate in rates)]

@@ -14,6 +14,9 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from kerv_cli.cli.command import F
     from kerv_cli.lab.catalogue import RunEntry
     from kerv_cli.report.compare import Comparison, Difference
 
@@ -30,6 +33,11 @@ def run_ids() -> list[str]:
     from kerv_cli.lab.catalogue import find_runs
 
     return [run.id for run in find_runs("results")]
+
+
+def _of_runs(name: str, *examples: str) -> Callable[[F], F]:
+    """Declares a command whose names are runs."""
+    return command(f"runs {name}", names=RUNS, completes=run_ids, keys="results", examples=examples)
 
 
 def _runs(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
@@ -84,13 +92,7 @@ def _plain(run: RunEntry) -> dict[str, Any]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
-@command(
-    "runs show",
-    names=RUNS,
-    completes=run_ids,
-    keys="results",
-    examples=("kerv runs show last", "kerv runs show main --json"),
-)
+@_of_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
     from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
@@ -109,10 +111,10 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         rows = [] if table is None else rows_of(table)
         print_json({**_plain(run), "made_from": origin, "bytes": size, "settings": rows})
         return
-    typed = shlex.join(["kerv", *run.command]) if run.command else "unknown"
+    line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
-    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": typed} | parts).items():
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": line} | parts).items():
         typer.echo(f"{name:<9} {value}")
     if table is not None:
         console().print(summary_table(table))
@@ -120,13 +122,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
-@command(
-    "runs compare",
-    names=RUNS,
-    completes=run_ids,
-    keys="results",
-    examples=("kerv runs compare main:ar main:kerv", "kerv runs compare main last"),
-)
+@_of_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: what differs in settings beside what differs in results, with intervals."""
     from kerv_cli.report import compare as comparing
@@ -142,13 +138,7 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
         _print_results(comparison)
 
 
-@command(
-    "runs diff",
-    names=RUNS,
-    completes=run_ids,
-    keys="results",
-    examples=("kerv runs diff main:ar main:kerv", "kerv runs diff main last"),
-)
+@_of_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
 def diff(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show what differs between two runs in settings, weights, machine and versions."""
     from dataclasses import asdict
@@ -169,8 +159,8 @@ def _print_differences(rows: list[Difference]) -> None:
     if not rows:
         typer.echo("no difference in settings, weights, machine or versions")
         return
-    shown = (("–" if value is None else value for value in (row.key, row.first, row.second)) for row in rows)
-    print_table(("setting", "first", "second"), shown)
+    cells = (("–" if value is None else value for value in (row.key, row.first, row.second)) for row in rows)
+    print_table(("setting", "first", "second"), cells)
 
 
 def _print_results(comparison: Comparison) -> None:
@@ -182,13 +172,7 @@ def _print_results(comparison: Comparison) -> None:
     print_table(("measure", "first", "second", "change", "95 % interval", ""), rows)
 
 
-@command(
-    "runs rerun",
-    names=RUNS,
-    completes=run_ids,
-    keys="results",
-    examples=("kerv runs rerun last", "kerv runs rerun main --plan"),
-)
+@_of_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
 def rerun(
     settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
@@ -204,15 +188,16 @@ def rerun(
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
     if run.command[:2] == ("runs", "import"):
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
-    from kerv_cli.cli.again import plan_again, run_again
+    from kerv_cli.cli.again import cells_again, run_again, store_again
     from kerv_cli.report.compare import same_tokens
 
-    again = plan_again(run, results)
+    cells = cells_again(run, results)
+    store = store_again(run, results, cells)
     if plan:
-        episodes = sum(len(cell.seeds) for cell in again.cells)
-        typer.echo(f"{run.id} again as {again.store.name}: {len(again.cells)} cells, {episodes} episodes")
+        episodes = sum(len(cell.seeds) for cell in cells)
+        typer.echo(f"{run.id} again as {store.name}: {len(cells)} cells, {episodes} episodes")
         return
-    entry = run_again(again, results)
+    entry = run_again(run, store, cells)
     same, shared = same_tokens(run, entry)
     if as_json:
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
@@ -228,9 +213,7 @@ def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None
     run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
 
 
-@command(
-    "runs rm", names=RUNS, completes=run_ids, keys="results", examples=("kerv runs rm last", "kerv runs rm main --yes")
-)
+@_of_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
     from kerv_cli.lab.catalogue import check_removable, disk_bytes, find_run, remove
@@ -252,13 +235,7 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@command(
-    "runs export",
-    names=RUNS,
-    completes=run_ids,
-    keys="results",
-    examples=("kerv runs export last", "kerv runs export main --to mlflow"),
-)
+@_of_runs("export", "kerv runs export last", "kerv runs export main --to mlflow")
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:

@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.errors import Interrupted
-from kerv_cli.base.places import check_writable
-from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
 
     from pandas import DataFrame
 
-    from kerv_cli.base.settings import RuntimeSettings
     from kerv_cli.lab.events import Outcome
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
@@ -58,7 +55,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         return
     store, covered = covered_cells(resolved, words)
     if plan:
-        print_sweep_plan(covered, store, next(iter(resolved.settings.values())).runtime.workers, as_json)
+        print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
         return
     outcome = run_covered(resolved, covered, store, words)
     _tell(outcome, resolved, covered.cells, store, words, as_json)
@@ -79,19 +76,15 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore
     """The study's store, and its cells as those on disk and those to run, after everything that can be refused without
     running was. Says what has no effect and which cells disagree. words: of the command."""
     from kerv_cli.cli.rollout import planned_cells
-    from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import idle_overrides
     from kerv_cli.lab.reuse import Stock, cover, disagreements
     from kerv_cli.lab.store import StudyStore
 
     print_notes(idle_overrides(resolved))
-    first = next(iter(resolved.settings.values()))
-    check_executor(first.runtime)
-    check_writable(first.results)
     cells = planned_cells(resolved)
-    store = StudyStore(first.results, resolved.study.name)
+    store = StudyStore(resolved.first.results, resolved.study.name)
     stock = Stock(store)
-    covered = cover(cells, stock, resolved.rerun, store.interrupted_since(["sweep", *words]))
+    covered = cover(cells, stock, resolved.sweep.rerun, store.interrupted_since(["sweep", *words]))
     _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
     return store, covered
 
@@ -99,14 +92,11 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore
 def _list_studies(as_json: bool) -> None:
     """Prints the studies of conf/ and how large each is."""
     from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
-    from kerv_cli.base.files import read_yaml_file
-    from kerv_cli.base.manifests import read
-    from kerv_cli.lab.resolve import tasks_of
+    from kerv_cli.lab.resolve import study_of_file, tasks_of
 
     rows, composer = [], Composer("rollout", RolloutSettings)
     for name in groups()["study"]:
-        path = conf_dir() / "study" / f"{name}.yaml"
-        study = read(StudySettings, {"name": name, **read_yaml_file(path)}, str(path))
+        study = study_of_file(conf_dir() / "study" / f"{name}.yaml")
         common = composer.compose(split_words(study.common))
         settings, tasks = sum(len(expand(text)) for text in study.settings.values()), len(tasks_of(common))
         rows.append((name, settings, tasks, common.episodes, settings * tasks * common.episodes, study.title))
@@ -151,35 +141,19 @@ def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json:
 
 def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
     """Runs what is not complete yet; says what differs from what it was before. Raises Interrupted: Ctrl-C."""
-    from kerv_cli.cli.progress import ProgressDisplay
-    from kerv_cli.lab.execute import execute
+    from kerv_cli.cli.running import running
     from kerv_cli.lab.reuse import Stock, disagreements, take_over
-    from kerv_cli.lab.run import CellRunner, reference_decode
-    from kerv_cli.report.viewing import save_recording
 
-    runtime: RuntimeSettings = next(iter(resolved.settings.values())).runtime
     cells = covered.cells
     take_over(store, covered)
-    if resolved.until == "done":
+    if resolved.sweep.until == "done":
         store.write_plan(resolved.study, cells)
     store.note_command(["sweep", *words])
-    here = runtime.executor == "local" and runtime.workers == 1
-    with ProgressDisplay(console(stderr=True)) as display:
-        runner = CellRunner(store.rollouts, save_recording, on_step=display.on_step if here else None)
-        try:
-            if resolved.until == "decided":
-                outcome = _until_decided(resolved, cells, store, lambda part: execute(
-                    part, runner, store, runtime, display, reference_decode))  # fmt: skip
-            else:
-                outcome = execute(cells, runner, store, runtime, display, reference_decode)
-        except KeyboardInterrupt:
-            count = sum(store.has_cell(cell.id) for cell in cells)
-            raise Interrupted(
-                f"interrupted: {count} of {len(cells)} cells are kept in {store.root}, the same command goes on there"
-            ) from None
+    with running(store, cells, resolved.first.runtime) as run:
+        outcome = _until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
     if not outcome.failed:
         store.note_finished()
-    if resolved.rerun != "never":
+    if resolved.sweep.rerun != "never":
         _warn(disagreements(outcome.done, Stock(store, others=False)))
     return outcome
 
@@ -192,9 +166,9 @@ def _until_decided(
     from kerv_cli.report import decide
     from kerv_cli.report.tables import load_study
 
-    study, margin = resolved.study, resolved.loss / 100
+    study, margin = resolved.study, resolved.sweep.loss / 100
     blocks = decide.looks_of(cells, study.block)
-    typer.echo(decide.rule(resolved.loss, len(blocks)), err=True)
+    typer.echo(decide.rule(resolved.sweep.loss, len(blocks)), err=True)
     latest: dict[str, decide.Verdict] = {}
     planned: list[Cell] = []
     total = Outcome()
@@ -210,7 +184,7 @@ def _until_decided(
         verdicts = decide.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
         typer.echo(f"look {look} of {len(blocks)}: {decide.summary(verdicts)}", err=True)
         latest |= {verdict.label: verdict for verdict in verdicts}
-        decide.write_verdicts(store.root, latest, resolved.loss, len(blocks))
+        decide.write_verdicts(store.root, latest, resolved.sweep.loss, len(blocks))
         open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decide.OPEN]
         if not open_labels:
             break
@@ -244,9 +218,8 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     if (table["label"] != table["baseline"]).any():
         typer.echo(f"verdict: {sentence(choices(table, None, loss)[0], loss, str(table['baseline'].iloc[0]))}")
     typer.echo(f"page: {store.root / 'report.html'}")
-    recordings = sorted(store.rollouts.glob("*.rrd"))
-    if recordings:
-        typer.echo(f"watch: {called()} view {recordings[0]}")
+    if store.recordings:
+        typer.echo(f"watch: {called()} view {store.recordings[0]}")
 
 
 def _tell(
@@ -256,12 +229,11 @@ def _tell(
 
     complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
     table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
-    recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
         rows = [] if table is None else rows_of(table)
         print_json({"study": store.name, "folder": store.root, "cells": counts, "settings": rows,
-                    "recordings": recordings})  # fmt: skip
+                    "recordings": store.recordings})  # fmt: skip
     else:
         if table is not None:
             tell_table(table, store, words)
@@ -274,7 +246,7 @@ def _tell(
                 from kerv_cli.report.report import report
 
                 report(store.root.parent.parent, store.name)
-            tell_end(table, store, resolved.loss)
+            tell_end(table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

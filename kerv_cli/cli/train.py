@@ -55,15 +55,15 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
         print_plan(run.plan(), as_json)
     with progress_bar(loading) as advance:
         run.load(advance)
-    begun = False
+    started = False
     losses: dict[int, float] = {}
     settings = run.settings
 
     def on_step(step: int, now: dict[str, float]) -> None:
-        nonlocal begun
-        if not begun and step > 1 and run.ranks.first:
+        nonlocal started
+        if not started and step > 1 and run.ranks.first:
             typer.echo(f"resuming at step {step - 1}", err=True)
-        begun = True
+        started = True
         losses.setdefault(step, now.get("loss", math.nan))
         log(step, now)
         advance(step, settings.train.steps, _line(now))

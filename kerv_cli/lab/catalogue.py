@@ -139,14 +139,14 @@ def store_of(run: RunEntry) -> StudyStore:
 
 def _study(store: StudyStore) -> RunEntry:
     kind = SWEEP if store.family == STUDIES else ROLLOUT
-    typed = store.commands()
+    commands = store.commands()
     name = store.name
     try:
         cells = unique_cells(store.read_plan().cells)
     except KervError:
         return RunEntry(name, kind, store.root, _changed(store.root / "plan.yaml"), "damaged")
     status = [entries for cell in cells if (entries := _status(store, cell)) is not None]
-    started = [s["started"] for s in status if s.get("started")] or [command.started for command in typed]
+    started = [s["started"] for s in status if s.get("started")] or [command.started for command in commands]
     episodes, successes = (sum(int(s[key]) for s in status) for key in ("episodes", "successes"))
     return RunEntry(
         id=name,
@@ -158,7 +158,7 @@ def _study(store: StudyStore) -> RunEntry:
         tasks=tuple(dict.fromkeys(cell.task for cell in cells)),
         episodes=episodes,
         figures={"success": successes / episodes} if episodes else {},
-        command=typed[-1].arguments if typed else (),
+        command=commands[-1].arguments if commands else (),
         made_from=_weights(cells),
     )
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,45 +35,8 @@ _LEAST = {"hold": 1, "linear": 2, "kalman": 2}  # actions that a prediction need
 _RATIO = 10.0  # q / r of the filter; experts' actions are predicted best with it, up to five steps ahead
 
 
-class Latency(Protocol):
-    """A source of latencies."""
-
-    def seconds(self, decode: DecodeRecord) -> float:
-        """Seconds from the decode's observation to its first action."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The decode's own inference time, times `scale`."""
-
-    scale: float = 1.0
-
-    def seconds(self, decode: DecodeRecord) -> float:
-        """See `Latency.seconds`."""
-        return self.scale * decode.seconds
-
-
-@dataclass(frozen=True)
-class Constant:
-    """A constant latency of every decode, seconds."""
-
-    latency: float
-
-    def seconds(self, decode: DecodeRecord) -> float:
-        """See `Latency.seconds`."""
-        return self.latency
-
-
-@dataclass(frozen=True)
-class Profiled:
-    """The cost model's seconds for the decode's forwards, its host seconds as measured, all times `scale`."""
-
-    profile: Profile
-    scale: float = 1.0
-
-    def seconds(self, decode: DecodeRecord) -> float:
-        """See `Latency.seconds`."""
-        return self.scale * predicted(sequence_of_record(decode), self.profile)
+Latency = Callable[[DecodeRecord], float]
+"""Seconds from a decode's observation to its first action."""
 
 
 def steps_of(seconds: float, control_hz: float) -> int:
@@ -122,7 +84,7 @@ class RealClock:
         Raises:
             KervError: a latency that is negative or not finite.
         """
-        seconds = self.latency.seconds(decode)
+        seconds = self.latency(decode)
         steps = self.expected = steps_of(seconds, self.space.control_hz)
         stale = min(steps, len(decode.actions))
         if self.compensation == CHUNK:
@@ -220,18 +182,22 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
     timing = settings.rollout
     ar_seconds = timing.ar_ms / 1000.0
     if timing.latency == CONSTANT:
-        return Constant(timing.latency_ms / 1000.0)
+        return lambda decode: timing.latency_ms / 1000.0
     if timing.latency == MEASURED:
-        return Measured(ar_seconds / measured if ar_seconds else 1.0)
+        scale = ar_seconds / measured if ar_seconds else 1.0
+        return lambda decode: scale * decode.seconds
     assert target is not None
     drafter = ("draft", "feed") if "drafter" in Method.of(settings).needs else ()
     profile = _open_profile(settings.results, timing.profile, ("encode", "prefill", "verify", *drafter))
-    if not ar_seconds:
-        return Profiled(profile)
     whole = profile.decode((settings.chunk or target.chunk) * target.actions.dofs)
-    if not whole:
+    if ar_seconds and not whole:
         raise UsageError(f"rollout.profile={timing.profile}: AR takes no time in it: nothing can be in proportion")
-    return Profiled(profile, ar_seconds / whole)
+    return profiled(profile, ar_seconds / whole if ar_seconds else 1.0)
+
+
+def profiled(profile: Profile, scale: float = 1.0) -> Latency:
+    """The cost model's seconds for a decode's forwards, its host seconds as measured, all times `scale`."""
+    return lambda decode: scale * predicted(sequence_of_record(decode), profile)
 
 
 def _profile_path(results: str, name: str) -> Path:

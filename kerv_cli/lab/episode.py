@@ -54,26 +54,23 @@ class Watcher(Protocol):
         """Whether the chunk is executed on from `step`."""
 
 
-class _Trace:
-    """Collects executed actions, end-effector positions, gripper openings, frames and places, step by step."""
+class _Execution:
+    """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
+    the first one the robot stands still. Collects actions, end-effector positions, gripper openings, frames and
+    places, step by step."""
 
-    def __init__(self, world: World, camera: CameraConfig | None) -> None:
-        self.world, self.camera = world, camera
+    def __init__(self, world: World, follower: Follower, camera: CameraConfig | None, on_step: OnStep | None) -> None:
+        self.world, self.follower, self.camera, self.on_step = world, follower, camera, on_step
+        self.in_hand: deque[np.ndarray] = deque()
+        self.last = world.spec.standstill(world.gripper)
         self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
         self.path: list[np.ndarray] = []
         self.gripper: list[float] = []
         self.frames: dict[int, np.ndarray] = {}
         self.places: dict[str, list[np.ndarray]] = {}
-        self._look()
+        self._collect()
 
-    def add(self, action: np.ndarray) -> None:
-        """Executes `action` and stores the result."""
-        self.world.step(action)
-        space = self.world.spec.actions
-        self.actions.append(np.clip(action, space.low, space.high).astype(np.float32))
-        self._look()
-
-    def _look(self) -> None:
+    def _collect(self) -> None:
         self.path.append(self.world.end_effector)
         self.gripper.append(self.world.gripper)
         if self.camera:
@@ -82,35 +79,28 @@ class _Trace:
             for place in self.world.spec.observation.places:
                 self.places.setdefault(place.name, []).append(state[place.first : place.first + 3])
 
-
-class _Execution:
-    """Executes actions, one per control step: of the chunk in hand, and where it is used up the last one again; before
-    the first one the robot stands still."""
-
-    def __init__(self, world: World, follower: Follower, trace: _Trace, on_step: OnStep | None) -> None:
-        self.world, self.follower, self.trace, self.on_step = world, follower, trace, on_step
-        self.in_hand: deque[np.ndarray] = deque()
-        self.last = world.spec.standstill(world.gripper)
-
     def step(self) -> None:
         """One control step."""
         if self.in_hand:
             self.last = self.in_hand.popleft()
-        self.trace.add(self.last)
-        self.follower.observe(self.trace.actions[-1], self.trace.path[-1])
+        self.world.step(self.last)
+        space = self.world.spec.actions
+        self.actions.append(np.clip(self.last, space.low, space.high).astype(np.float32))
+        self._collect()
+        self.follower.observe(self.actions[-1], self.path[-1])
         if self.on_step is not None:
-            self.on_step(len(self.trace.actions))
+            self.on_step(len(self.actions))
 
     def take(self, decode: DecodeRecord, clock: RealClock | None) -> None:
         """A new chunk replaces the one in hand."""
         if clock is None or decode.delay is None:
             self.in_hand = deque(decode.actions)
         else:
-            self.in_hand = deque(clock.chunk(decode, self.trace.actions[: decode.delay.observed]))
+            self.in_hand = deque(clock.chunk(decode, self.actions[: decode.delay.observed]))
 
-    def until(self, left: int) -> None:
+    def until(self, rest: int) -> None:
         """Executes the chunk in hand until so many of its steps are left, or the episode ends."""
-        while len(self.in_hand) > left and not self.world.done:
+        while len(self.in_hand) > rest and not self.world.done:
             self.step()
 
     def watched(self, decode: DecodeRecord, watcher: Watcher) -> DecodeRecord:
@@ -129,11 +119,11 @@ class _Execution:
 
     def during(self, delay: Delay) -> Delay:
         """The world goes on for a decode's delay -> the delay, with what was executed."""
-        before, in_hand = len(self.trace.actions), len(self.in_hand)
-        while len(self.trace.actions) < before + delay.steps and not self.world.done:
+        before, in_hand = len(self.actions), len(self.in_hand)
+        while len(self.actions) < before + delay.steps and not self.world.done:
             self.step()
         carried = in_hand - len(self.in_hand)
-        return dataclasses.replace(delay, carried=carried, held=len(self.trace.actions) - before - carried)
+        return dataclasses.replace(delay, carried=carried, held=len(self.actions) - before - carried)
 
 
 def run_episode(
@@ -175,8 +165,7 @@ def episode(
     began = time.perf_counter()
     world.reset(seed)
     follower.reset(world.task, seed, world.end_effector)
-    trace = _Trace(world, camera)
-    execution = _Execution(world, follower, trace, on_step)
+    execution = _Execution(world, follower, camera, on_step)
     watcher: Watcher | None = getattr(follower, "watcher", None)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
@@ -184,12 +173,12 @@ def episode(
         clock.reset()
     while not world.done:
         observation = world.observe(follower.cameras)
-        decode = yield observation if clock is None else clock.observed(observation, trace.path)
+        decode = yield observation if clock is None else clock.observed(observation, execution.path)
         if clock is not None:
-            delay = clock.delay(decode, len(trace.actions))
+            delay = clock.delay(decode, len(execution.actions))
             decode = dataclasses.replace(decode, delay=execution.during(delay))
         decodes.append(decode)
-        decode_steps.append(len(trace.actions))
+        decode_steps.append(len(execution.actions))
         execution.take(decodes[-1], clock)
         if watcher is not None:
             decodes[-1] = execution.watched(decodes[-1], watcher)
@@ -202,14 +191,14 @@ def episode(
         instruction=world.instruction,
         seed=seed,
         success=world.succeeded,
-        steps=len(trace.actions),
+        steps=len(execution.actions),
         decodes=tuple(decodes),
         decode_steps=tuple(decode_steps),
-        actions=np.stack(trace.actions),
-        path=np.stack(trace.path).astype(np.float32),
-        gripper=np.asarray(trace.gripper, dtype=np.float32),
+        actions=np.stack(execution.actions),
+        path=np.stack(execution.path).astype(np.float32),
+        gripper=np.asarray(execution.gripper, dtype=np.float32),
         initial_state=world.initial_state,
-        frames=trace.frames,
-        places={name: np.asarray(path, dtype=np.float32) for name, path in trace.places.items()},
+        frames=execution.frames,
+        places={name: np.asarray(path, dtype=np.float32) for name, path in execution.places.items()},
         wall_seconds=time.perf_counter() - began,
     )

@@ -5,15 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from kerv_cli.base.errors import KervError
 from kerv_cli.lab.plan import Block, Cell
 
 
 @dataclass(frozen=True)
-class CellFailed:
-    """A cell failed, with the reason in one line; the rest of its block goes on."""
+class CellEnd:
+    """The end of a cell, complete or failed; the rest of its block goes on. It is pickled: of an exception that is not
+    kerv's only the text is kept. seconds: wall time of its episodes and of preparing its setting."""
 
     cell: Cell
-    reason: str
+    episodes: int = 0
+    successes: int = 0
+    seconds: float = 0.0
+    reused: bool = False  # another sweep completed it while this one ran
+    reason: str = ""  # of a failure, in one line; empty: complete
+    trace: str = ""
+    error: KervError | None = None
 
 
 @dataclass(frozen=True)
@@ -22,17 +30,16 @@ class Outcome:
 
     done: list[Cell] = field(default_factory=list)  # run now
     reused: list[Cell] = field(default_factory=list)  # complete before
-    failed: list[CellFailed] = field(default_factory=list)
+    failed: list[CellEnd] = field(default_factory=list)
     seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class SweepStarted:
-    """The sweep begins. total: cells to run. workers: blocks that run at the same time. episodes: of those cells."""
+    """The sweep begins. total: cells to run. episodes: of those cells."""
 
     total: int
     reused: int
-    workers: int
     episodes: int
 
 
@@ -50,29 +57,5 @@ class BlockWaits:
     block: Block
 
 
-@dataclass(frozen=True)
-class CellDone:
-    """A cell completed and is stored. seconds: wall time of its episodes and of preparing its setting."""
-
-    cell: Cell
-    episodes: int
-    successes: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class CellReused:
-    """Another sweep completed the cell while this one ran."""
-
-    cell: Cell
-
-
-@dataclass(frozen=True)
-class SweepFinished:
-    """Every cell is done, reused or failed: the last event."""
-
-    outcome: Outcome
-
-
-Event = SweepStarted | BlockStarted | BlockWaits | CellDone | CellFailed | CellReused | SweepFinished
+Event = SweepStarted | BlockStarted | BlockWaits | CellEnd
 OnEvent = Callable[[Event], None]

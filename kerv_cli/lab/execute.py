@@ -7,6 +7,8 @@ take turns in it, episode by episode, and a cell is written after its last episo
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import math
 import os
 import secrets
@@ -17,17 +19,18 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError
 from kerv_cli.base.leftovers import clean
 from kerv_cli.base.provenance import git_commit, stamp
+from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab import events
 from kerv_cli.lab.claims import claim, clean_void, is_claimed, note_running, release, running_cell
 from kerv_cli.lab.code import code_hash
-from kerv_cli.lab.executors import Executor, WorkerLost, check_executor, open_executor
+from kerv_cli.lab.events import BlockStarted, BlockWaits, CellEnd, OnEvent, Outcome, SweepStarted
+from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Block, Cell, blocks_of
 from kerv_cli.lab.rows import Circumstances
@@ -39,41 +42,25 @@ RunEpisode = Callable[[int], EpisodeRecord]
 """Runs the episode of a seed."""
 
 Prepare = Callable[[Cell], RunEpisode]
-"""Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls. One
-that can run the cells of a batch is a `Together` too."""
+"""Builds and warms up a cell's setting on its task. Picklable; loaded weights stay in its module between calls. For
+cells of a batch it has a method too, `CellRunner.together`."""
 
 Gauge = Callable[[str], float]
 """Seconds of a fixed workload on a device. Picklable."""
 
 
-@runtime_checkable
-class Together(Protocol):
-    """Runs the episodes of several cells at once."""
-
-    def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
-        """Cells of one setting -> each episode as it ends: its cell, its seed, and its record or its error."""
-
-
-@dataclass(frozen=True)
-class CellResult:
-    """The end of a cell, complete or failed; plain values, because an exception may not survive pickling."""
-
-    episodes: int = 0
-    successes: int = 0
-    seconds: float = 0.0
-    reason: str = ""  # empty: complete
-    reused: bool = False  # another sweep completed it meanwhile
-    trace: str = ""
-    storage: bool = False  # the disk refused the cell: no other cell could be written either
-
-
-Results = dict[str, CellResult]
+Ends = dict[str, CellEnd]
 """Ends of a block's cells by id."""
 
+Step = tuple[Cell, Callable[[], CellEnd | None]]
+"""A cell, and what is to be done for it next: the end of the cell where that completes it."""
 
-def failed(error: BaseException) -> CellResult:
-    """The result of a cell that raised `error`, inside an except clause."""
-    return CellResult(reason=one_line(error), trace=traceback.format_exc(), storage=isinstance(error, StorageError))
+
+def failure(cell: Cell, error: Exception) -> CellEnd:
+    """The end of a cell by an error, inside the except clause that caught it."""
+    trace = traceback.format_exc()
+    kept = error.with_traceback(None) if isinstance(error, KervError) else None  # frames hold weights
+    return CellEnd(cell, reason=one_line(error), trace=trace, error=kept)
 
 
 def execute(
@@ -81,9 +68,9 @@ def execute(
     prepare: Prepare,
     store: StudyStore,
     runtime: RuntimeSettings | None = None,
-    on_event: events.OnEvent = lambda event: None,
+    on_event: OnEvent = lambda event: None,
     gauge: Gauge | None = None,
-) -> events.Outcome:
+) -> Outcome:
     """Runs the cells that are not complete yet, block by block; cells of one id run once.
 
     A cell that raises, or whose worker is killed, is reported as failed and the rest of its block goes on. Cells that
@@ -94,43 +81,19 @@ def execute(
         StorageError: the disk refused a result; further results could not be stored either.
         UsageError: the executor cannot be used.
     """
-    runtime = runtime or RuntimeSettings()
-    check_executor(runtime)
-    clock = time.perf_counter()
-    sweep = _Sweep(prepare, store, runtime, on_event, gauge)
-    clean(store.cells)
-    clean_void(store.claims)
-    blocks, damaged = sweep.split(cells)
-    threads = max((cell.settings["runtime"]["threads"] for cell in cells), default=1)
-    executor = open_executor(runtime, threads, store.jobs) if blocks else None
-    to_run = [cell for block in blocks for cell in block.cells]
-    episodes = sum(len(cell.seeds) for cell in to_run)
-    total = len(to_run) + len(damaged)
-    on_event(events.SweepStarted(total, len(sweep.outcome.reused), runtime.workers, episodes))
-    for cell, result in damaged:
-        sweep.note(cell, result)
-    if executor is not None:
-        sweep.run(blocks, executor)
-    outcome = dataclasses.replace(sweep.outcome, seconds=time.perf_counter() - clock)
-    on_event(events.SweepFinished(outcome))
-    return outcome
+    return _Sweep(prepare, store, runtime or RuntimeSettings(), on_event, gauge).run(cells)
 
 
 class _Sweep:
     """State of one call of `execute`."""
 
     def __init__(
-        self,
-        prepare: Prepare,
-        store: StudyStore,
-        runtime: RuntimeSettings,
-        on_event: events.OnEvent,
-        gauge: Gauge | None,
+        self, prepare: Prepare, store: StudyStore, runtime: RuntimeSettings, on_event: OnEvent, gauge: Gauge | None
     ) -> None:
-        self.prepare, self.store, self.on_event, self.gauge = prepare, store, on_event, gauge
-        self.outcome = events.Outcome()
+        self.prepare, self.store, self.runtime, self.on_event, self.gauge = prepare, store, runtime, on_event, gauge
+        self.options = check_executor(runtime)
+        self.outcome = Outcome()
         self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
-        self.workers = runtime.workers
         self.status = {
             "workers": runtime.workers,
             "executor": runtime.executor,
@@ -140,24 +103,44 @@ class _Sweep:
         }
         self.waiting: deque[Block] = deque()
         self.elsewhere: list[Block] = []  # another sweep computes them
-        self.running: dict[Future[Results | None], BlockRun] = {}
+        self.running: dict[Future[Ends | None], BlockRun] = {}
 
-    def split(self, cells: Sequence[Cell]) -> tuple[list[Block], list[tuple[Cell, CellResult]]]:
-        """Blocks of the cells to run, and the damaged cells; complete cells are added to the outcome."""
-        damaged: dict[str, tuple[Cell, CellResult]] = {}
+    def run(self, cells: Sequence[Cell]) -> Outcome:
+        """Runs what is not complete."""
+        clock = time.perf_counter()
+        clean(self.store.cells)
+        clean_void(self.store.claims)
+        damaged = self._damaged(cells)
+        settled = {*damaged, *(cell.id for cell in self.outcome.reused)}
+        blocks = (block.without(settled) for block in blocks_of(cells, self.runtime.workers))
+        self.waiting.extend(block for block in blocks if block is not None)
+        executor: Executor | None = None
+        if self.waiting:
+            threads = max(cell.settings["runtime"]["threads"] for cell in cells)
+            part = find("executor", self.runtime.executor)
+            executor = part.built(self.options, self.runtime.workers, threads, self.store.jobs)
+        to_run = [cell for block in self.waiting for cell in block.cells]
+        total, episodes = len(to_run) + len(damaged), sum(len(cell.seeds) for cell in to_run)
+        self.on_event(SweepStarted(total, len(self.outcome.reused), episodes))
+        for end in damaged.values():
+            self._note(end)
+        if executor is not None:
+            self._run_blocks(executor)
+        return dataclasses.replace(self.outcome, seconds=time.perf_counter() - clock)
+
+    def _damaged(self, cells: Sequence[Cell]) -> Ends:
+        """The damaged cells by id; complete ones are added to the outcome."""
+        damaged = {}
         for cell in (cell for block in blocks_of(cells) for cell in block.cells):
             try:
                 if self.store.has_cell(cell.id):
                     self.outcome.reused.append(cell)
             except CheckpointError as error:
-                damaged[cell.id] = cell, failed(error)
-        settled = {*damaged, *(cell.id for cell in self.outcome.reused)}
-        blocks = [block.without(settled) for block in blocks_of(cells, self.workers)]
-        return [block for block in blocks if block is not None], list(damaged.values())
+                damaged[cell.id] = failure(cell, error)
+        return damaged
 
-    def run(self, blocks: Sequence[Block], executor: Executor) -> None:
+    def _run_blocks(self, executor: Executor) -> None:
         """Keeps every slot busy until all blocks are settled."""
-        self.waiting.extend(blocks)
         finished = False
         try:
             while self.waiting or self.running or self.elsewhere:
@@ -165,7 +148,7 @@ class _Sweep:
                     block = self.waiting.popleft()
                     name = f"{self.run_id}-{secrets.token_hex(4)}"
                     attempt = BlockRun(block, name, self.run_id, self.prepare, self.store, self.gauge, self.status)
-                    self.on_event(events.BlockStarted(block))
+                    self.on_event(BlockStarted(block))
                     self.running[executor.submit(attempt)] = attempt
                 for future in wait(self.running, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done:
                     self._settle(self.running.pop(future), future)
@@ -176,44 +159,39 @@ class _Sweep:
             for attempt in self.running.values():
                 release(self.store.claims, attempt.block.cells, attempt.name)
 
-    def _settle(self, attempt: BlockRun, future: Future[Results | None]) -> None:
+    def _settle(self, attempt: BlockRun, future: Future[Ends | None]) -> None:
         block = attempt.block
         try:
-            results = future.result()
+            ends = future.result()
         except WorkerLost as error:
-            self._lost(attempt, failed(error))
-            return
+            ends = self._lost(attempt, error)
         except Exception as error:  # noqa: BLE001 - the block could not be sent or its result not be read
-            self._note_all(block, dict.fromkeys((cell.id for cell in block.cells), failed(error)))
-            return
-        if results is None:
+            ends = {cell.id: failure(cell, error) for cell in block.cells}
+        if ends is None:
             self.elsewhere.append(block)
-            self.on_event(events.BlockWaits(block))
-        else:
-            self._note_all(block, results)
-
-    def _note_all(self, block: Block, results: Results) -> None:
+            self.on_event(BlockWaits(block))
+            return
         for cell in block.cells:
-            if cell.id in results:
-                self.note(cell, results[cell.id])
+            if cell.id in ends:
+                self._note(dataclasses.replace(ends[cell.id], cell=cell))  # a worker's copy takes memory of its own
 
-    def _lost(self, attempt: BlockRun, result: CellResult) -> None:
+    def _lost(self, attempt: BlockRun, error: WorkerLost) -> Ends:
         """After a worker's end: the cell that ran has failed, complete cells are done, the block's others run again."""
         cells = attempt.block.cells
         last_cell = running_cell(self.store.claims, cells, attempt.name)
         release(self.store.claims, cells, attempt.name)
-        results = {} if last_cell is None else {last_cell.id: result}
+        ends: Ends = {}
         for cell in cells:
-            if last_cell is None:  # it ended before any cell ran: so would another attempt
-                results[cell.id] = result
+            if last_cell is None or cell is last_cell:  # None: it ended at once, as another attempt would
+                ends[cell.id] = failure(cell, error)
             elif self.store.has_cell(cell.id):
                 status = self.store.status_of(cell.id)
                 sums = status["episodes"], status["successes"], status["seconds"]
-                results[cell.id] = CellResult(*sums, reused=status["run"] != self.run_id)
-        self._note_all(attempt.block, results)
-        rest = attempt.block.without(results)
+                ends[cell.id] = CellEnd(cell, *sums, reused=status["run"] != self.run_id)
+        rest = attempt.block.without(ends)
         if rest is not None:
             self.waiting.append(rest)
+        return ends
 
     def _look_elsewhere(self) -> None:
         """When nothing else is left to do, queues the blocks that no other sweep computes any more."""
@@ -226,21 +204,19 @@ class _Sweep:
         if not self.waiting:
             time.sleep(_POLL_SECONDS)
 
-    def note(self, cell: Cell, result: CellResult) -> None:
-        """Adds a cell's result to the outcome and emits its event."""
-        if result.storage:
-            raise StorageError(result.reason)
-        if result.reason:
-            self.store.write_failure(cell.id, f"{cell.label} on {cell.task}\n\n{result.trace}")
-            self.outcome.failed.append(events.CellFailed(cell, result.reason))
-            self.on_event(self.outcome.failed[-1])
-        elif result.reused:
-            self.outcome.reused.append(cell)
-            self.on_event(events.CellReused(cell))
+    def _note(self, end: CellEnd) -> None:
+        """Adds a cell's end to the outcome and emits it."""
+        if isinstance(end.error, StorageError):
+            raise end.error
+        if end.reason:
+            self.store.write_failure(end.cell.id, f"{end.cell.label} on {end.cell.task}\n\n{end.trace}")
+            self.outcome.failed.append(end)
+        elif end.reused:
+            self.outcome.reused.append(end.cell)
         else:
-            self.store.clear_failure(cell.id)
-            self.outcome.done.append(cell)
-            self.on_event(events.CellDone(cell, result.episodes, result.successes, result.seconds))
+            self.store.clear_failure(end.cell.id)
+            self.outcome.done.append(end.cell)
+        self.on_event(end)
 
 
 @dataclass(frozen=True)
@@ -258,66 +234,57 @@ class BlockRun:
     gauge: Gauge | None = None
     status: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(self) -> Results | None:
-        """Results by cell id; None where another sweep computes one of the cells: nothing was run then."""
+    def __call__(self) -> Ends | None:
+        """Ends by cell id; None where another sweep computes one of the cells: nothing was run then."""
+        first = self.block.cells[0]
         try:
             if not claim(self.store.claims, self.block.cells, self.run, self.name):
                 return None
         except StorageError as error:
-            return {self.block.cells[0].id: failed(error)}
+            return {first.id: failure(first, error)}
         try:
-            return self._take_turns() if self.block.batch == 1 else self._together()
+            ends: Ends = {}
+            for cell, step in self._take_turns(ends) if self.block.batch == 1 else self._together(ends):
+                try:
+                    end = step()
+                except Exception as error:  # noqa: BLE001 - one setting's failure must not end the others
+                    end = failure(cell, error)
+                if end is not None:
+                    ends[cell.id] = end
+                    if isinstance(end.error, StorageError):
+                        break
+            return ends
         finally:
             release(self.store.claims, self.block.cells, self.name)
 
-    def _take_turns(self) -> Results:
+    def _take_turns(self, ends: Ends) -> Iterator[Step]:
+        """Builds every setting, then runs them in turn, seed by seed."""
         turns = [_Turn(cell, self) for cell in self.block.cells]
-        results = {turn.cell.id: result for turn in turns if (result := _attempt(turn.prepare)) is not None}
-        order = 0
+        yield from ((turn.cell, turn.prepare) for turn in turns)
+        order = itertools.count()
         for seed in self.block.seeds:
             for turn in (turns[index] for index in self.block.order(seed)):
-                if turn.cell.id in results:
-                    continue
-                result = _attempt(turn.take, seed, order)
-                order += 1
-                if result is not None:
-                    results[turn.cell.id] = result
-                    if result.storage:
-                        return results
-        return results
+                if turn.cell.id not in ends:
+                    yield turn.cell, functools.partial(turn.take, seed, next(order))
 
-    def _together(self) -> Results:
-        """Runs the cells of a batch; a cell is written as soon as its last episode has ended."""
-        turns = {cell.id: _Turn(cell, self) for cell in self.block.cells if not self.store.has_cell(cell.id)}
-        results = {cell.id: CellResult(reused=True) for cell in self.block.cells if cell.id not in turns}
-        cells = [turn.cell for turn in turns.values()]
+    def _together(self, ends: Ends) -> Iterator[Step]:
+        """Takes the episodes of a batch as they end."""
+        ends |= {cell.id: CellEnd(cell, reused=True) for cell in self.block.cells if self.store.has_cell(cell.id)}
+        turns = {cell.id: _Turn(cell, self) for cell in self.block.cells if cell.id not in ends}
+        if not turns:
+            return
+        note_running(self.store.claims, self.block.cells[0], self.name)
+        runner: Any = self.prepare
         try:
-            if not isinstance(self.prepare, Together):
-                raise TypeError(f"{type(self.prepare).__name__} runs one episode at a time, not {self.block.batch}")
-            note_running(self.store.claims, self.block.cells[0], self.name)
-            for order, (cell, _, end) in enumerate(self.prepare.together(cells) if cells else ()):
-                if cell.id in results:
-                    continue  # another of its episodes failed
-                result = _attempt(turns[cell.id].add, end, order)
-                if result is not None:
-                    results[cell.id] = result
-                    if result.storage:
-                        return results
+            for order, (cell, _, result) in enumerate(runner.together([turn.cell for turn in turns.values()])):
+                if cell.id not in ends:  # else another of its episodes failed
+                    yield cell, functools.partial(turns[cell.id].add, result, order)
         except Exception as error:  # noqa: BLE001 - what the decodes have in common failed
-            results = dict.fromkeys(turns, failed(error)) | results
-        return results
-
-
-def _attempt(step: Callable[..., CellResult | None], *arguments: Any) -> CellResult | None:
-    """The step's result; an error is the cell's result."""
-    try:
-        return step(*arguments)
-    except Exception as error:  # noqa: BLE001 - one setting's failure of any kind must not end the others
-        return failed(error)
+            ends |= {name: failure(turn.cell, error) for name, turn in turns.items() if name not in ends}
 
 
 class _Turn:
-    """One cell's part in a block. Its methods return the cell's result as soon as it is complete, or raise."""
+    """One cell's part in a block. Its methods return the cell's end as soon as it is complete, or raise."""
 
     def __init__(self, cell: Cell, work: BlockRun) -> None:
         self.cell, self.work = cell, work
@@ -325,17 +292,17 @@ class _Turn:
         self.episodes: list[tuple[EpisodeRecord, Circumstances]] = []
         self.seconds = 0.0
 
-    def prepare(self) -> CellResult | None:
+    def prepare(self) -> CellEnd | None:
         """Builds the setting, unless the cell is complete."""
         clock = time.perf_counter()
         if self.work.store.has_cell(self.cell.id):
-            return CellResult(reused=True)
+            return CellEnd(self.cell, reused=True)
         note_running(self.work.store.claims, self.cell, self.work.name)
         self.run_episode = self.work.prepare(self.cell)
         self.seconds += time.perf_counter() - clock
         return None
 
-    def take(self, seed: int, order: int) -> CellResult | None:
+    def take(self, seed: int, order: int) -> CellEnd | None:
         """Runs one episode; writes the cell after its last one."""
         note_running(self.work.store.claims, self.cell, self.work.name)
         started = datetime.now(UTC)
@@ -344,17 +311,17 @@ class _Turn:
         record = self.run_episode(seed)
         return self._keep(record, order, started, load, time.perf_counter() - clock)
 
-    def add(self, end: EpisodeRecord | Exception, order: int) -> CellResult | None:
+    def add(self, result: EpisodeRecord | Exception, order: int) -> CellEnd | None:
         """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
         note_running(self.work.store.claims, self.cell, self.work.name)
-        if isinstance(end, Exception):
-            raise end
-        started = datetime.now(UTC) - timedelta(seconds=end.wall_seconds)
-        return self._keep(end, order, started, math.nan, end.wall_seconds)
+        if isinstance(result, Exception):
+            raise result
+        started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
+        return self._keep(result, order, started, math.nan, result.wall_seconds)
 
     def _keep(
         self, record: EpisodeRecord, order: int, started: datetime, load: float, seconds: float
-    ) -> CellResult | None:
+    ) -> CellEnd | None:
         at = Circumstances(self.work.name, order, started.isoformat(timespec="milliseconds"), load)
         self.episodes.append((record, at))
         self.seconds += seconds
@@ -364,8 +331,8 @@ class _Turn:
         status |= {"seconds": self.seconds}
         records, circumstances = zip(*sorted(self.episodes, key=lambda episode: episode[0].seed), strict=True)
         if not self.work.store.write_cell(self.cell, records, status, circumstances):
-            return CellResult(reused=True)
-        return CellResult(len(records), sum(record.success for record in records), self.seconds)
+            return CellEnd(self.cell, reused=True)
+        return CellEnd(self.cell, len(records), sum(record.success for record in records), self.seconds)
 
 
 def one_line(error: BaseException) -> str:

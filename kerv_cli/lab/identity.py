@@ -83,11 +83,11 @@ def effective(settings: Plain) -> dict[str, Any]:
     """The settings that determine a result: complete, without those that have no effect."""
     determining = without(settings, NOT_DETERMINING)
     try:
-        typed = settings_from(settings, tolerant=True)
+        today = settings_from(settings, tolerant=True)
     except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
         return determining
-    determining = _filled(determining, without(as_plain(typed), NOT_DETERMINING))
-    for key in idle_keys(typed) if typed.policy.kind != EXPERT else ():
+    determining = _filled(determining, without(as_plain(today), NOT_DETERMINING))
+    for key in idle_keys(today) if today.policy.kind != EXPERT else ():
         _drop(determining, key.split("."))
     determining["runtime"] = without(determining["runtime"], NOT_DETERMINING_RUNTIME)
     if not stress_of(determining)["level"]:

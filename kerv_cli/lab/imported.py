@@ -30,7 +30,7 @@ from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, EpisodeRecord
 from kerv_cli.lab.identity import ENGINE, OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
-from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, table_bytes
+from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row
 from kerv_cli.lab.served import Served, path_of, read_served
 from kerv_cli.lab.store import StudyStore
 
@@ -183,11 +183,8 @@ class Side:
 
     def takes(self, one: Evaluation) -> bool:
         """Whether an evaluation of another benchmark is of the same server."""
-        first = self.evaluations[0]
-        same = (first.name, first.facts, first.server.get("action_spec")) == (
-            *(one.name, one.facts, one.server.get("action_spec")),
-        )
-        return same and one.benchmark not in {other.benchmark for other in self.evaluations}
+        servers = [(each.name, each.facts, each.server.get("action_spec")) for each in (self.evaluations[0], one)]
+        return servers[0] == servers[1] and one.benchmark not in {other.benchmark for other in self.evaluations}
 
 
 def sides_of(recordings: Sequence[Sequence[Evaluation]], labels: Sequence[str] = ()) -> list[Side]:
@@ -254,97 +251,80 @@ def write_study(results: Path, name: str, sides: Sequence[Side], baseline: str, 
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(labels)}")
     benchmarks = list(dict.fromkeys(one.benchmark for side in sides for one in side.evaluations))
     run = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
-    plans = [_SidePlan(side, results, len(benchmarks) > 1, run) for side in sides]
-    notes = [line for plan in plans for line in plan.notes]
+    planned = [cell for side in sides for cell in _planned(side, len(benchmarks) > 1)]
+    notes = [line for side in sides for one in side.evaluations for line in _notes(side.label, one)]
     study = StudySettings(
         name=name, title=f"vla-eval: {', '.join(benchmarks)}", baseline=baseline, note="; ".join(notes)
     )
     store.note_command(words)
-    store.write_plan(study, [cell for plan in plans for cell in plan.cells])
-    for plan in plans:
-        plan.write(store)
+    store.write_plan(study, [cell for cell, _, _ in planned])
+    for cell, one, episodes in planned:
+        if episodes:
+            pairs = [(episode, _served(results, one, episode)) for episode in episodes]
+            rows = [_row(cell, one, *pair) for pair in pairs]
+            tables = {
+                "episodes.parquet": pa.Table.from_pylist(rows, schema=EPISODE_SCHEMA),
+                "decodes.parquet": _decodes(cell, pairs),
+            }
+            store.write_tables(cell, tables, _status(one, episodes, sum(row["seconds"] for row in rows), run))
     store.note_finished()
     return notes
 
 
-class _SidePlan:
-    """The cells of one side: those of episodes that are there, and of those that are missing."""
-
-    def __init__(self, side: Side, results: Path, several: bool, run: str) -> None:
-        self.side, self.results, self.run, self.several = side, results, run, several
-        self.settings, self.identity = _settings(side), _identity(side)
-        self.there: list[tuple[Cell, Evaluation, list[Episode]]] = []
-        self.cells: list[Cell] = []
-        self.notes: list[str] = []
-        for one in side.evaluations:
-            self._plan(one)
-
-    def _plan(self, one: Evaluation) -> None:
+def _planned(side: Side, several: bool) -> Iterator[tuple[Cell, Evaluation, list[Episode]]]:
+    """The side's cells, each with its episodes; one without any is of those that are missing. several: the study is of
+    several benchmarks."""
+    settings, identity = _settings(side), _identity(side)
+    for one in side.evaluations:
         tasks: dict[str, list[Episode]] = {}
         for episode in one.episodes:
             tasks.setdefault(episode.task, []).append(episode)
-        failed = [episode for episode in one.episodes if episode.reason]
         each = int(one.config.get("episodes_per_task") or 0)
         for task, episodes in tasks.items():
             good = sorted((e for e in episodes if not e.reason), key=lambda e: e.seed)
             offset = episodes[0].seed - episodes[0].index if not episodes[0].reason else 0
             missing = [i + offset for i in range(each) if i + offset not in {e.seed for e in good}]
+            name = f"{one.benchmark}: {task}" if several else task
             if good:
-                cell = self._cell(one, task, [e.seed for e in good])
-                self.there.append((cell, one, good))
-                self.cells.append(cell)
+                yield make_cell(side.label, "", settings, identity, name, [e.seed for e in good]), one, good
             if missing:
-                self.cells.append(self._cell(one, task, missing))
-        lost = one.planned - len(one.episodes)
-        if failed:
-            reasons = ", ".join(sorted({episode.reason for episode in failed}))
-            self.notes.append(
-                f"{self.side.label}: {len(failed)} episodes ended in an error ({reasons}) and are left out"
-            )
-        if lost > 0:
-            self.notes.append(f"{self.side.label}: {lost} of {one.planned} episodes of {one.benchmark} are missing")
+                yield make_cell(side.label, "", settings, identity, name, missing), one, []
 
-    def _cell(self, one: Evaluation, task: str, seeds: Sequence[int]) -> Cell:
-        name = f"{one.benchmark}: {task}" if self.several else task
-        return make_cell(self.side.label, "", self.settings, self.identity, name, seeds)
 
-    def write(self, store: StudyStore) -> None:
-        """Writes the cells that have episodes."""
-        for cell, one, episodes in self.there:
-            kept = [self._served(one, episode) for episode in episodes]
-            pairs = list(zip(episodes, kept, strict=True))
-            found = [_row(cell, one, *pair) for pair in pairs]
-            tables = {
-                "episodes.parquet": table_bytes(pa.Table.from_pylist(found, schema=EPISODE_SCHEMA)),
-                "decodes.parquet": table_bytes(_decodes(cell, pairs)),
-            }
-            seconds = sum(row["seconds"] for row in found)
-            store.write_tables(cell, tables, self._status(one, episodes, seconds))
+def _notes(label: str, one: Evaluation) -> Iterator[str]:
+    """Lines about episodes that failed or are missing."""
+    failed = [episode for episode in one.episodes if episode.reason]
+    if failed:
+        reasons = ", ".join(sorted({episode.reason for episode in failed}))
+        yield f"{label}: {len(failed)} episodes ended in an error ({reasons}) and are left out"
+    lost = one.planned - len(one.episodes)
+    if lost > 0:
+        yield f"{label}: {lost} of {one.planned} episodes of {one.benchmark} are missing"
 
-    def _served(self, one: Evaluation, episode: Episode) -> Served | None:
-        path = path_of(self.results, one.id, episode.id) if one.facts else None
-        return read_served(path) if path is not None else None
 
-    def _status(self, one: Evaluation, episodes: Sequence[Episode], seconds: float) -> dict[str, Any]:
-        machine = dict(one.facts.get("machine") or {})
-        about = {"source": one.source.name, "evaluation": one.id, "config": one.config}
-        return {
-            "episodes": len(episodes),
-            "successes": sum(episode.success for episode in episodes),
-            "wall_seconds": sum(episode.seconds for episode in episodes),
-            "timed": not math.isnan(seconds),
-            "started": "",
-            "device_name": "",
-            **machine,
-            "seconds": 0.0 if math.isnan(seconds) else seconds,
-            "run": self.run,
-            "workers": 1,
-            "executor": "vla-eval",
-            "engine": ENGINE,
-            "server": one.server.get("model_server", ""),
-            "harness_version": one.server.get("harness_version", ""),
-            "imported": about,
-        }
+def _served(results: Path, one: Evaluation, episode: Episode) -> Served | None:
+    path = path_of(results, one.id, episode.id) if one.facts else None
+    return read_served(path) if path is not None else None
+
+
+def _status(one: Evaluation, episodes: Sequence[Episode], seconds: float, run: str) -> dict[str, Any]:
+    return {
+        "episodes": len(episodes),
+        "successes": sum(episode.success for episode in episodes),
+        "wall_seconds": sum(episode.seconds for episode in episodes),
+        "timed": not math.isnan(seconds),
+        "started": "",
+        "device_name": "",
+        **dict(one.facts.get("machine") or {}),
+        "seconds": 0.0 if math.isnan(seconds) else seconds,
+        "run": run,
+        "workers": 1,
+        "executor": "vla-eval",
+        "engine": ENGINE,
+        "server": one.server.get("model_server", ""),
+        "harness_version": one.server.get("harness_version", ""),
+        "imported": {"source": one.source.name, "evaluation": one.id, "config": one.config},
+    }
 
 
 def _settings(side: Side) -> dict[str, Any]:

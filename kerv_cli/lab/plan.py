@@ -154,11 +154,9 @@ def plan(
         repeats: how often everything is measured.
 
     Raises:
-        ValueError: `baseline` is no label, or a device is `auto`.
+        ValueError: a device is `auto`.
         UsageError: more than MOST_CELLS cells.
     """
-    if baseline is not None and baseline not in settings_by_label:
-        raise ValueError(f"baseline '{baseline}' is not among the settings {list(settings_by_label)}")
     blocks = sum(-(-settings.episodes // block) for settings in settings_by_label.values())
     tasks = list(dict.fromkeys(tasks))
     if blocks * len(tasks) * repeats > MOST_CELLS:
@@ -166,19 +164,15 @@ def plan(
     labels = sorted(settings_by_label, key=lambda label: label != baseline)
     hashes = {label: identity(label) if callable(identity) else identity for label in labels}
     plain = {label: asdict(settings) for label, settings in settings_by_label.items()}
+    seeds = {label: range(s.seed, s.seed + s.episodes) for label, s in settings_by_label.items()}
     words = overrides or {}
     return [
-        make_cell(label, words.get(label, ""), plain[label], hashes[label], task, seeds, repeat)
+        make_cell(label, words.get(label, ""), plain[label], hashes[label], task, seeds[label][at : at + block], repeat)
         for repeat in range(repeats)
         for task in tasks
         for label in labels
-        for seeds in _seed_blocks(settings_by_label[label], block)
+        for at in range(0, len(seeds[label]), block)
     ]
-
-
-def _seed_blocks(settings: RolloutSettings, size: int) -> Iterator[range]:
-    end = settings.seed + settings.episodes
-    return (range(first, min(first + size, end)) for first in range(settings.seed, end, size))
 
 
 def blocks_of(cells: Iterable[Cell], workers: int = 1) -> list[Block]:
@@ -298,19 +292,14 @@ class _File:
 
 
 def plan_text(plan: StudyPlan) -> str:
-    """The plan as YAML: every label's settings once, then one line per cell."""
-    first = {cell.label: cell for cell in reversed(plan.cells)}
-    labels = {
-        label: {
-            "overrides": first[label].overrides,
-            "identity": first[label].identity,
-            "settings": without(first[label].settings, {"task"}),
-        }
-        for label in plan.labels
-    }
-    head = {"study": plan.name, **{name: getattr(plan, name) for name in ("title", "baseline", "axis", "note")}}
-    lines = [asdict(_Line(c.id, c.label, c.task, seeds_text(c.seeds), c.repeat)) for c in plan.cells]
-    return to_yaml({**head, "labels": labels}) + to_yaml({"cells": lines}, default_flow_style=None, width=1000)
+    """The plan as YAML."""
+    labels = {c.label: _Label(c.overrides, c.identity, without(c.settings, {"task"})) for c in reversed(plan.cells)}
+    labels = {label: labels[label] for label in plan.labels}
+    lines = tuple(_Line(c.id, c.label, c.task, seeds_text(c.seeds), c.repeat) for c in plan.cells)
+    head = {name: getattr(plan, name) for name in ("title", "baseline", "axis", "note")}
+    file = asdict(_File(study=plan.name, labels=labels, cells=lines, **head))
+    cells = list(file.pop("cells"))
+    return to_yaml(file) + to_yaml({"cells": cells}, default_flow_style=None, width=1000)
 
 
 def plan_from_text(text: str) -> StudyPlan:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder, Watcher
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
-from kerv_cli.lab.resolve import known_tasks, tasks_of
+from kerv_cli.lab.resolve import tasks_of
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.worlds import spec_of
@@ -40,17 +39,6 @@ def artifacts_of(settings: RolloutSettings | ServeSettings) -> Artifacts:
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
-def is_expert(settings: RolloutSettings) -> bool:
-    """Whether the policy is the environment's scripted expert."""
-    return settings.policy.kind == EXPERT
-
-
-def unseen_tasks(settings: RolloutSettings, tasks: Sequence[str]) -> list[str]:
-    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
-    trained_on = known_tasks(settings)
-    return [task for task in tasks if trained_on and task not in trained_on]
-
-
 def check(settings: RolloutSettings) -> dict[str, str]:
     """Refuses settings that cannot run, before anything heavy starts -> the identity of their results: hashes of
     everything that determines these besides the settings, and what is observed.
@@ -64,7 +52,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     check_stress(settings.world.stress, spec)
-    if is_expert(settings):
+    if settings.policy.kind == EXPERT:
         _check_expert(settings, spec)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
@@ -170,7 +158,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         UsageError, CheckpointError: as `check`.
     """
     spec = spec_of(task)
-    if is_expert(settings):
+    if settings.policy.kind == EXPERT:
         decoder: ActionDecoder = ExpertDecoder()
     else:
         artifacts = artifacts_of(settings)
@@ -201,7 +189,7 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
     """
     if settings.rollout.clock == WAITS:
         return None
-    target = None if is_expert(settings) else artifacts_of(settings).description
+    target = None if settings.policy.kind == EXPERT else artifacts_of(settings).description
     measured = 0.0
     if clock.calibrates(settings):
         runtime = settings.runtime

@@ -28,15 +28,22 @@ _OF_THE_SWEEP = ("study", "results", "until", "loss", "rerun")
 
 @dataclass(frozen=True)
 class ResolvedStudy:
-    """A study whose settings are composed and checked. until, loss, rerun: as SweepSettings."""
+    """A study whose settings are composed and checked."""
 
-    study: StudySettings
+    sweep: SweepSettings
     settings: Mapping[str, RolloutSettings]  # by label, the study's order
     overrides: Mapping[str, str]  # by label, as written
-    until: str = "done"
-    loss: float = 3.0
-    rerun: str = "never"
     common: tuple[str, ...] = ()  # of the command line, for every setting
+
+    @property
+    def study(self) -> StudySettings:
+        """Which settings are compared."""
+        return self.sweep.study
+
+    @property
+    def first(self) -> RolloutSettings:
+        """The first setting, for what all have in common: tasks, results folder, processes."""
+        return next(iter(self.settings.values()))
 
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
@@ -45,37 +52,36 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     Raises:
         UsageError: an unknown key or name; a key on the command line that the study itself varies; too many settings.
     """
-    overrides, by_path = _study_of_path(overrides)
-    mine = [o for o in overrides if _key(o).split(".", 1)[0] in _OF_THE_SWEEP]
-    theirs = [o for o in overrides if o not in mine or o.startswith("results=")]
+    check_once(overrides, ["study"])
+    file = next((o for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))), None)
+    mine = [o for o in overrides if o != file and _key(o).split(".", 1)[0] in _OF_THE_SWEEP]
+    theirs = [o for o in overrides if o != file and (o not in mine or o.startswith("results="))]
     sweep = compose("sweep", mine, SweepSettings)
-    if by_path is not None:
-        names = {_key(o).removeprefix("study.") for o in mine if o.startswith("study.")}
-        changes = {name: getattr(sweep.study, name) for name in names & set(StudySettings.__dataclass_fields__)}
-        sweep.study = dataclasses.replace(by_path, **changes)
-    sweep.study.name = sweep.study.name or next(o.split("=", 1)[1] for o in mine if o.startswith("study="))
+    if file is not None:
+        names = {_key(o).removeprefix("study.") for o in mine} & set(StudySettings.__dataclass_fields__)
+        changes = {name: getattr(sweep.study, name) for name in names}
+        sweep.study = dataclasses.replace(study_of_file(Path(file.split("=", 1)[1]).expanduser()), **changes)
+    study = sweep.study
+    study.name = study.name or next(o.split("=", 1)[1] for o in mine if o.startswith("study="))
     keys = {_key(o) for o in theirs}
-    common = [o for o in split_words(sweep.study.common) if _key(o) not in keys] + theirs
-    points = _points(sweep.study)
+    common = [o for o in split_words(study.common) if _key(o) not in keys] + theirs
+    points = _points(study)
     for words in points.values():
         varied = keys & {_key(word) for word in words}
         if varied:
-            raise UsageError(f"study '{sweep.study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
+            raise UsageError(f"study '{study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
     if not points:
-        raise UsageError(f"study '{sweep.study.name}' has no settings: see conf/study/demo.yaml for some")
-    if sweep.study.baseline not in points:
+        raise UsageError(f"study '{study.name}' has no settings: see conf/study/demo.yaml for some")
+    if study.baseline not in points:
         raise UsageError(
-            f"study '{sweep.study.name}' has no setting '{sweep.study.baseline}', the baseline that its others are "
+            f"study '{study.name}' has no setting '{study.baseline}', the baseline that its others are "
             f"compared with: add it, or name one of these by baseline=: {', '.join(points)}"
         )
     composer = Composer("rollout", RolloutSettings)
     settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
-    first = settings[sweep.study.baseline]
-    if any(key.startswith("policy") for key in keys) and not keys & {"task", "cover"}:
-        _narrow(settings.values(), first)
-    _settle(settings.values(), first)
-    texts = {label: " ".join(words) for label, words in points.items()}
-    return ResolvedStudy(sweep.study, settings, texts, sweep.until, sweep.loss, sweep.rerun, tuple(theirs))
+    narrows = any(key.startswith("policy") for key in keys) and not keys & {"task", "cover"}  # to the policy named
+    _settle(settings.values(), settings[study.baseline], narrows)
+    return ResolvedStudy(sweep, settings, {label: " ".join(words) for label, words in points.items()}, tuple(theirs))
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
@@ -102,7 +108,7 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     baseline = next((label for label, s in settings.items() if _is_ar(s)), next(iter(settings)))
     _settle(settings.values(), settings[baseline])
     study = StudySettings(name="rollout", title="", baseline=baseline, block=EPISODES_PER_CELL)
-    return ResolvedStudy(study, settings, texts)
+    return ResolvedStudy(SweepSettings(study=study), settings, texts)
 
 
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
@@ -111,10 +117,10 @@ def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
     Raises:
         UnknownName: no such task. CheckpointError: the target's description is damaged.
     """
-    return resolve_tasks(settings.task or list(known_tasks(settings)) or DEFAULT_TASKS)
+    return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
 
 
-def known_tasks(settings: RolloutSettings) -> tuple[str, ...]:
+def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     """Full names of the tasks that a rollout's target was trained on; none of the expert, and where it does not say or
     is not there, which `policy.check` refuses.
 
@@ -131,19 +137,19 @@ def known_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     return resolve_tasks(names) if names else ()
 
 
-def _narrow(settings: Iterable[RolloutSettings], first: RolloutSettings) -> None:
-    """Of a study's tasks, for a policy that the command line names: those that the target of `first` was trained on,
-    or where that are none, all that it was trained on."""
-    known = known_tasks(first)
-    chosen = [task for task in tasks_of(first) if task in known] or list(known)
-    for setting in settings:
-        setting.task = chosen or setting.task
+def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
+    """Those of the tasks that the policy's target was not trained on; none where its description names no tasks."""
+    trained = trained_tasks(settings)
+    return [task for task in tasks if trained and task not in trained]
 
 
-def _settle(settings: Iterable[RolloutSettings], first: RolloutSettings) -> None:
-    """Fills what the settings leave open: tasks, all those of `first`, camera and horizon."""
+def _settle(settings: Iterable[RolloutSettings], first: RolloutSettings, narrows: bool = False) -> None:
+    """Fills what the settings leave open, as `first` does: tasks, camera and horizon. narrows: of the tasks only those
+    that its target was trained on stay, or where that are none, all that it was trained on."""
+    trained = list(trained_tasks(first)) if narrows else []
+    tasks = [task for task in tasks_of(first) if task in trained] or trained or list(tasks_of(first))
     for setting in settings:
-        setting.task = setting.task or list(tasks_of(first))
+        setting.task = tasks if trained else setting.task or tasks
         setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
 
 
@@ -163,26 +169,16 @@ def idle_overrides(resolved: ResolvedStudy) -> dict[str, str]:
     return reasons | {word: why for word, why in common[0].items() if all(word in idle for idle in common)}
 
 
-def _study_of_path(overrides: Sequence[str]) -> tuple[list[str], StudySettings | None]:
-    """The overrides without a `study=PATH.yaml`, and the study in that file.
-
-    Raises:
-        UsageError: no such file, or it is no study.
-    """
-    check_once(overrides, ["study"])
-    paths = [o.split("=", 1)[1] for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))]
-    if not paths:
-        return list(overrides), None
-    path = Path(paths[0]).expanduser()
+def study_of_file(path: Path) -> StudySettings:
+    """The study in a file. Raises UsageError: no such file, or it is no study."""
     value = _read_study(path)
     for key in value:
         if key not in StudySettings.__dataclass_fields__:
             raise UnknownName(f"key in study={path}:", key, StudySettings.__dataclass_fields__)
     try:
-        study = read(StudySettings, {"name": path.stem, **value}, str(path))
+        return read(StudySettings, {"name": path.stem, **value}, str(path))
     except CheckpointError as error:
         raise UsageError(str(error).replace(" is damaged", " is no study")) from error
-    return [o for o in overrides if not o.startswith("study=")], study
 
 
 def _read_study(path: Path) -> dict[str, Any]:

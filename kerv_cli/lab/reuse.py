@@ -17,7 +17,7 @@ from kerv_cli.lab.claims import clean_void
 from kerv_cli.lab.code import code_hash
 from kerv_cli.lab.identity import ENGINE, OBSERVATION, depends_on_order, effective, flat, work_of
 from kerv_cli.lab.plan import Cell, blocks_of, unique_cells
-from kerv_cli.lab.store import ROLLOUTS, StudyStore, new_rollout, stores, studies_of
+from kerv_cli.lab.store import ROLLOUTS, STUDIES, StudyStore, new_rollout, stores
 
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """What `rerun=` runs again: nothing; settings whose times were not taken in turn; cells of other code; everything."""
@@ -49,18 +49,15 @@ class Stock:
         self.by_work: dict[tuple[str, str, int], list[StockEntry]] = {}
         self.by_label: dict[str, list[StockEntry]] = {}
         self.names: set[str] = set()  # of the study's own cells
-        for entry in _entries(store):
-            self.names.add(entry.cell.id)
-            self._add(entry)
-        for other in studies_of(store) if others else ():
-            for entry in _entries(other):
-                self._add(entry)
+        studies = stores(store.root.parent.parent) if others and store.family == STUDIES else []
+        for one in [store, *(other for other in studies if other.name != store.name)]:
+            for entry in _entries(one):
+                self.by_work.setdefault(entry.work, []).append(entry)
+                self.by_label.setdefault(entry.cell.label, []).append(entry)
+                if one is store:
+                    self.names.add(entry.cell.id)
         self.settings = {work[0] for work in self.by_work}
         self._blocks: dict[str, dict[int, str]] = {}
-
-    def _add(self, entry: StockEntry) -> None:
-        self.by_work.setdefault(entry.work, []).append(entry)
-        self.by_label.setdefault(entry.cell.label, []).append(entry)
 
     def of(self, cell: Cell) -> list[StockEntry]:
         """Cells that hold results of the same work for some of its seeds."""
@@ -246,7 +243,7 @@ def take_over(store: StudyStore, covered: Covered) -> None:
             write_folder(store.cells / name, copy)
 
 
-def begin(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
+def rollout_store(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
     """The store of a rollout's cells, the cells by the names that they have in it, and the number of complete ones:
     a new folder, or the newest run of the same cells that was interrupted. A complete run is not reused, because who
     types a rollout wants it run."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from operator import attrgetter
 from pathlib import Path
@@ -169,18 +169,6 @@ def decode_rows(record: EpisodeRecord) -> list[dict[str, Any]]:
     ]
 
 
-def parquet_bytes(rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> bytes:
-    """Rows as the bytes of a parquet file; the store writes them.
-
-    Raises:
-        ValueError: a row has a column that the schema does not know.
-    """
-    for row in rows:
-        if unknown := set(row) - set(schema.names):
-            raise ValueError(f"columns {sorted(unknown)} are not in the schema")
-    return table_bytes(pa.Table.from_pylist(list(rows), schema=schema))
-
-
 def table_bytes(table: pa.Table) -> bytes:
     """A table as the bytes of a parquet file."""
     buffer = io.BytesIO()
@@ -188,13 +176,13 @@ def table_bytes(table: pa.Table) -> bytes:
     return buffer.getvalue()
 
 
-def tables_of(records: Sequence[EpisodeRecord], at: Sequence[Circumstances], repeat: int) -> dict[str, bytes]:
-    """A cell's tables: name of the file -> its bytes. at: circumstances of each record."""
+def tables_of(records: Sequence[EpisodeRecord], at: Sequence[Circumstances], repeat: int) -> dict[str, pa.Table]:
+    """A cell's tables by the names of their files. at: circumstances of each record."""
     episodes = [episode_row(record, one, repeat) for record, one in zip(records, at, strict=True)]
     decodes = [row for record in records for row in decode_rows(record)]
     return {
-        "episodes.parquet": parquet_bytes(episodes, EPISODE_SCHEMA),
-        "decodes.parquet": parquet_bytes(decodes, DECODE_SCHEMA),
+        "episodes.parquet": pa.Table.from_pylist(episodes, schema=EPISODE_SCHEMA),
+        "decodes.parquet": pa.Table.from_pylist(decodes, schema=DECODE_SCHEMA),
     }
 
 

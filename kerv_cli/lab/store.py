@@ -339,11 +339,12 @@ class StudyStore:
         }
         return self.write_tables(cell, rows.tables_of(records, at, cell.repeat), {**sums, **status})
 
-    def write_tables(self, cell: Cell, tables: Mapping[str, bytes], status: Mapping[str, Any]) -> bool:
+    def write_tables(self, cell: Cell, tables: Mapping[str, pa.Table], status: Mapping[str, Any]) -> bool:
         """Writes a complete cell of these tables; returns and raises as `write_cell`. status: its entries, sums over
         the episodes among them."""
         config = {"study": self.name, **asdict(cell), "seeds": list(cell.seeds)}
-        files = {"config.yaml": to_yaml(config).encode(), **tables}
+        files = {"config.yaml": to_yaml(config).encode()}
+        files |= {name: rows.table_bytes(table) for name, table in tables.items()}
         hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
         full: dict[str, Any] = {"format": FORMAT, "state": "complete", **status, "files": hashes}
         full["sha256"] = _seal(full)
@@ -402,6 +403,11 @@ class StudyStore:
                 results[cell.id] = result
             pa.default_memory_pool().release_unused()
         return results, [cell for cell in unique if cell.id not in results]
+
+    @property
+    def recordings(self) -> list[Path]:
+        """Its .rrd files, by name."""
+        return sorted(self.rollouts.glob("[!.]*.rrd"))
 
     def write_failure(self, name: str, text: str) -> None:
         """Stores the traceback of a cell that failed."""
@@ -464,13 +470,6 @@ def stores(results: Path | str, family: str = STUDIES) -> list[StudyStore]:
         clean(Path(results) / family)
     folders = visible(Path(results) / family)
     return [StudyStore(results, folder.name, family) for folder in folders if (folder / "plan.yaml").is_file()]
-
-
-def studies_of(store: StudyStore) -> list[StudyStore]:
-    """The other studies of the same results folder; none where the store is no study's."""
-    if store.family != STUDIES:
-        return []
-    return [other for other in stores(store.root.parent.parent) if other.name != store.name]
 
 
 def begun_studies(results: Path | str) -> list[str]:

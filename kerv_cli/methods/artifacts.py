@@ -4,7 +4,6 @@ however many settings of a study share them."""
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,20 +83,20 @@ class Artifact(Generic[T]):
     """A kind of artifact: one JSON of the dataclass `schema`, with other files beside it or none, made for one target.
     `Weights` is the base of those that are a network.
 
-    kind: as `needs` name it. noun: its name in messages. made: e.g. trained. again: the remedy.
+    kind: as `needs` name it. noun: its name in messages. made: e.g. trained. command: words behind `kerv` that make
+    one; none where no command does.
     """
 
     kind: str
     noun: str
     made = "trained"
-    again: str
+    command: tuple[str, ...] = ()
     schema: type[T]
 
     @property
-    def command(self) -> tuple[str, ...]:
-        """Words behind `kerv` that make one, as the remedy names them; none where it names no command."""
-        quoted = re.search(r"'kerv ([^']+)'", self.again)
-        return tuple(quoted[1].split()) if quoted else ()
+    def again(self) -> str:
+        """The remedy where one is missing or does not fit."""
+        return f"run 'kerv {' '.join(self.command)}'"
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
         """Its path; name None: the one beside the target in the folder `target`."""
@@ -143,7 +142,7 @@ class Artifact(Generic[T]):
     def described(self, file: Path) -> T:
         """The description in `file`, which exists; errors as `read`."""
         try:
-            description = read_file(self.schema, file, f"a {self.noun} of this version of kerv")
+            description = read_file(self.schema, file)
         except CheckpointError as error:
             raise CheckpointError(f"{error}; {self.again}") from error
         check_files(file.parent, getattr(description, "files", {}), self.again)

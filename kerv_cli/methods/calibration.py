@@ -171,7 +171,7 @@ class CalibrationArtifact(Artifact[Calibration]):
     """The calibration: one file, which its path names."""
 
     kind = noun = "calibration"
-    made, again = "made", "run 'kerv calibrate'"
+    made, command = "made", ("calibrate",)
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:

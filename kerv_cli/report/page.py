@@ -83,7 +83,7 @@ def render(
         figures=figures,
         sections=sections,
         tasks=_by_task(per_task),
-        recordings=[Link(path.stem, _href(path, store.root)) for path in sorted(store.rollouts.glob("[!.]*.rrd"))],
+        recordings=[Link(path.stem, _href(path, store.root)) for path in store.recordings],
         files=[Link(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
         commands=[(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()],
     )

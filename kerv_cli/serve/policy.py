@@ -30,8 +30,6 @@ VLA_EVAL = "vla_eval"
 WARM_UP = 4  # decodes
 GATHER = 0.005
 """Seconds that a batch waits for more clients."""
-_BY_TASK = frozenset({"calibration", "certificate"})
-"""Artifacts with levels that differ between tasks."""
 
 
 class Policy:
@@ -56,7 +54,7 @@ class Policy:
         self.identity = self.artifacts.check(self.method.needs)
         self.interface = self._interface()
         self.range = self._range()
-        self.by_task = not settings.task_name and not _BY_TASK.isdisjoint(self.method.needs)
+        self.by_task = not settings.task_name and bool(self._task_artifacts())
         self._turn = threading.Lock()
         self._idle: list[Decoder] = []
         first = self._decoder(self._any_task())
@@ -92,10 +90,14 @@ class Policy:
         low, high = (np.array(ends)[: None if interface.privileged else len(names)] for ends in stored)
         return StateRange(low, high, names, self.settings.margin)
 
+    def _task_artifacts(self) -> list[str]:
+        """Kinds of the method's artifacts whose levels differ between tasks."""
+        return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get("by_task"))
+
     def _any_task(self) -> str:
         """The task of the settings; without one, where a client names its tasks, one that the method's levels know."""
         if self.by_task and self.settings.protocol == VLA_EVAL:
-            for kind in sorted(_BY_TASK.intersection(self.method.needs)):
+            for kind in self._task_artifacts():
                 artifact = self.artifacts.load(kind)
                 return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ("",)))
         return self.settings.task_name

@@ -12,18 +12,12 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import artifact, find_target, results_dir
-from kerv_cli.base.settings import (
-    DEFAULT_TASKS,
-    BuildDatastoreSettings,
-    CalibrateSettings,
-    PrepareSettings,
-    TrainDrafterSettings,
-)
+from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
-S = TypeVar("S", CalibrateSettings, BuildDatastoreSettings, TrainDrafterSettings, PrepareSettings)
+S = TypeVar("S", bound=DemonstrationSettings)
 """Settings of what is made for a target from demonstrations."""
 ALL, HALF = "all", "half"
 

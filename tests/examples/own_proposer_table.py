@@ -56,7 +56,7 @@ class FollowArtifact(Weights[WeightsDescription]):
     """The table's files: its weights, and the JSON that all weights have."""
 
     kind, noun = "follow", "table"
-    again = "run 'kerv train drafter drafter=follow'"
+    command = ("train", "drafter", "drafter=follow")
     schema = WeightsDescription
     any_chunk = True
 

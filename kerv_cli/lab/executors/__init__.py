@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from concurrent.futures import Future
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
@@ -62,14 +61,3 @@ def check_executor(runtime: RuntimeSettings) -> Any:
         return read(part.settings, runtime.executor_options, "runtime.executor_options")
     except CheckpointError as error:
         raise UsageError(str(error).replace(" is damaged", "")) from None
-
-
-def open_executor(runtime: RuntimeSettings, threads: int, folder: Path) -> Executor:
-    """The chosen executor, ready.
-
-    Raises:
-        UsageError: as `check_executor`, or the cluster cannot be reached.
-    """
-    options = check_executor(runtime)
-    executor: Executor = find("executor", runtime.executor).built(options, runtime.workers, threads, folder)
-    return executor

@@ -32,16 +32,16 @@ def build(options: RayOptions, slots: int, threads: int, folder: Path) -> Execut
 
     _check_reachable(options.address)
     started: dict[str, Any] = {} if options.address else {"num_cpus": slots * threads, "include_dashboard": False}
-    own = contextlib.ExitStack()
+    stack = contextlib.ExitStack()
     if not options.address:  # its agents would outlive this process
-        own.enter_context(guard())
+        stack.enter_context(guard())
     try:
         ray.init(address=options.address or "local", log_to_driver=False, logging_level="error", **started)
     except Exception as error:  # noqa: BLE001 - Ray raises it bare where a machine is slow
-        own.close()
+        stack.close()
         why = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise UsageError(f"the Ray cluster {options.address or 'of this machine'} cannot be reached: {why}") from None
-    return Tasks(slots, threads, options.gpus, own)
+    return Tasks(slots, threads, options.gpus, stack)
 
 
 def _check_reachable(address: str) -> None:
@@ -62,10 +62,10 @@ def _check_reachable(address: str) -> None:
 class Tasks:
     """Ray tasks without Ray's retries: `execute` decides about lost blocks."""
 
-    def __init__(self, slots: int, threads: int, gpus: float, own: contextlib.ExitStack) -> None:
+    def __init__(self, slots: int, threads: int, gpus: float, stack: contextlib.ExitStack) -> None:
         import ray
 
-        self.slots, self._own = slots, own
+        self.slots, self._own = slots, stack
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
         self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)

@@ -81,11 +81,11 @@ class Jobs:
         """Cancels the jobs that run or wait. abandon: waits until they have ended, at most ten seconds."""
         self._closed.set()
         with self._changed:
-            left = list(self._open.values())
-        for job in left:
+            jobs = list(self._open.values())
+        for job in jobs:
             job.cancel()
         deadline = time.monotonic() + 10
-        while abandon and any(not job.done() for job in left) and time.monotonic() < deadline:
+        while abandon and any(not job.done() for job in jobs) and time.monotonic() < deadline:
             time.sleep(0.1)
 
 

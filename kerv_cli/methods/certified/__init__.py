@@ -36,7 +36,7 @@ def _needs(settings: Any) -> tuple[str, ...]:
 
 _CERTIFICATE = "kerv_cli.methods.certified.certificate:"
 
-add("artifact", "certificate", _CERTIFICATE + "CertificateArtifact", sees=True)  # a scout drafts for a candidate
+add("artifact", "certificate", _CERTIFICATE + "CertificateArtifact", sees=True, by_task=True)
 add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, when=PREFILL, chains=True)
 add(
     "skip",

@@ -139,7 +139,7 @@ class CertificateArtifact(Artifact[Certificate]):
     """`certificate/` beside the target: certificate.json."""
 
     kind, noun, made = "certificate", "certificate", "issued"
-    again = "run 'kerv calibrate success'"
+    command = ("calibrate", "success")
     schema = Certificate
 
     def made_for(self, description: Certificate) -> MadeFor:

@@ -174,7 +174,7 @@ class DrafterArtifact(Weights[DrafterDescription]):
     """The drafter's files; it drafts for a target with chunks of any length."""
 
     kind = noun = "drafter"
-    again = "run 'kerv train drafter'"
+    command = ("train", "drafter")
     schema = DrafterDescription
     any_chunk = True
 

@@ -288,7 +288,7 @@ class EarlyArtifact(Weights[EarlyDescription]):
     """The early drafter's files."""
 
     kind, noun = "early", "early drafter"
-    again = "run 'kerv train drafter drafter=early'"
+    command = ("train", "drafter", "drafter=early")
     schema = EarlyDescription
 
     def module(self, description: EarlyDescription, target: ReadableTarget) -> EarlyDrafter:

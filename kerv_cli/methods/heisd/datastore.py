@@ -327,7 +327,7 @@ class DatastoreArtifact(Artifact[Manifest]):
     """The datastore's files."""
 
     kind = noun = "datastore"
-    made, again = "built", AGAIN
+    made, command, again = "built", ("build", "datastore"), AGAIN
     schema = Manifest
 
     def json(self, path: Path) -> Path:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _PREDICTION = "kerv_cli.methods.kinematics.prediction:"
 
 _sources = ("drafter", "datastore")  # each has a section
-add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact", needs=_sources)
+add("artifact", "calibration", "kerv_cli.methods.calibration:CalibrationArtifact", needs=_sources, by_task=True)
 
 # --- predictors, and proposers that draft by them (§3.1, §6)
 

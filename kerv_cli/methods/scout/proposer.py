@@ -51,7 +51,7 @@ class ScoutArtifact(Weights[ScoutDescription]):
     """The scout's files."""
 
     kind, noun = "scout", "scout"
-    again = "run 'kerv train drafter drafter=scout'"
+    command = ("train", "drafter", "drafter=scout")
     schema = ScoutDescription
 
     def module(self, description: ScoutDescription, target: ReadableTarget) -> Scout:
