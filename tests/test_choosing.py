@@ -88,6 +88,8 @@ def test_what_is_not_shown_yet_says_how_many_episodes_more_would_do(table: pd.Da
     assert (found.chosen, found.candidate) == ("", "r=9")
     assert found.candidate_pairs == pairs_to_settle(PairedCounts(188, 2, 2, 8), 0.02) > 200
     assert "more would show it for r=9" in sentence(found, 2.0, "ar")
+    slower = choices(table[table["label"].isin(["ar", "slow"])], None, 2.0)[0]
+    assert sentence(slower, 2.0, "ar") == "no setting is faster per episode than ar (200 pairs)"
     worse = choices(table[table["label"].isin(["ar", "r=20"])], table.iloc[:0], 2.0)[0]
     assert sentence(worse, 2.0, "ar").endswith("more would not show one")
 

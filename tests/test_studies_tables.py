@@ -339,19 +339,20 @@ def test_csv_has_sensible_digits_and_empty_cells(data: StudyData) -> None:
     assert dict(zip(lines[0].split(","), lines[3].split(","), strict=True))["AL"] == ""
 
 
-def printed(table: pd.DataFrame) -> list[str]:
-    console = Console(width=80, file=io.StringIO(), record=True)
+def printed(table: pd.DataFrame, width: int = 80) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), record=True)
     console.print(summary_table(table))
     return console.export_text().splitlines()
 
 
 def test_summary_on_a_terminal(data: StudyData) -> None:
-    lines = printed(study_table(data))
+    table = study_table(data)
+    lines = printed(table, 120)
     assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
     at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
-    words = " ".join(lines[at : at + 2]).split()
-    assert {"60", "(23–88)", "4.22", "1.86", "14/21/14/14"} <= set(words)
+    assert {"60", "(23–88)", "4.22", "1.86", "14/21/14/14"} <= set(lines[at].split())
     assert "/ compensated" in " ".join(lines)
+    assert any(line.startswith("kerv") and "1/0 of 5 1" in line for line in printed(table))  # no p without its counts
 
 
 def test_summary_leaves_out_what_no_setting_uses(results: Path) -> None:
@@ -416,6 +417,7 @@ def test_the_page_stands_alone(results: Path) -> None:
     assert "by difficulty" in page
     assert 'class="verdict"' in page
     assert "prefers-color-scheme: dark" in page
+    assert page.count('<th scope="col"><button>') == page.count("<th ")  # every heading sorts
     assert 'href="../../report/tables/threshold_per_task.csv"' in page
     tables = re.findall(r"<thead><tr>(.*?)</tr>", page)
     assert len(tables) == len(set(tables)) == 3, "a table that repeats another"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.settings import CalibrateSettings, CalibrateSuccessSettings
+from kerv_cli.base.settings import CalibrateSettings, CalibrateSuccessSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_plan, print_table, progress_bar
 
@@ -118,8 +119,8 @@ def _skip(calibration: Calibration) -> None:
     print_table(columns, rows, title)
 
 
-OWN = ("name", "margin", "delta")
-"""Settings of `kerv calibrate success`; all others are the study's."""
+OWN = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}
+"""Settings of `kerv calibrate success` itself; all others are the study's."""
 
 
 @command(
@@ -132,7 +133,7 @@ OWN = ("name", "margin", "delta")
 def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
     Episodes that are there are reused; settle their number before you look."""
-    from kerv_cli.base.config import compose
+    from kerv_cli.base.config import compose, to_yaml
     from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve
     from kerv_cli.report.certificate import certify, folder_of, verdicts, write
@@ -145,6 +146,8 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     settings = compose("calibrate_success", [*own, *folder], CalibrateSuccessSettings)
     resolved = resolve(theirs)
     if cfg:
+        lines = to_yaml(settings).splitlines()
+        typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OWN), "---"]))
         print_settings(resolved)
         return
     place = folder_of(resolved, settings.name)

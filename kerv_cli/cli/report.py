@@ -62,7 +62,7 @@ def report(
     if choose:
         _choose(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.on)
+    output = write_report(results_dir(settings.results), settings.only, publish, settings.on, settings.loss)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}

@@ -213,13 +213,13 @@ def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
 
 def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     """Prints the last three lines of a study: the verdict, the page to open, the recording to watch."""
-    from kerv_cli.report.decide import choices, sentence
+    from kerv_cli.report.page import verdict
 
-    if (table["label"] != table["baseline"]).any():
-        typer.echo(f"verdict: {sentence(choices(table, None, loss)[0], loss, str(table['baseline'].iloc[0]))}")
+    typer.echo(f"verdict: {verdict(table, loss)[0]}")
     typer.echo(f"page: {store.root / 'report.html'}")
-    if store.recordings:
-        typer.echo(f"watch: {called()} view {store.recordings[0]}")
+    recordings = store.recordings
+    nothing = "nothing is recorded; the same sweep with record=1 rerun=all does that"
+    typer.echo(f"watch: {f'{called()} view {recordings[0]}' if recordings else nothing}")
 
 
 def _tell(
@@ -245,7 +245,7 @@ def _tell(
             with at_work("writing the page"):
                 from kerv_cli.report.report import report
 
-                report(store.root.parent.parent, store.name)
+                report(store.root.parent.parent, store.name, loss=resolved.sweep.loss)
             tell_end(table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)

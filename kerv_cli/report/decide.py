@@ -38,7 +38,7 @@ class Choice:
     first. chosen: the fastest setting whose loss of success is shown to be below the bound; empty if there is none.
     loss_at_most, episode_speedup: of the chosen one, the first in points of success at 95 % confidence. candidate: the
     fastest that more pairs would show at the present rates, empty if there is none, and about how many pairs, all in
-    all."""
+    all. faster: how many settings are faster than the baseline, or untimed; no other is ever chosen."""
 
     where: str
     pairs: int
@@ -47,6 +47,7 @@ class Choice:
     loss_at_most: float
     candidate: str
     candidate_pairs: float
+    faster: int
     episode_speedup: float
     episode_speedup_low: float
     episode_speedup_high: float
@@ -78,12 +79,13 @@ def _choice(where: str, rows: Sequence[Row], loss: float) -> Choice:
     label = str(candidate["label"]) if candidate else ""
     return Choice(
         where,
-        pairs=max((int(row["pairs"]) for row in order), default=0),
+        pairs=max((int(row["pairs"]) for row in rows if not is_baseline(row)), default=0),
         front=tuple(str(row["label"]) for row in pareto(rows)),
         chosen=str(best["label"]) if best else "",
         loss_at_most=_loss_at_most(best) if best else math.nan,
         candidate=label,
         candidate_pairs=reached.get(label, math.nan),
+        faster=len(order),
         **{f"{SPEED}{end}": float(best[f"{SPEED}{end}"]) if best else math.nan for end in ("", "_low", "_high")},
     )
 
@@ -138,6 +140,8 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
         times = interval(choice.as_dict(), SPEED)
         speed = f", per episode {times} times as fast as {baseline} on this machine" if times != "–" else ""
         return f"the fastest setting that {bound}: {choice.chosen}{speed} ({choice.pairs} pairs)"
+    if not choice.faster:
+        return f"no setting is faster per episode than {baseline} ({choice.pairs} pairs)"
     return f"{choice.pairs} pairs do not yet show a setting that is faster and {bound}; {_missing(choice)}"
 
 
@@ -145,6 +149,8 @@ def short(choice: Choice) -> str:
     """The choice for one task in a few words."""
     if choice.chosen:
         return f"{choice.where}: {choice.chosen}"
+    if not choice.faster:
+        return f"{choice.where}: none is faster ({choice.pairs} pairs)"
     return f"{choice.where}: undecided after {choice.pairs} pairs; {_missing(choice)}"
 
 

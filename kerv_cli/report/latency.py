@@ -13,7 +13,7 @@ from kerv_cli.base.settings import REAL, TimingSettings
 from kerv_cli.report.ceiling import is_autoregressive
 from kerv_cli.report.measures import MICRO, measure
 from kerv_cli.report.tables import StudyData, rows_of
-from kerv_cli.report.text import Column, compared, intervals, numbers, p_value, shares, text_frame
+from kerv_cli.report.text import LOST_WON, Column, compared, intervals, lost_won, numbers, p_value, shares, text_frame
 
 _SUCCESS = ("successes", "success", "success_low", "success_high")
 _FELT = ("felt_latency_ms", "felt_latency_steps", "held_share", "forwards_per_step")
@@ -67,5 +67,6 @@ _COLUMNS = (
     Column("held", shares("held_share")),
     Column("success %", intervals("success", 100.0, 0)),
     Column("minus AR's", compared(intervals("difference", 100.0, 0, " to "))),
+    Column(LOST_WON, compared(lost_won)),
     Column("p", compared(p_value)),
 )

@@ -1,4 +1,4 @@
-"""A study's HTML page: one file, no script, nothing loaded from elsewhere but the recordings and tables beside it."""
+"""A study's HTML page: one file; nothing is loaded from elsewhere but the recordings and tables beside it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from kerv_cli.report.decide import choices, read_verdicts, sentence
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.reprice import machine_columns
 from kerv_cli.report.summary import SPEEDS, differences, motion_frame, summary_frame
-from kerv_cli.report.tables import StudyData, is_number, rows_of
+from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 
 LOSS = 3.0
-"""Points of success that the verdict at the top of the page allows."""
+"""Points of success that the verdict at the top of the page allows where nobody says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ def render(
     sections: Sequence[Section],
     files: Sequence[Path],
     priced: pd.DataFrame | None = None,
+    loss: float = LOSS,
 ) -> str:
     """The page.
 
@@ -60,15 +61,18 @@ def render(
         figures: HTML elements.
         files: the study's tables and plots; the page links the tables.
         priced: `repriced_table` of the machines that the report was asked for.
+        loss: points of success that the verdict allows.
     """
     template = Environment(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
     ).get_template("report.html.j2")
     stopped = read_verdicts(store.root)
+    answer, shown = verdict(whole, loss)
     return template.render(
         name=store.name,
         title=data.plan.title or store.name,
-        verdict=verdict(data, whole, per_task),
+        verdict=answer[:1].upper() + answer[1:],
+        shown=shown,
         caution=caution(whole),
         note=data.plan.note,
         about=_about(whole),
@@ -89,17 +93,17 @@ def render(
     )
 
 
-def verdict(data: StudyData, whole: pd.DataFrame, per_task: pd.DataFrame) -> str:
-    """The study's answer in one sentence."""
+def verdict(whole: pd.DataFrame, loss: float) -> tuple[str, bool]:
+    """The study's answer in one sentence, and whether it names a setting that is shown to be faster at that loss of
+    success, in points. whole: `study_table`."""
     if stressed.is_stressed(whole):
-        return stressed.verdict(whole)
-    if not any(row["pairs"] and row["label"] != row["baseline"] for row in rows_of(whole, MICRO)):
-        rows = rows_of(whole, MICRO)
+        return stressed.verdict(whole), False
+    rows = rows_of(whole, MICRO)
+    if not any(row["pairs"] and not is_baseline(row) for row in rows):
         rates = ", ".join(f"{row['label']} {100 * row['success']:.1f} %" for row in rows)
-        return f"Success: {rates}."
-    choice = choices(whole, per_task.iloc[:0], LOSS)[0]
-    text = sentence(choice, LOSS, data.plan.baseline)
-    return text[:1].upper() + text[1:] + "."
+        return f"success: {rates}.", False
+    choice = choices(whole, None, loss)[0]
+    return f"{sentence(choice, loss, str(whole['baseline'].iloc[0]))}.", bool(choice.chosen)
 
 
 def caution(whole: pd.DataFrame) -> str:

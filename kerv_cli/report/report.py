@@ -15,7 +15,7 @@ from kerv_cli.lab.store import StudyStore, begun_studies
 from kerv_cli.report.drawing import save_plot
 from kerv_cli.report.latency import latency_summary, latency_table
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.page import Section, render
+from kerv_cli.report.page import LOSS, Section, render
 from kerv_cli.report.plots import about, has_task_map, latency_figure, study_figures, task_map
 from kerv_cli.report.publish import check_publishable
 from kerv_cli.report.reprice import ASSUMES, Machine, open_machines, repriced_summary, repriced_table
@@ -38,12 +38,13 @@ def report(
     study: str | None = None,
     publish: bool = False,
     on: Sequence[str] = (),
+    loss: float = LOSS,
 ) -> Report:
     """Writes a study's files, or those of every study that has a complete cell.
 
     In report/, or to publish in the results folder itself: tables/<study>.csv and <study>_per_task.csv,
     plots/<study>*.png and, where small, .svg; with `on`, names of profiles, tables/<study>_on.csv. Always
-    studies/<study>/report.html. The same cells give the same bytes.
+    studies/<study>/report.html, whose verdict allows `loss` points of success. The same cells give the same bytes.
 
     Raises:
         UsageError: no such study, or nothing to report; the message names what to run.
@@ -56,7 +57,7 @@ def report(
     names = [study] if study else begun_studies(results)
     if not names:
         raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=demo`")
-    reporter = _Reporter(Path(results), publish, open_machines(results, on))
+    reporter = _Reporter(Path(results), publish, open_machines(results, on), loss)
     for name in names:
         reporter.report_study(name)
     return reporter.report
@@ -65,8 +66,8 @@ def report(
 class _Reporter:
     """Writes the files of studies."""
 
-    def __init__(self, results: Path, publish: bool, machines: Sequence[Machine] = ()) -> None:
-        self.results, self.publish, self.machines = results, publish, machines
+    def __init__(self, results: Path, publish: bool, machines: Sequence[Machine], loss: float) -> None:
+        self.results, self.publish, self.machines, self.loss = results, publish, machines, loss
         self.folder = results if publish else results / "report"
         self.report = Report([], {})
 
@@ -92,7 +93,8 @@ class _Reporter:
         files = self.report.files[before:]
         with atomic_path(page) as temporary:
             present = [section for section in sections if section is not None]
-            temporary.write_text(render(store, data, whole, per_task, plots, present, files, priced), encoding="utf-8")
+            text = render(store, data, whole, per_task, plots, present, files, priced, self.loss)
+            temporary.write_text(text, encoding="utf-8")
         self.report.files.append(page)
 
     def machines_section(self, priced: pd.DataFrame | None) -> Section | None:

@@ -15,12 +15,21 @@ from rich.text import Text
 
 from kerv_cli.report.measures import MICRO, own_columns
 from kerv_cli.report.tables import Row, is_baseline, is_number, rows_of
-from kerv_cli.report.text import Column, TextOf, compared, interval, intervals, numbers, p_value, shares, text_frame
+from kerv_cli.report.text import (
+    LOST_WON,
+    Column,
+    TextOf,
+    compared,
+    interval,
+    intervals,
+    lost_won,
+    numbers,
+    p_value,
+    shares,
+    text_frame,
+)
 
 APART = "*"
-WIDE = 130
-"""Columns of a terminal that hold every measure."""
-
 SPEEDS = {"episode_speedup": "per episode", "speedup": "per step"}
 """Speed against the baseline -> its heading."""
 
@@ -39,7 +48,11 @@ _SHARES = {
 _ALIKE = 0.02
 """Lengths of episodes that differ by a smaller share are alike."""
 
-_NARROW_LACKS = ["AL", "AFEP", "ms / step", "p95 ms", "ceiling", "lost/won", "deviation"]
+_SPARE = ("forwards / step", "felt ms", "AL", "ms / step", "ceiling", "p95 ms", "deviation", "AFEP")
+"""Columns that a narrow terminal lacks where they do not fit, behind the speed per step and the shares, the most
+important first."""
+_LABEL = 16
+"""Letters of a label that are not wrapped."""
 
 
 def _speed(name: str) -> TextOf:
@@ -52,10 +65,6 @@ def _speed(name: str) -> TextOf:
         return interval(row, name) + (APART if apart else "")
 
     return text
-
-
-def _lost_won(row: Row) -> str:
-    return f"{row['only_baseline']}/{row['only_method']}" if row["pairs"] else ""
 
 
 def _columns() -> list[Column]:
@@ -74,7 +83,7 @@ def _columns() -> list[Column]:
         Column("felt ms", numbers("felt_latency_ms"), needs="felt_latency_ms"),
         Column("held", shares("held_share"), needs="held_share"),
         *(Column(name.replace("_", " "), numbers(name), needs=name) for name in own_columns()),
-        Column("lost/won", compared(_lost_won)),
+        Column(LOST_WON, compared(lost_won)),
         Column("p", compared(p_value)),
     ]
 
@@ -88,21 +97,20 @@ def _motion_columns() -> Iterator[Column]:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """The rows of one averaging of `study_table`, for the terminal. From `WIDE` columns on every measure is there;
-    80 columns hold labels of 16 characters and fewer measures."""
+    """The rows of one averaging of `study_table`, for the terminal, with all measures that fit; a narrow one wraps
+    labels."""
 
     table: pd.DataFrame
     averaging: str = MICRO
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        full = summary_frame(self.table, self.averaging)
-        frame = full if options.max_width >= WIDE else _narrow(full)
+        frame = _fitting(summary_frame(self.table, self.averaging), options.max_width)
         yield Text(_title(self.table, self.averaging), style="bold", overflow="fold")
         yield _printed(frame)
         first, several = self.table["baseline"].iloc[0], self.table["baseline"].nunique() > 1
         against = f"{first}, under the same stress" if several else first
         yield Text(f"brackets: 95 % intervals; p: exact McNemar test against {against}")
-        if frame["per step"].str.endswith(APART).any():
+        if frame["per episode"].str.endswith(APART).any():
             yield Text(f"{APART} of those pairs alone that were measured in turn")
         untimed = list(dict.fromkeys(self.table.loc[self.table["time_per_step_ms"].isna(), "label"]))
         if untimed:
@@ -111,7 +119,7 @@ class SummaryTable:
             yield Text("ceiling: speed per step if every chunk were accepted whole at once")
         yield from (Text(reason) for reason in differences(rows_of(self.table, self.averaging)))
         motion = motion_frame(self.table, self.averaging)
-        if motion is not None and options.max_width >= WIDE:
+        if motion is not None and _width(motion) <= options.max_width:
             yield Text("Successful episodes, and ratios over the pairs in which both succeeded", style="bold")
             yield _printed(motion)
 
@@ -119,13 +127,25 @@ class SummaryTable:
 def _printed(frame: pd.DataFrame) -> Table:
     printed = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0)
     for name in frame.columns:
-        left = name == "setting"
-        head = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
-        interval = name in ("success %", "per episode", "per step")  # labels wrap, intervals do not
-        printed.add_column(head, justify="left" if left else "right", overflow="fold", no_wrap=interval)
+        left = name == "setting"  # labels wrap, measures do not
+        head = "\n".join(_heading(name))
+        printed.add_column(head, justify="left" if left else "right", overflow="fold", no_wrap=not left)
     for row in frame.itertuples(index=False):
         printed.add_row(*(escape(str(value)) for value in row))
     return printed
+
+
+def _heading(name: str) -> list[str]:
+    """A column's heading in lines."""
+    short = name.replace("forwards", "fwd").replace(" / ", "\n/ ").replace("ceiling", "ceil-\ning")
+    return short.replace("lost/won of", "lost/won\nof").replace(": ", ":\n").split("\n")
+
+
+def _width(frame: pd.DataFrame) -> int:
+    """Characters of a printed table whose labels are wrapped where that helps."""
+    wide = [max(map(len, [*_heading(name), *frame[name]])) for name in frame.columns]
+    words = " ".join(frame["setting"]).split()
+    return sum(wide) - max(0, wide[0] - max([_LABEL, *map(len, words)])) + len(wide) - 1
 
 
 def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
@@ -133,14 +153,22 @@ def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
     return SummaryTable(table, averaging)
 
 
-def _narrow(frame: pd.DataFrame) -> pd.DataFrame:
-    """Fewer columns, for a terminal, and the shares of decodes in one."""
-    frame = frame.drop(columns=_NARROW_LACKS, errors="ignore")
+def _fitting(frame: pd.DataFrame, width: int) -> pd.DataFrame:
+    """The columns that fit into so many characters; where not all do, the shares of decodes stand in one."""
+    if _width(frame) <= width:
+        return frame
     names = [name for name in (*_SHARES.values(), "held") if name in frame]
+    shares = " / ".join(names) + " %"
     if names:
         together = frame[names].apply(lambda row: "/".join(text.removesuffix(" %") for text in row), axis=1)
-        frame.insert(list(frame.columns).index(names[0]), " / ".join(names) + " %", together)
-    return frame.drop(columns=names)
+        frame.insert(list(frame.columns).index(names[0]), shares, together)
+        frame = frame.drop(columns=names)
+    spares = ("per step", shares, *_SPARE)
+    fitting = frame.drop(columns=list(spares), errors="ignore")
+    for spare in spares:
+        wider = frame[[name for name in frame.columns if name in fitting or name == spare]]
+        fitting = wider if _width(wider) <= width else fitting
+    return fitting
 
 
 def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:

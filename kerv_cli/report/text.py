@@ -12,6 +12,9 @@ from kerv_cli.report.tables import Row, is_baseline, is_number
 
 TextOf = Callable[[Row], str]
 
+LOST_WON = "lost/won of pairs"
+"""Heading of `lost_won`, which no p stands without."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -72,3 +75,9 @@ def p_value(row: Mapping[str, Any]) -> str:
     if not row["pairs"]:
         return ""
     return "<0.001" if row["mcnemar_p"] < 0.001 else f"{row['mcnemar_p']:.2g}"
+
+
+def lost_won(row: Mapping[str, Any]) -> str:
+    """Pairs that the baseline alone and the setting alone solved, of how many: what McNemar's p is of; empty without
+    pairs."""
+    return f"{row['only_baseline']}/{row['only_method']} of {row['pairs']}" if row["pairs"] else ""
