@@ -1,17 +1,20 @@
 """Kills kerv's commands and lets their disk fail at every change of a file, and feeds them strange settings and files.
 
-    python scripts/torture.py [--short] [--minutes 15] [--jobs CORES] [--seed N] [--only faults,requests,files]
+    python scripts/torture.py [--short] [--minutes 15] [--jobs CORES] [--seed N] [--only faults,requests,files,frames]
 
 What must hold: a command that was killed or whose disk failed, started again, ends with the artifacts and tables of an
 undisturbed run; before that, others work; no file and no process of it is left. A wrong request or a damaged file gives
-exit 1 or 2 and one line, or the same result; nothing hangs. The figures are printed; the exit code is 1 where something
-did not hold. Every command runs in a fork of this process, so that Python and torch load once; the trials of all parts
-are shared out among `--jobs` processes. Faults come from torture.c, preloaded where there is a compiler.
+exit 1 or 2 and one line, or the same result; a server goes on whatever clients send; nothing hangs. The figures are
+printed; the exit code is 1 where something did not hold. Every command runs in a fork of this process, so that Python
+and torch load once; the trials of all parts are shared out among `--jobs` processes. Faults come from torture.c,
+preloaded where there is a compiler.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import hashlib
 import json
 import multiprocessing
@@ -35,13 +38,14 @@ from typing import NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 warnings.simplefilter("ignore")
-from torture_runs import KINDS, Ended, Fault, learn, preload, run  # noqa: E402
+from torture_runs import ENDING, HINDERING, Ended, Fault, learn, preload, run  # noqa: E402
 
 FAULTS = __name__ == "__main__" and preload()  # starts anew before anything large is loaded
 
 import pandas as pd  # noqa: E402
 import torch  # noqa: E402
 from torture_cases import PLANNED, TASK, damage, keys_for, wrong_request  # noqa: E402
+from torture_frames import DIALECTS, SERVE, Fire, seen_by  # noqa: E402
 
 from kerv_cli.base.config import conf_dir  # noqa: E402
 from kerv_cli.base.provenance import stamp  # noqa: E402
@@ -52,8 +56,10 @@ from kerv_cli.worlds.camera import choose_backend  # noqa: E402
 LONGEST = 10.0  # seconds of CPU that a wrong request or a damaged file may take
 MEMORY = 1024.0  # MiB that it may take beyond what a fork begins with
 HANGS = 300.0  # seconds after which a command that waits for something is ended; a busy machine is slow, too
-TRIALS = {"requests": 2000, "files": 1000}
-WORKERS = 24  # trials of each command with worker processes, which start slowly
+TRIALS = {"requests": 2000, "files": 1000, "frames": 20}
+SHARE = 30.0  # seconds of CPU: a command of one second has as many trials, each with several faults
+WORKERS = 6  # trials of one with worker processes, which start slowly
+FURTHER = 16  # faults of a trial behind its first
 PROBES = ("runs list", "doctor", "sweep study=tortured --plan")
 POLICY = "policy=state policy.target=mine"
 STUDY = f"""
@@ -137,6 +143,11 @@ def state(command: str) -> dict[str, str]:
     return made
 
 
+def _drawn(draw: random.Random, calls: int, count: int) -> list[int]:
+    """Numbers of calls, more often early ones."""
+    return [1 + int(calls ** draw.random()) for _ in range(count)]
+
+
 def _undated(name: str) -> str:
     return re.sub(r"\d{8}-\d{6}(?=-)", "DATE", name)
 
@@ -147,9 +158,9 @@ def names_below(folder: Path) -> set[str]:
 
 
 def undisturbed(words: str, log: Path) -> Ended:
-    """Runs a command that must succeed, and loads what it loads."""
+    """Runs a command that must succeed, and loads what it loads. Of doctor also 1: a busy machine draws too slowly."""
     ended = run(words.split(), limit=HANGS, log=log)
-    if ended.code:
+    if ended.code not in (0, 1 if words == "doctor" else 0):
         raise SystemExit(f"{words} does not run: {ended.text[-600:]}")
     learn(log)
     return ended
@@ -167,22 +178,23 @@ class Trial(NamedTuple):
 
 @dataclass
 class Tally:
-    """What was tried and what did not hold. slowest: seconds of CPU of a request or of a reader of damaged files."""
+    """What was tried and what did not hold. slowest: seconds of CPU of a request or of a reader of damaged files. seat:
+    of waiting for a seat of the server."""
 
     counts: Counter[str] = field(default_factory=Counter)
     slowest: float = 0.0
+    seat: float = 0.0
     faults: list[str] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
         """Adds what another process tried."""
         self.counts.update(other.counts)
-        self.slowest = max(self.slowest, other.slowest)
+        self.slowest, self.seat = max(self.slowest, other.slowest), max(self.seat, other.seat)
         self.faults += other.faults
 
     def __str__(self) -> str:
-        return json.dumps(
-            {**dict(sorted(self.counts.items())), "slowest": round(self.slowest, 1), "wrong": len(self.faults)}
-        )
+        times = {"slowest": round(self.slowest, 1), "seat": round(self.seat, 1)}
+        return json.dumps({**dict(sorted(self.counts.items())), **times, "wrong": len(self.faults)})
 
 
 class Torture:
@@ -190,21 +202,47 @@ class Torture:
 
     def __init__(self, folder: Path, seed: int, ends: float) -> None:
         self.folder, self.seed, self.ends, self.tally = folder, seed, ends, Tally()
-        self.calls, self.memory = dict[str, int](), 0.0
+        self.calls, self.cpu, self.memory = dict[str, int](), dict[str, float](), 0.0
         self.expected = dict[str, tuple[dict[str, str], set[str]]]()  # command -> state, names of files
 
     def prepare(self) -> None:
         """Runs every command undisturbed, and loads what it loads; what lies in `results` before each is kept for its
         trials."""
-        shutil.copytree(conf_dir(), self.folder / "conf")
-        (self.folder / "conf/study/tortured.yaml").write_text(STUDY)
-        (self.folder / "conf/study/certified.yaml").write_text(CERTIFY)
-        os.environ["KERV_CONF_DIR"] = str(self.folder / "conf")
         torch.set_num_threads(1)
         choose_backend()
         stamp("cpu")
-        code_hash()
-        whole, log = self.folder / "whole", self.folder / "log"
+        kept, log, conf = self.folder / "prepared.json", self.folder / "log", conf_dir()
+        os.environ["KERV_CONF_DIR"] = str(self.folder / "conf")
+        if kept.exists() and (known := json.loads(kept.read_text())).pop("code") == code_hash():
+            learn(log)
+            self.calls, self.cpu, self.memory = known["calls"], known["cpu"], known["memory"]
+            self.expected = {command: (made, set(names)) for command, (made, names) in known["expected"].items()}
+        else:
+            self.run_all(log, conf)
+            expected = {command: (made, sorted(names)) for command, (made, names) in self.expected.items()}
+            known = {
+                "code": code_hash(),
+                "calls": self.calls,
+                "cpu": self.cpu,
+                "memory": self.memory,
+                "expected": expected,
+            }
+            kept.write_text(json.dumps(known))
+        os.chdir(self.folder / "all")
+        for command in PLANNED:
+            keys_for(command)
+        with spec_of(TASK).open_world(TASK) as world:  # draws the placements of the first seeds
+            for seeds in (world.spec.seeds.training, world.spec.seeds.evaluation):
+                world.reset(seeds.start)
+
+    def run_all(self, log: Path, conf: Path) -> None:
+        """Runs every command. log: gets the names of all modules that they load. conf: kerv's configuration."""
+        if (self.folder / "prepared.json").exists():  # by other code
+            shutil.rmtree(self.folder)
+        shutil.copytree(conf, self.folder / "conf")
+        (self.folder / "conf/study/tortured.yaml").write_text(STUDY)
+        (self.folder / "conf/study/certified.yaml").write_text(CERTIFY)
+        whole = self.folder / "whole"
         whole.mkdir()
         os.chdir(whole)
         for command, (words, _, _) in COMMANDS.items():
@@ -212,24 +250,22 @@ class Torture:
                 shutil.copytree(whole, self.folder / "all")
             shutil.copytree(whole, self.folder / f"before {command}")
             ended = undisturbed(words, log)
-            self.calls[command] = ended.calls
+            self.calls[command], self.cpu[command] = ended.calls, ended.cpu
             self.expected[command] = state(command), names_below(whole)
             print(f"{command}: {ended.calls} calls, {ended.cpu:.1f} s of CPU", flush=True)
         os.chdir(self.folder / "all")
         for words in [*PLANNED.values(), *PROBES]:
             self.memory = undisturbed(words, log).memory
-        for command in PLANNED:
-            keys_for(command)
-        with spec_of(TASK).open_world(TASK) as world:  # draws the placements of the first seeds
-            for seeds in (world.spec.seeds.training, world.spec.seeds.evaluation):
-                world.reset(seeds.start)
+        log.write_text("\n".join(sys.modules))
 
     def trials(self, parts: list[str], share: int) -> list[Trial]:
         """All trials, in an order drawn at random, so that a run that ends early has tried some of everything. share:
         of so many takes one."""
         order = random.Random(self.seed)
-        places = {command: range(1, calls + 1) for command, calls in self.calls.items()}
-        places |= {name: order.sample(at, min(WORKERS, len(at))) for name, at in places.items() if "workers" in name}
+        places = dict[str, list[int]]()
+        for name, there in self.calls.items():
+            most = WORKERS if "workers" in name else max(WORKERS, int(SHARE / self.cpu[name]))
+            places[name] = order.sample(range(1, there + 1), min(most, there))
         calls = [(command, at) for command, ats in places.items() for at in ats]
         order.shuffle(calls)
         trials = [Trial("faults", number, *call) for number, call in enumerate(calls)]
@@ -258,12 +294,12 @@ class Torture:
         return place
 
     def faults(self, trial: Trial, draw: random.Random) -> None:
-        """A fault at a call, and up to three more at random: a command that goes on is struck, too."""
-        calls = self.calls[trial.command]
-        further = [1 + int(calls ** draw.random()) for _ in range(draw.randrange(4))]
-        kinds = [*KINDS[1:7] * 4, *KINDS[7:]]  # mostly those that end a command
-        faults = [Fault(draw.choice(kinds), at) for at in (trial.at, *further)]
-        self.strike(trial.command, faults, draw.choice(PROBES))
+        """A fault at a call, and more at random, while they end the command: one that goes on is struck, too."""
+        calls, most = self.calls[trial.command], 4 if "workers" in trial.command else FURTHER
+        faults = [Fault(draw.choice(ENDING), at) for at in (trial.at, *_drawn(draw, calls, draw.randrange(most)))]
+        if draw.random() < 0.5:
+            faults += [Fault(draw.choice(HINDERING), at) for at in _drawn(draw, calls, 1)]
+        self.strike(trial.command, faults, draw.choices(PROBES, (1, 1, 5))[0])  # doctor is slow
 
     def strike(self, command: str, faults: list[Fault], probe: str) -> None:
         """Strikes a command, runs another, starts it again, compares."""
@@ -314,6 +350,21 @@ class Torture:
         temporary = {n for n in names_below(place) if n.endswith((".tmp", ".tmp/")) or "/claims/" in n[:-1]}
         self.check_left(what, temporary)
 
+    def frames(self, trial: Trial, draw: random.Random) -> None:
+        """Damaged messages and connections, sent to a server of each protocol, which ends in order."""
+        place = self.place("all")
+        for dialect in DIALECTS:
+            fire = Fire(draw, dialect, seen_by(place / "results", TASK))
+            ended = run([*SERVE.split(), f"protocol={dialect.name}"], HANGS, meanwhile=fire)
+            self.tally.counts.update(fire.counts)
+            self.tally.seat = max(self.tally.seat, fire.seat)
+            for says in fire.wrong:
+                self.fault(dialect.name, says)
+            wrong = ended.code or ended.left or ended.memory > self.memory + MEMORY
+            if wrong or "internal error" in ended.text or "Traceback" in ended.text:
+                self.fault(dialect.name, f"exit {ended.code}, {ended.memory:.0f} MiB: {ended.text[-300:]}")
+        self.check_left("frames", {name for name in names_below(place) if name.endswith((".tmp", ".tmp/"))})
+
     def judge(self, part: str, what: str, ended: Ended) -> None:
         """Notes a refusal that is not one line, a crash or a hang."""
         self.tally.slowest = max(self.tally.slowest, ended.cpu)
@@ -341,7 +392,9 @@ def share_out(torture: Torture, trials: list[Trial], jobs: int) -> Tally:
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
         try:
             for done in as_completed([pool.submit(torture, trial) for trial in trials]):
-                whole.add(done.result())
+                whole.add(tally := done.result())
+                for fault in tally.faults:
+                    print(f"FAULT {' '.join(fault.split())}", flush=True)
                 if time.monotonic() > told + 60:
                     told = time.monotonic()
                     print(whole, flush=True)
@@ -360,15 +413,18 @@ def main() -> None:
     parser.add_argument(
         "--seed", type=int, default=secrets.randbelow(10**6), help="of what is drawn; a new one each run"
     )
-    parser.add_argument("--only", default="faults,requests,files")
+    parser.add_argument("--only", default="faults,requests,files,frames")
+    parser.add_argument("--keep", type=Path, help="folder in which everything is prepared once for several runs")
     parser.add_argument("--commands", default="", help="faults of those commands alone whose names hold this")
     asked = parser.parse_args()
     parts = [part for part in asked.only.split(",") if part != "faults" or FAULTS]
     print(
         f"seed {asked.seed}" if FAULTS else f"seed {asked.seed}; no faults: no compiler for torture.c here", flush=True
     )
-    with tempfile.TemporaryDirectory(prefix="kerv-torture-") as folder:
-        torture = Torture(Path(folder), asked.seed, began + 60 * 0.98 * asked.minutes)  # what has begun must end, too
+    temporary = functools.partial(tempfile.TemporaryDirectory, prefix="kerv-torture-")
+    ends = began + 60 * 0.98 * asked.minutes  # what has begun must end, too
+    with contextlib.nullcontext(asked.keep) if asked.keep else temporary() as folder:
+        torture = Torture(Path(folder).resolve(), asked.seed, ends)
         torture.prepare()
         print(f"ready after {time.monotonic() - began:.0f} s", flush=True)
         tally = torture.tally
@@ -378,8 +434,6 @@ def main() -> None:
         os.chdir("/")
     if FAULTS:
         shutil.rmtree(Path(os.environ["LD_PRELOAD"]).parent)
-    for fault in tally.faults:
-        print(f"FAULT {' '.join(fault.split())}")
     print(f"{tally} in {(time.monotonic() - began) / 60:.1f} minutes, {asked.jobs} processes")
     sys.exit(bool(tally.faults))
 

@@ -18,7 +18,7 @@ TASK = "handle-press"  # its episodes are short
 PLANNED = {  # command of conf/ -> its words; all are plans, so that nothing long begins
     "rollout": "rollout --plan",
     "grid": "rollout -m --plan",
-    "sweep": "sweep --plan study=demo",
+    "sweep": "sweep --plan study=tortured",
     "demos": "demos --plan",
     "train_target": f"train target --plan demos=few task={TASK}",
     "train_drafter": "train drafter --plan demos=few",

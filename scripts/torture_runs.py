@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ KINDS = ("count", "kill", "torn", "no space", "broken", "full", "kill first", "s
 ENOSPC; EIO; ENOSPC from there on; the command's first process is killed, whichever made the call; calls take 50 ms
 from there on; the clock jumps by 25 hours, forth or back. As in torture.c. Memory: not a call's, the command gets that
 many MiB more than it has when it begins."""
+ENDING, HINDERING = KINDS[1:7], KINDS[7:]
 _CONTROL = struct.Struct("iiii1000s")
 
 
@@ -67,10 +69,17 @@ def preload() -> bool:
     os.execv(sys.executable, [sys.executable, *sys.argv])
 
 
-def run(words: list[str], limit: float, fault: Fault = NONE, log: Path | None = None) -> Ended:
+def run(
+    words: list[str],
+    limit: float,
+    fault: Fault = NONE,
+    log: Path | None = None,
+    meanwhile: Callable[[Callable[[], str]], None] | None = None,
+) -> Ended:
     """Runs a command in a fork of this process, in its own session, in the present folder.
 
     limit: seconds after which it is killed as one that hangs. log: gets the names of the modules that it loaded.
+    meanwhile: is called with what reads the command's output so far; then the command gets a SIGTERM.
     """
     began, status = time.monotonic(), None
     with tempfile.TemporaryFile() as output, tempfile.NamedTemporaryFile() as file:
@@ -81,10 +90,17 @@ def run(words: list[str], limit: float, fault: Fault = NONE, log: Path | None = 
             root = os.path.realpath(os.getcwd()).encode()
             control[: _CONTROL.size] = _CONTROL.pack(0, fault.at, KINDS.index(fault.kind), os.getpid(), root)
             _be_command(words, fault, output.fileno(), file.name, log)
+        try:
+            if meanwhile is not None:
+                meanwhile(lambda: os.pread(output.fileno(), 2**20, 0).decode(errors="replace"))
+        finally:
+            if meanwhile is not None:
+                os.kill(child, signal.SIGTERM)
+        until = time.monotonic() + limit
         while status is None:
             ended, code, used = os.wait4(child, os.WNOHANG)
             status = code if ended else None
-            if not ended and time.monotonic() > began + limit:
+            if not ended and time.monotonic() > until:
                 os.kill(child, signal.SIGKILL)
             time.sleep(0.003)
         wall, left = time.monotonic() - began, _left(child)

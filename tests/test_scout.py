@@ -210,6 +210,9 @@ def test_a_certificate_of_another_method_chunk_format_or_world_is_refused(target
     issued.check_world({"camera": {"size": 96}, "horizon": 500, "stress": {"kind": "push"}})
     with pytest.raises(UsageError, match=r"world.horizon=120: the certificate is of 500"):
         issued.check_world({"camera": {"size": 96}, "horizon": 120})
+    issued.check_environment("metaworld")
+    with pytest.raises(UsageError, match=r"with a policy of libero: the certificate is of metaworld"):
+        issued.check_environment("libero")
 
 
 def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Path) -> None:
@@ -226,6 +229,15 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     assert "0/2" in done.stdout
     written = next(results.rglob("certificate.json"))
     assert written.is_file(), path
+    serve = ["serve", "--plan", "policy.target=nano-vision", f"results={results}", "port=0"]
+    serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
+    assert CliRunner().invoke(app, serve).exit_code == 0
+    issued = written.read_text()
+    written.write_text(issued.replace('"environment": "metaworld"', '"environment": "elsewhere"'))
+    refused = CliRunner().invoke(app, serve)
+    assert refused.exit_code == 2
+    assert "with a policy of metaworld: the certificate is of elsewhere" in refused.stderr
+    written.write_text(issued)
     few = CliRunner().invoke(app, [*words[:-2], "margin=1", "name=few", "--json"])
     assert few.exit_code == 0, few.output
     assert "nothing is certified" in few.stdout

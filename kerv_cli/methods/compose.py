@@ -62,9 +62,10 @@ class Method:
         kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
         return tuple(dict.fromkeys(kinds))
 
-    def check(self, target: Any, batch: int = 1) -> None:
+    def check(self, target: Any, batch: int = 1, key: str = "rollout.batch") -> None:
         """Refuses parts that do not belong together or to the target, and numbers out of range, before anything heavy
-        is loaded. target: a description of one, or a loaded one. batch: episodes whose decodes are computed together.
+        is loaded. target: a description of one, or a loaded one. batch: episodes whose decodes are computed together;
+        key: the setting that says so.
 
         Raises:
             UnknownName: no such part. UsageError: a composition that cannot work, or a number out of range.
@@ -77,7 +78,7 @@ class Method:
         self._check_drafts()
         self._check_parallel(is_parallel(target))
         self._check_skip()
-        self._check_batch(batch)
+        self._check_batch(batch, key)
 
     def _check_drafts(self) -> None:
         """A boundary chooses between two sides, and an in-prefill draft comes before the target's states."""
@@ -117,7 +118,7 @@ class Method:
                 "the prefill, e.g. prefill_draft=early"
             )
 
-    def _check_batch(self, batch: int) -> None:
+    def _check_batch(self, batch: int, key: str) -> None:
         """Several episodes at a time go through the same forwards."""
         if batch == 1:
             return
@@ -125,12 +126,12 @@ class Method:
         if (names["prefill_draft"], names["proposer"], names["skip"]) not in _BATCHED:
             *others, last = _BATCHED.values()
             raise UsageError(
-                f"rollout.batch={batch} with method={self.name}: {', '.join(others)} and {last} alone decode several "
+                f"{key}={batch} with method={self.name}: {', '.join(others)} and {last} alone decode several "
                 "episodes at once, leave it out"
             )
         if names["prefill_draft"] != "none" and names["threshold"] != "fixed":
             raise UsageError(
-                f"rollout.batch={batch} with threshold={names['threshold']}: its radius follows one episode's "
+                f"{key}={batch} with threshold={names['threshold']}: its radius follows one episode's "
                 "decodes, use threshold=fixed"
             )
 

@@ -48,10 +48,12 @@ class Policy:
         self.settings = settings
         self.artifacts = artifacts_of(settings)
         self.method = Method.of(settings)
-        self.method.check(self.artifacts.description, settings.batch)
+        self.method.check(self.artifacts.description, settings.batch, "batch")
         if settings.protocol != VLA_EVAL:
             self.method.check_unwatched("kerv serve", "a client executes chunks without a look between their steps")
         self.identity = self.artifacts.check(self.method.needs)
+        if "certificate" in self.method.needs:
+            self.artifacts.load("certificate").check_environment(self.artifacts.description.environment)
         self.interface = self._interface()
         self.range = self._range()
         self.by_task = not settings.task_name and bool(self._task_artifacts())

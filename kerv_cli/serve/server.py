@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import http
+import logging
 import math
 import threading
 import time
@@ -158,6 +159,7 @@ class PolicyServer:
                 ping_interval=self.ping_s or None,
                 ping_timeout=self.ping_s or None,
                 close_timeout=FAREWELL,
+                logger=_lines(self.log),
             )
         except OSError as error:
             raise UsageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
@@ -170,7 +172,7 @@ class PolicyServer:
         """One connection, from its handshake to its end."""
         from websockets.exceptions import ConnectionClosed
 
-        who = str(connection.remote_address)
+        who = _address(connection)
         seated, lost = self.seats.take(connection)
         if not seated:
             self.log(f"{who} refused: {self._full}")
@@ -200,7 +202,7 @@ class PolicyServer:
     def _talk(self, connection: Any, latencies: Latencies) -> None:
         """Answers frames until the connection ends. Raises ConnectionClosed, and TimeoutError for silence."""
         with self.policy.session() as session:
-            session.say = lambda line: self.log(f"{connection.remote_address} {line}")
+            session.say = lambda line: self.log(f"{_address(connection)} {line}")
             conversation: Conversation = self.protocol(self.policy, session)
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
@@ -233,13 +235,34 @@ class PolicyServer:
 
     def _refuse(self, connection: Any, conversation: Conversation, reason: str) -> None:
         line = " ".join(reason.split())[:LONGEST]
-        self.log(f"{connection.remote_address} error: {line}")
+        self.log(f"{_address(connection)} error: {line}")
         connection.send(conversation.fault(line))
 
 
 def _close(connection: Any, code: int, reason: str) -> None:
     """Closes a connection that may never answer, in a thread of its own: nobody waits for it."""
     threading.Thread(target=connection.close, args=(code, reason), daemon=True).start()
+
+
+def _address(connection: Any) -> str:
+    """The client's address, for the log."""
+    try:
+        return str(connection.remote_address)
+    except OSError:
+        return "a client that has left"
+
+
+def _lines(log: Log) -> logging.Logger:
+    """Where websockets reports what it cannot handle: a line of the log each, no traceback."""
+
+    class Lines(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            error = record.exc_info[1] if record.exc_info else None
+            log(f"error: {record.getMessage()}{f': {error}' if error else ''}"[:LONGEST])
+
+    logger = logging.Logger("kerv.serve", logging.ERROR)
+    logger.addHandler(Lines())
+    return logger
 
 
 def _health(connection: Any, request: Any) -> Any:

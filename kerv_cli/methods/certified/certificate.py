@@ -124,6 +124,15 @@ class Certificate:
             if world.get(key) != certified:
                 raise UsageError(f"skip=certified with world.{key}={world.get(key)}: the certificate is of {certified}")
 
+    def check_environment(self, name: str) -> None:
+        """Refuses to be served with a policy of another environment. Camera and horizon are the client's.
+
+        Raises:
+            UsageError: another one; names both.
+        """
+        if name != self.environment:
+            raise UsageError(f"skip=certified with a policy of {name}: the certificate is of {self.environment}")
+
     def sentence(self) -> str:
         """The certificate in one sentence."""
         chosen = self.certified
