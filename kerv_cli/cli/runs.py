@@ -178,6 +178,7 @@ def rerun(
 ) -> None:
     """Run a run again from what it stored, into a new folder, and say whether the tokens are the same."""
     from kerv_cli.lab.catalogue import find_run
+    from kerv_cli.lab.store import IMPORT
 
     results, (name,) = settings.results, _runs(names)
     run = find_run(results, name)
@@ -186,7 +187,7 @@ def rerun(
         return
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
-    if run.command[:2] == ("runs", "import"):
+    if run.command[:2] == IMPORT:
         raise UsageError(f"{run.id} was imported: run vla-eval again, then 'kerv runs import'")
     from kerv_cli.cli.again import cells_again, run_again, store_again
     from kerv_cli.report.compare import same_tokens
@@ -270,7 +271,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     """Read evaluations of vla-eval as a study, whose episodes are paired as those of a sweep are."""
     from kerv_cli.base.places import results_dir
     from kerv_cli.lab import imported
-    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.lab.store import IMPORT, StudyStore
     from kerv_cli.report.summary import summary_table
     from kerv_cli.report.tables import load_study, rows_of, study_table
 
@@ -278,7 +279,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
         raise UsageError("name a recording of vla-eval: kerv runs import recording-ID.sqlite")
     sides = imported.sides_of([imported.read_evaluations(Path(name)) for name in names], settings.labels)
     results, name = results_dir(settings.results), settings.name or imported.study_name(sides)
-    notes = imported.write_study(results, name, sides, settings.baseline, [*imported.COMMAND, *names])
+    notes = imported.write_study(results, name, sides, settings.baseline, [*IMPORT, *names])
     table = study_table(load_study(StudyStore(results, name)))
     if as_json:
         print_json({"study": name, "notes": notes, "settings": rows_of(table)})

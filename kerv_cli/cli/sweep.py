@@ -204,8 +204,8 @@ def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
         typer.echo(f"its cells are of {len(codes)} states of the code, commits {names}")
     apart = not_in_turn(table)
     if apart:
-        command = runnable(f"'{store.sweep_command('rerun=timed')}'", words)
-        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; {command} does that")
+        mend = "" if store.is_imported else f"; '{store.sweep_command('rerun=timed')}' does that"
+        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{runnable(mend, words)}")
     note = store.read_plan().note
     if note:
         typer.echo(f"\n{note}\n")
@@ -218,8 +218,8 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     typer.echo(f"verdict: {verdict(table, loss)[0]}")
     typer.echo(f"page: {store.root / 'report.html'}")
     recordings = store.recordings
-    nothing = "nothing is recorded; the same sweep with record=1 rerun=all does that"
-    typer.echo(f"watch: {f'{called()} view {recordings[0]}' if recordings else nothing}")
+    mend = "" if store.is_imported else "; the same sweep with record=1 rerun=all does that"
+    typer.echo(f"watch: {f'{called()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
 
 
 def _tell(

@@ -34,7 +34,6 @@ from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, deco
 from kerv_cli.lab.served import Served, path_of, read_served
 from kerv_cli.lab.store import StudyStore
 
-COMMAND = ("runs", "import")
 _ELSEWHERE = "elsewhere"
 """Mode of the one decode that stands for those of a server which is not kerv."""
 _UNKNOWN = ("path_length", "jerk", "gripper_switches", "worker_pid")
@@ -243,7 +242,7 @@ def write_study(results: Path, name: str, sides: Sequence[Side], baseline: str, 
             refused. CheckpointError: a served episode is damaged.
     """
     store = StudyStore(results, name)
-    if store.plan_path.is_file() and not any(one.arguments[:2] == COMMAND for one in store.commands()):
+    if store.plan_path.is_file() and not store.is_imported:
         raise UsageError(f"study '{name}' is there and was not imported: choose another with name=")
     labels = [side.label for side in sides]
     baseline = baseline or ("ar" if "ar" in labels else labels[0])

@@ -112,6 +112,8 @@ FORMAT = 1
 
 STUDIES, ROLLOUTS = "studies", "rollouts"
 """Families of stores: what `kerv sweep` and what `kerv rollout` leaves, in the same files."""
+IMPORT = ("runs", "import")
+"""The command whose episodes another harness ran."""
 
 
 class StudyStore:
@@ -193,6 +195,11 @@ class StudyStore:
         with contextlib.suppress(CheckpointError):
             return read(_RunFile, read_json(self.run_path), str(self.run_path), tolerant=True).commands
         return ()
+
+    @property
+    def is_imported(self) -> bool:
+        """Whether the episodes come from another harness (`kerv runs import`)."""
+        return any(command.arguments[:2] == IMPORT for command in self.commands())
 
     def note_command(self, arguments: Sequence[str]) -> None:
         """Appends a command that begins now to run.json. Raises StorageError: the disk refused."""
