@@ -28,6 +28,7 @@ from kerv_cli.engine.draft import ROOT, Draft, TokenTree
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.record import path_length
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer
@@ -352,12 +353,6 @@ def radius_of_curvature(points: np.ndarray) -> float:
     conic = np.column_stack([((planar**2).sum(1) - 1) / 2, planar])
     quadratic = abs(float(np.linalg.svd(conic, full_matrices=False)[2][-1, 0]))
     return scale / quadratic if quadratic > 0 else math.inf
-
-
-def path_length(points: np.ndarray) -> float:
-    """Summed distances between successive points (n, 3), metres; 0 for fewer than two."""
-    points = np.asarray(points, dtype=np.float64)
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 @dataclass(frozen=True)
