@@ -23,7 +23,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.acceptance import Acceptance, Accepted, Strict, accept_by_group
-from kerv_cli.engine.chunk import Choice, Chunk, Mode
+from kerv_cli.engine.chunk import Choice, Chunk
 from kerv_cli.engine.draft import ROOT, Draft, TokenTree
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
@@ -421,24 +421,8 @@ class Seeded:
 
 
 @dataclass(frozen=True)
-class Always(Seeded):
-    """One side for all chunks."""
-
-    mode: Mode
-
-    @classmethod
-    def build(cls, settings: NoSettings, context: Context) -> Always:
-        """boundary=always_retrieval, always_drafter."""
-        return cls("retrieval" if settings.kind == "always_retrieval" else "drafter")
-
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """`mode`, whatever the path."""
-        return Choice(self.mode)
-
-
-@dataclass(frozen=True)
 class Random(Seeded):
-    """Retrieval with probability p, without looking at the path: a control."""
+    """Retrieval with probability p, without looking at the path: a control; 1 and 0 are one side for all chunks."""
 
     p: float
     seed: int = 0
@@ -447,6 +431,11 @@ class Random(Seeded):
     def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
         """boundary=random."""
         return cls(settings.p, settings.seed)
+
+    @classmethod
+    def always(cls, settings: NoSettings, context: Context) -> Random:
+        """boundary=always_retrieval, always_drafter."""
+        return cls(float(settings.kind == "always_retrieval"))
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """Retrieval with probability p, else the drafter."""
