@@ -52,10 +52,6 @@ class Round:
         """Whether the target verified a tree."""
         return self.tree_size > 0 and self.mode != "skip"
 
-    def without_bonus(self) -> Round:
-        """This round without its bonus, for compensations that do not use the target token at the rejected position."""
-        return replace(self, committed=self.accepted)
-
 
 @dataclass(frozen=True)
 class Delay:
