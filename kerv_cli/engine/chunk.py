@@ -168,7 +168,7 @@ class Chunk:
         return self.prompt.shape[1]
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Tokens still to be decoded; 0 after a rectifier closed the chunk."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
