@@ -148,5 +148,5 @@ def parts_of_device(parts: Parts) -> Parts:
         if hasattr(part, "waits"):
             part.waits = False
         if isinstance(part, DrafterProposer):
-            part.state.cache = part.drafter.new_cache(1, part.state.cache.capacity)
+            part.cache = part.drafter.new_cache(1, part.cache.capacity)
     return parts
