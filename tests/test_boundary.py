@@ -15,8 +15,9 @@ from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Choice
 from kerv_cli.engine.parts import Boundary
+from kerv_cli.engine.record import path_length
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.heisd.rules import STILL, BoundaryRanges, path_length, radius_of_curvature
+from kerv_cli.methods.heisd.rules import STILL, BoundaryRanges, radius_of_curvature
 
 WINDOW = 15
 RANGES = BoundaryRanges(radius_low=0.01, radius_high=1.0, length_low=0.0, length_high=0.15)

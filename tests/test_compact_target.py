@@ -27,7 +27,7 @@ from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyProposer
 from kerv_cli.targets.attention import attention_mask
 from kerv_cli.targets.checkpoint import load_target, read_target
-from kerv_cli.targets.compact.captured import CapturedLayers, bucket
+from kerv_cli.targets.compact.captured import CapturedCache, bucket
 from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
@@ -250,13 +250,13 @@ def test_a_padded_bucket_computes_its_tokens(tokens: int) -> None:
     with torch.inference_mode():
         wanted = trunk.run_layers(x, positions, None, None)[:, 20:]
         cache = trunk.new_cache(1, 60, fixed=True)
-        captured = CapturedLayers(trunk, cache)
+        assert isinstance(cache, CapturedCache)
         for first, last in ((0, 20), (20, 20 + tokens)):
             mask = attention_mask(None, last - first, cache, x)
             assert mask is not None
-            found = captured(x[:, first:last], positions[first:last], mask)
+            found = cache.run(trunk, x[:, first:last], positions[first:last], mask)
             cache.length = last
-    assert captured.steps.keys() == {32, bucket(tokens)}
+    assert cache.steps.keys() == {32, bucket(tokens)}
     assert torch.allclose(found, wanted, atol=1e-5)
 
 

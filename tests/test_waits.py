@@ -17,7 +17,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.heisd.rules import Always, HybridProposer, RetrievalProposer
+from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer
 from kerv_cli.methods.jacobi.proposer import JacobiProposer
 from kerv_cli.methods.kinematics.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged.proposer import MergedProposer
@@ -67,8 +67,8 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
         "hold": Parts(proposer=hold),
         "kalman": Parts(proposer=kalman),
         "retrieval": Parts(proposer=retrieval),
-        "hybrid, drafter": Parts(proposer=both, boundary=Always("drafter")),
-        "hybrid, retrieval": Parts(proposer=both, boundary=Always("retrieval")),
+        "hybrid, drafter": Parts(proposer=both, boundary=Random(0.0)),
+        "hybrid, retrieval": Parts(proposer=both, boundary=Random(1.0)),
         "hold in the prefill": Parts(prefill_draft=hold),
         "early": Parts(prefill_draft=early),
         "merged": Parts(prefill_draft=merged),
@@ -148,5 +148,5 @@ def parts_of_device(parts: Parts) -> Parts:
         if hasattr(part, "waits"):
             part.waits = False
         if isinstance(part, DrafterProposer):
-            part.state.cache = part.drafter.new_cache(1, part.state.cache.capacity)
+            part.cache = part.drafter.new_cache(1, part.cache.capacity)
     return parts

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -168,7 +168,7 @@ class Chunk:
         return self.prompt.shape[1]
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Tokens still to be decoded; 0 after a rectifier closed the chunk."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
@@ -204,6 +204,6 @@ class Chunk:
         whether the target token at the rejected position stays committed."""
         if not with_target_token:
             del self.tokens[-1]
-            self.rounds[-1] = self.rounds[-1].without_bonus()
+            self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)  # without the bonus
         del self.tokens[values.size :]
         self.closed = values

@@ -183,12 +183,12 @@ class Decoder:
             if skipped:
                 return chunk
         self.prefill(chunk, clock)
-        if parts.proposer is not None and chunk.left > 1:
+        if parts.proposer is not None and chunk.remaining > 1:
             parts.proposer.begin(chunk)
             clock.lap("propose")
-        if parts.proposer is None and chunk.left:
+        if parts.proposer is None and chunk.remaining:
             self.decode_alone(chunk, clock)
-        while chunk.left:
+        while chunk.remaining:
             self.round(chunk, clock)
         return chunk
 
@@ -224,9 +224,9 @@ class Decoder:
     def round(self, chunk: Chunk, clock: Clock) -> None:
         """One round: propose, verify, accept, commit, rectify. Without a draft the forward decodes one token."""
         draft, proposer = EMPTY, self.parts.proposer
-        if proposer is not None and chunk.left > 1:
+        if proposer is not None and chunk.remaining > 1:
             # one token less than the chunk lacks: the bonus is its last token whether or not everything is accepted
-            draft = proposer.propose(chunk, chunk.left - 1)
+            draft = proposer.propose(chunk, chunk.remaining - 1)
             clock.lap("propose")
         hidden, verified = self.verify(chunk, draft)
         clock.lap("verify")
@@ -238,7 +238,7 @@ class Decoder:
             clock.lap("accept")
             self.rectify(chunk)
             clock.lap("rectify")
-        if proposer is not None and chunk.left > 1:
+        if proposer is not None and chunk.remaining > 1:
             proposer.committed(chunk, first, hidden, verified.target_tokens)
             clock.lap("propose")
 
@@ -246,7 +246,7 @@ class Decoder:
         """The chunk's remaining tokens, one forward each, without a proposer. Each goes from the device into the next
         forward; all are read behind the last one."""
         target, first = self.target, chunk.prompt_length + len(chunk.tokens) - 1
-        positions = torch.arange(first, first + chunk.left, device=target.device).split(1)
+        positions = torch.arange(first, first + chunk.remaining, device=target.device).split(1)
         tokens = [upload(chunk.tokens[-1:], target.device)]
         for position in positions:
             hidden = target.forward(target.embed(tokens[-1][None]), position, chunk.cache, None)
@@ -333,7 +333,7 @@ class Decoder:
         if rectifier is None or last.accepted == len(last.drafted):
             return
         # where the target's token is the last of the chunk nothing is missing, if it may be used
-        if chunk.left or not rectifier.uses_target_token:
+        if chunk.remaining or not rectifier.uses_target_token:
             rectifier.close(chunk)
 
 

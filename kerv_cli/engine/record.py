@@ -52,10 +52,6 @@ class Round:
         """Whether the target verified a tree."""
         return self.tree_size > 0 and self.mode != "skip"
 
-    def without_bonus(self) -> Round:
-        """This round without its bonus, for compensations that do not use the target token at the rejected position."""
-        return replace(self, committed=self.accepted)
-
 
 @dataclass(frozen=True)
 class Delay:
@@ -141,6 +137,11 @@ class DecodeRecord:
         return None
 
 
+def path_length(points: np.ndarray) -> float:
+    """Summed distances between successive points (n, 3), metres; 0 for fewer than two."""
+    return float(np.linalg.norm(np.diff(points.astype(np.float64), axis=0), axis=1).sum())
+
+
 @dataclass(frozen=True)
 class EpisodeRecord:
     """One episode: a task, a seed, and everything the decoder did."""
@@ -181,7 +182,7 @@ class EpisodeRecord:
     @property
     def path_length(self) -> float:
         """The end effector's way, metres."""
-        return float(np.linalg.norm(np.diff(self.path.astype(np.float64), axis=0), axis=1).sum())
+        return path_length(self.path)
 
     @property
     def jerk(self) -> float:

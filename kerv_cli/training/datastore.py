@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.files import read_json, sha256_of, write_folder, write_json
+from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.runtime import set_up
@@ -110,11 +110,10 @@ class DatastoreBuild:
         most = settings.episodes or None
         self.chosen = {name: [i for i in by_seed if entries[i].task == name][:most] for name in tasks}
         check_seeds(self.seeds, self.dataset.path)
-        if self.folder.is_file() or (self.folder.is_dir() and any(self.folder.iterdir())):
-            manifest = self.folder / "manifest.json"
-            content = read_json(manifest) if manifest.is_file() else None
-            if not isinstance(content, dict) or content.get("kind") != "datastore":
-                raise UsageError(f"{self.folder} exists and is no datastore: give the new one another name")
+        manifest = self.folder / "manifest.json"
+        kind = read_mapping(manifest).get("kind") if manifest.is_file() else None
+        if kind != "datastore" and (self.folder.is_file() or visible(self.folder)):
+            raise UsageError(f"{self.folder} exists and is no datastore: give the new one another name")
 
     @property
     def seeds(self) -> dict[str, list[int]]:

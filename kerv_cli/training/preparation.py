@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
@@ -27,7 +26,6 @@ class Step:
     that make it, without those that every step shares. seconds: of making it, a guess; 0 where it is there."""
 
     kind: str
-    place: Path
     state: str
     command: tuple[str, ...]
     seconds: float
@@ -48,13 +46,13 @@ def plan(settings: PrepareSettings) -> list[Step]:
     kinds = needs(tuple(settings.methods), bool(description.cameras), played)
     steps: list[Step] = []
     for kind in kinds:
-        place, command = artifacts.path(kind), list(kind_of(kind).command)
+        command = list(kind_of(kind).command)
         if command[0] == "calibrate" and "drafter" not in kinds:
             command.append("decodes=0")  # they are the drafter's
         if command[0] == "train" and settings.steps:
             command.append(f"train.steps={settings.steps}")
         state = _state(artifacts, kind, kinds)
-        steps.append(Step(kind, place, state, tuple(command), 0.0 if state == THERE else _seconds(kind, command)))
+        steps.append(Step(kind, state, tuple(command), 0.0 if state == THERE else _seconds(kind, command)))
     if any(step.state != THERE and step.kind != "certificate" for step in steps):
         demos_for(settings)
     return steps
@@ -97,22 +95,22 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
     Raises:
         CheckpointError: a trained one is of another target.
     """
-    files, place = kind_of(kind), artifacts.path(kind)
-    if not files.json(place).is_file():
+    files, path = kind_of(kind), artifacts.path(kind)
+    if not files.json(path).is_file():
         return MISSING
     try:
-        described = files.checked(place, artifacts.description)
+        described = files.checked(path, artifacts.description)
         made = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
         artifacts.check(made[: made.index(kind) + 1])
     except CheckpointError as error:
         if isinstance(files, Weights):
-            name = f"{kind}/{place.name}"
+            name = f"{kind}/{path.name}"
             raise CheckpointError(f"{str(error).split(': ')[0]}: remove it with 'kerv runs rm {name}'") from error
         return "of other artifacts"
     if kind == "calibration":
         lacks = [name for name, part in (("variability", "drafter"), ("skip", "datastore")) if part in kinds]
         return MISSING if any(not getattr(described, name) for name in lacks) else THERE
-    state = state_of(place, kind) if isinstance(files, Weights) else THERE
+    state = state_of(path, kind) if isinstance(files, Weights) else THERE
     return THERE if state == "complete" else state
 
 

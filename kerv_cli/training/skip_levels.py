@@ -59,10 +59,10 @@ def neighbours_elsewhere(store: Datastore, task: str, entries: int) -> tuple[np.
     return rows, similarity, chunks
 
 
-def match(store: Datastore, task: str, entries: int = ENTRIES) -> Matches:
+def match(store: Datastore, task: str) -> Matches:
     """The entries of `neighbours_elsewhere`, with the neighbours' chunks compared to their own."""
     space = store.manifest.actions
-    rows, similarity, drafts = neighbours_elsewhere(store, task, entries)
+    rows, similarity, drafts = neighbours_elsewhere(store, task, ENTRIES)
     expert = store.tokens[rows].astype(np.int64)
     error = np.abs(space.values_of(drafts) - space.values_of(expert)).mean(1)
     strict = (drafts != expert)[:, space.strict_tokens(expert.shape[1])].any(1)

@@ -1,6 +1,5 @@
 """The early drafter: the whole chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours).
-Settings and
-registration."""
+Settings and registration."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class RandomBoundarySettings:
 
 
 for _name in ("always_retrieval", "always_drafter"):
-    add("boundary", _name, _RULES + "Always.build", chooses=True)
+    add("boundary", _name, _RULES + "Random.always", chooses=True)
 add("boundary", "fused", _RULES + "Fused.build", FusedBoundarySettings, ("calibration",), chooses=True)
 add("boundary", "random", _RULES + "Random.build", RandomBoundarySettings, chooses=True)
 

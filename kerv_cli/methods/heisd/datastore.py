@@ -207,7 +207,7 @@ class ExactIndex:
         digest: str = "",
         settings: Any = None,
     ) -> None:
-        """vectors (rows, d) float32, seeds (rows,), shards: task -> rows; digest, search: read by other searches."""
+        """vectors (rows, d) float32, seeds (rows,), shards: task -> rows; digest, settings: read by other searches."""
         self.seeds, self.shards = seeds, shards
         self.outlines = {task: Outline.of(vectors[shard]) for task, shard in shards.items()}
 

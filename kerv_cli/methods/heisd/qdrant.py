@@ -13,7 +13,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -24,18 +24,6 @@ from kerv_cli.methods.heisd.datastore import best, length_of_longest, slack
 BATCH = 131_072  # numbers sent at once: below a server's limit for one request
 MARGIN = 8  # rows requested beyond k, so that ties at the k-th place seldom need a second search
 TIMEOUT = 10  # s, of a server
-
-
-class Engine(Protocol):
-    """A Qdrant engine or server. Point i is row i of the datastore, with payload task and seed."""
-
-    def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
-        """Stores rows first, first + 1, …: vectors (n, d), one payload each."""
-
-    def search(
-        self, key: list[float], task: str, limit: int, without: int | None, above: float | None
-    ) -> list[tuple[int, float]]:
-        """(row, score) of the `limit` best of the task's rows, best first; of those that score more than `above`."""
 
 
 class QdrantIndex:
@@ -56,7 +44,7 @@ class QdrantIndex:
         self.longest = length_of_longest(vectors)
         width = vectors.shape[1]
         if url is None:
-            self.engine: Engine = EmbeddedEngine(width)
+            self.engine: EmbeddedEngine | ServerEngine = EmbeddedEngine(width)
             self._fill()
         else:
             server = ServerEngine(url, f"kerv-{digest[:32]}", width)
@@ -98,7 +86,8 @@ def qdrant_index(
 
 
 class EmbeddedEngine:
-    """Qdrant's own engine, one search thread, without a server."""
+    """Qdrant's own engine, one search thread, without a server. Point i is row i of the datastore, with its task and
+    seed."""
 
     def __init__(self, width: int) -> None:
         import qdrant_edge as q
@@ -126,7 +115,8 @@ class EmbeddedEngine:
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
     ) -> list[tuple[int, float]]:
-        """(row, score) of the task's best rows, arguments as in `Engine`."""
+        """(row, score) of the `limit` best of the task's rows, best first; of those that score more than `above`.
+        without: seed passed over."""
         q = self.q
         must = [q.FieldCondition("task", match=q.MatchValue(task))]
         excluded = [] if without is None else [q.FieldCondition("seed", match=q.MatchValue(without))]
@@ -155,7 +145,7 @@ def _discard(shard: Any, folder: str) -> None:
 
 
 class ServerEngine:
-    """A Qdrant server; creates the collection where there is none."""
+    """A Qdrant server, with the methods of `EmbeddedEngine`; creates the collection where there is none."""
 
     def __init__(self, url: str, collection: str, width: int) -> None:
         from qdrant_client import QdrantClient, models
@@ -195,7 +185,8 @@ class ServerEngine:
     def search(
         self, key: list[float], task: str, limit: int, without: int | None, above: float | None
     ) -> list[tuple[int, float]]:
-        """(row, score) of the task's best rows, arguments as in `Engine`."""
+        """(row, score) of the `limit` best of the task's rows, best first; of those that score more than `above`.
+        without: seed passed over."""
         m = self.models
         must = [m.FieldCondition(key="task", match=m.MatchValue(value=task))]
         excluded = [] if without is None else [m.FieldCondition(key="seed", match=m.MatchValue(value=without))]

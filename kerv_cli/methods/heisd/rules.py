@@ -23,11 +23,12 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.acceptance import Acceptance, Accepted, Strict, accept_by_group
-from kerv_cli.engine.chunk import Choice, Chunk, Mode
+from kerv_cli.engine.chunk import Choice, Chunk
 from kerv_cli.engine.draft import ROOT, Draft, TokenTree
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.engine.record import path_length
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer
@@ -354,12 +355,6 @@ def radius_of_curvature(points: np.ndarray) -> float:
     return scale / quadratic if quadratic > 0 else math.inf
 
 
-def path_length(points: np.ndarray) -> float:
-    """Summed distances between successive points (n, 3), metres; 0 for fewer than two."""
-    points = np.asarray(points, dtype=np.float64)
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
 @dataclass(frozen=True)
 class BoundaryRanges:
     """Ranges of R and D over the training demonstrations: minimum and 95th percentile, metres.
@@ -426,24 +421,8 @@ class Seeded:
 
 
 @dataclass(frozen=True)
-class Always(Seeded):
-    """One side for all chunks."""
-
-    mode: Mode
-
-    @classmethod
-    def build(cls, settings: NoSettings, context: Context) -> Always:
-        """boundary=always_retrieval, always_drafter."""
-        return cls("retrieval" if settings.kind == "always_retrieval" else "drafter")
-
-    def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
-        """`mode`, whatever the path."""
-        return Choice(self.mode)
-
-
-@dataclass(frozen=True)
 class Random(Seeded):
-    """Retrieval with probability p, without looking at the path: a control."""
+    """Retrieval with probability p, without looking at the path: a control; 1 and 0 are one side for all chunks."""
 
     p: float
     seed: int = 0
@@ -452,6 +431,11 @@ class Random(Seeded):
     def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
         """boundary=random."""
         return cls(settings.p, settings.seed)
+
+    @classmethod
+    def always(cls, settings: NoSettings, context: Context) -> Random:
+        """boundary=always_retrieval, always_drafter."""
+        return cls(float(settings.kind == "always_retrieval"))
 
     def choose(self, path: np.ndarray, rng: np.random.Generator) -> Choice:
         """Retrieval with probability p, else the drafter."""

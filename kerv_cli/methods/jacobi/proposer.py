@@ -33,8 +33,8 @@ class JacobiProposer(Proposer):
 
     def begin(self, chunk: Chunk) -> None:
         """Makes the first guess."""
-        tokens = chunk.rejection.target[: chunk.left]
-        self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.left - len(tokens))]
+        tokens = chunk.rejection.target[: chunk.remaining]
+        self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.remaining - len(tokens))]
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The present guess as a chain."""

@@ -37,33 +37,22 @@ class Stack(Protocol):
 
 
 class CapturedCache(Cache):
-    """A cache of fixed shapes. captured: the graphs that write to it, from the first forward that runs in one."""
+    """A cache of fixed shapes. steps: bucket -> the graph that writes to it, from the first forward that runs in one;
+    every forward over a cache is of one stack and of batch 1."""
 
     def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
         super().__init__(layers, batch, heads, capacity, channels, like, fixed=True)
-        self.captured: CapturedLayers | None = None
+        self.steps: dict[int, _Step] = {}
 
     def run(self, stack: Stack, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """The layers in a graph, see `CapturedLayers.__call__`; every forward over a cache is of one stack."""
-        self.captured = self.captured or CapturedLayers(stack, self)
-        return self.captured(x, positions, mask)
-
-
-class CapturedLayers:
-    """The layers of one stack over one cache of fixed shapes and batch 1."""
-
-    def __init__(self, stack: Stack, cache: Cache) -> None:
-        self.stack, self.cache = stack, cache
-        self.steps: dict[int, _Step] = {}
-        if cache.buffer.is_cuda:  # in the warm-up's first forward: a capture in the middle of an episode would be timed
-            self.steps = {size: _Step(stack, cache, size) for size in _AT_ONCE if size <= cache.capacity}
-
-    def __call__(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """x (1, T, E) at `positions` (T,), mask (T, slots) as `attention_mask` -> output of the last layer (1, T, E),
-        valid until the next forward of the same bucket; the new tokens lie behind the cached ones."""
+        """The layers in a graph: x (1, T, E) at `positions` (T,), mask (T, slots) as `attention_mask` -> output of the
+        last layer (1, T, E), valid until the next forward of the same bucket; the new tokens lie behind the cached
+        ones."""
+        if self.buffer.is_cuda and not self.steps:  # in the warm-up: a capture in the middle of an episode is timed
+            self.steps = {size: _Step(stack, self, size) for size in _AT_ONCE if size <= self.capacity}
         size = bucket(x.shape[1])
         if size not in self.steps:
-            self.steps[size] = _Step(self.stack, self.cache, size)
+            self.steps[size] = _Step(stack, self, size)
         return self.steps[size].run(x, positions, mask)
 
 
@@ -96,7 +85,7 @@ class _Step:
         return self.stack.compute(self.x, self.positions, self.cache, Slots.at(self.index), self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """Copies the inputs to the graph's buffers and replays it, see `CapturedLayers.__call__`."""
+        """Copies the inputs to the graph's buffers and replays it, see `CapturedCache.run`."""
         tokens, start = x.shape[1], self.cache.length
         self.x.zero_()[:, :tokens].copy_(x)
         self.positions[:tokens].copy_(positions)

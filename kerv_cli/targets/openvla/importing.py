@@ -10,6 +10,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
 from kerv_cli.base.provenance import provenance
+from kerv_cli.base.registry import find, load
 from kerv_cli.base.settings import BuildTargetSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.targets.checkpoint import FORMAT, target_fields
@@ -18,8 +19,6 @@ from kerv_cli.targets.openvla.image import read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_of, layout, open_shards
 from kerv_cli.targets.openvla.prompt import PROMPTS, Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
-from kerv_cli.worlds import specs
-from kerv_cli.worlds.spec import EnvironmentSpec
 
 SEES_NOTHING_ELSE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
 
@@ -37,7 +36,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         raise UnknownName("prompt", settings.prompt, PROMPTS)
     source = Path(settings.checkpoint).expanduser().resolve()
     shape = read_shape(source)
-    spec = _environment(settings.environment)
+    spec = None if settings.environment is None else load(find("environment", settings.environment).build)
     statistics = read_statistics(source, settings.statistics)
     actions = action_space(shape, statistics, spec.actions if spec else None, settings.control_hz)
     prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
@@ -73,10 +72,3 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     prompt = shape.patches + len(prompter.ids("move"))
     figures = {"parameters": parameters, "prompt tokens": prompt, "action tokens": actions.tokens, "DoFs": actions.dofs}
     return folder, figures
-
-
-def _environment(name: str | None) -> EnvironmentSpec | None:
-    environments = specs()
-    if name is not None and name not in environments:
-        raise UnknownName("environment", name, environments)
-    return environments[name] if name is not None else None

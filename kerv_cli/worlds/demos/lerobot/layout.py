@@ -10,4 +10,4 @@ IMAGES, DONE = "observation.images.", "next.done"
 COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Columns that every dataset has; timestamps are seconds since the episode's start."""
 FILE_MB = 100
-"""Data files are begun anew from this size on."""
+"""Size from which on a further data file is written."""

@@ -80,10 +80,14 @@ class Source:
             return [f"{prefix}_{i}" for i in range(count)]
         return [str(name) for name in names]
 
+    def path(self, episode: Mapping[str, Any], columns: str, form: str) -> Path:
+        """The file of an episode, whose chunk and number stand in the columns that begin with `columns`."""
+        indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
+        return self.folder / form.format(video_key=self.key, **indices)
+
     def table(self, episode: Mapping[str, Any]) -> pa.Table:
         """The rows of one episode, in order."""
-        indices = {f"{x}_index": int(episode[f"data/{x}_index"]) for x in ("chunk", "file")}
-        path = self.folder / str(self.info.get("data_path") or layout.DATA).format(**indices)
+        path = self.path(episode, "data", self.info.get("data_path") or layout.DATA)
         table = _table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
         if len(table) != int(episode["length"]):
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
@@ -93,8 +97,7 @@ class Source:
         """(T, h, w, 3) uint8 of one episode."""
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
-        indices = {f"{x}_index": int(episode[f"videos/{self.key}/{x}_index"]) for x in ("chunk", "file")}
-        path = self.folder / str(self.info.get("video_path") or layout.VIDEO).format(video_key=self.key, **indices)
+        path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or layout.VIDEO)
         start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
         return np.stack(list(_video_frames(path, start, rate, len(table))))
 
