@@ -117,7 +117,13 @@ def cover(planned: Sequence[Cell], stock: Stock, rerun: str = NEVER, since: str 
     for cell in planned:
         groups.setdefault((cell.task, cell.seeds, cell.repeat), []).append(cell)
     splits: dict[int, tuple[Pieces, list[tuple[int, ...]]]] = {}
-    accepts = _accepts(rerun, since)
+    code = code_hash() if rerun == CHANGED else ""
+
+    def accepts(entry: StockEntry) -> bool:
+        if rerun == ALL:
+            return bool(since) and entry.started >= since
+        return rerun != CHANGED or entry.code == code
+
     for group in groups.values():
         pieces = _pieces(group, stock, accepts)
         if rerun == TIMED:
@@ -127,15 +133,6 @@ def cover(planned: Sequence[Cell], stock: Stock, rerun: str = NEVER, since: str 
     for cell in planned:
         _append(covered, cell, *splits[id(cell)], stock, rerun)
     return covered
-
-
-def _accepts(rerun: str, since: str) -> Callable[[StockEntry], bool]:
-    if rerun == CHANGED:
-        code = code_hash()
-        return lambda entry: entry.code == code
-    if rerun == ALL:
-        return lambda entry: bool(since) and entry.started >= since
-    return lambda entry: True
 
 
 def _pieces(group: Sequence[Cell], stock: Stock, accepts: Callable[[StockEntry], bool]) -> list[Pieces]:
