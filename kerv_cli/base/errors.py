@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
+
+from kerv_cli.base.near import nearest, question
 
 
 class KervError(Exception):
@@ -40,8 +41,7 @@ class UnknownName(UsageError):
     def __init__(self, kind: str, name: str, known: Iterable[str], more: str = "") -> None:
         known = list(known)
         self._arguments = (kind, name, known, more)
-        near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+        hint = question(nearest(name, known)) or f"known: {', '.join(known)}"
         gone = GONE.get((kind.split(".")[0], name))
         hint = f"{hint} ({more})" if more else hint
         super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.base.errors import Interrupted
+from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.settings import RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.cli.command import command
@@ -48,6 +48,10 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
     """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused. Without study=
     list the studies."""
     if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in words):
+        others = [word for word in words if not word.startswith("results=")]
+        if others:
+            raise UsageError(f"{' '.join(others)} of which study? name one, study=NAME: 'kerv sweep' lists them; "
+                             "'kerv rollout -m' runs a grid of your own")  # fmt: skip
         _list_studies(as_json)
         return
     from kerv_cli.lab.resolve import resolve
@@ -254,7 +258,14 @@ def _tell(
     from kerv_cli.report.tables import load_study, rows_of, study_table
 
     complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
-    table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
+    table = None
+    if complete and (as_json or outcome.failed):
+        table = study_table(load_study(store, [cell for cell in cells if cell.id in complete]))
+    elif complete:
+        with at_work("writing the page"):
+            from kerv_cli.report.report import report
+
+            table = report(store.root.parent.parent, store.name, loss=resolved.loss).tables[store.name]
     recordings = sorted(store.rollouts.glob("[!.]*.rrd"))
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
@@ -269,10 +280,6 @@ def _tell(
             typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
         typer.echo(f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed")
         if table is not None and not outcome.failed:
-            with at_work("writing the page"):
-                from kerv_cli.report.report import report
-
-                report(store.root.parent.parent, store.name, loss=resolved.loss)
             tell_end(table, store, resolved.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
