@@ -507,7 +507,7 @@ def _wrong_value(error: Any, overrides: Sequence[str], keys: Sequence[str], sche
     number = _NUMBER.match(value)
     at, example = field_of(schema, key)
     if number and kind[0] != "bool" and "%" not in value:
-        example = f"{float(number[0]):.0f}" if kind[0] == "Integer" else number[0]
+        example = int(float(number[0])) if kind[0] == "Integer" else number[0]
     such = "" if example is None else f", e.g. {key}={str(example).lower()}"
     about = f" ({description(at)})" if at is not None and description(at) else ""
     return UsageError(f"{key}={value}: {_KINDS[kind[0]]}{such}{about}")
