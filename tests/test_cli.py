@@ -235,50 +235,6 @@ def test_the_help_shows_the_defaults_that_hold() -> None:
     assert "all | half: " in shown
 
 
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ("method=ar rollout", "settings follow the command: kerv rollout method=ar"),
-        ("method=ar", "settings follow the command: kerv COMMAND method=ar"),
-        ("rolout method=ar", "unknown command 'rolout': did you mean rollout"),
-        ("train targt", "unknown train command 'targt': did you mean target"),
-        ("rollout episode: 2", "'episode:' is not an override: write key=value, did you mean episodes=?"),
-        ("rollout --paln", "No such option: --paln"),
-        ("sweep study=demo study=main", "study= is given twice, demo and main: leave one out"),
-        ("sweep study=typo.yaml study=main", "study= is given twice, typo.yaml and main: leave one out"),
-        ("sweep study=typo.yaml", "unknown key in study=typo.yaml: 'setings': did you mean settings"),
-        ("sweep study=no_baseline.yaml", "study 'no_baseline' has no setting 'ar', the baseline that its others are"),
-        ("rollout reach", "'reach' is not an override: did you mean task=reach?"),
-        ("sweep demo", "'demo' is not an override: did you mean study=demo?"),
-        ("rollout --task reach", "No such option: --task; settings have no dashes: task=VALUE"),
-        ("rollout task=", "name at least one task or suite: task=NAME, or leave it out"),
-        (
-            "rollout policy=mine",
-            "state, state_h8, vision, vision_h8 (policy.target=mine names weights)",
-        ),
-        ("train drafter target=mine", "unknown target 'mine': did you mean tiny? (policy.target=mine names weights)"),
-        ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
-        ("rollout method=ar,kerv", "method=ar,kerv names 2 choices: run each in turn with 'kerv rollout -m'"),
-        ("rollout task=reach, push", "'push' is not an override: did you mean task=push?"),
-        ("rollout episodes=three", "episodes: Value 'three' of type 'str' could not be converted to Integer"),
-        ("rollout method=kerv method=ar", "method= is given twice, kerv and ar: leave one out"),
-        ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
-        ("prepare for=kervv", "unknown method 'kervv': did you mean kerv"),
-        ("view nothing.rrd", "nothing.rrd does not exist: name a recording (.rrd) or a folder of them"),
-        ("report study=main", "no study 'main' in results/studies: run `kerv sweep study=main`"),
-        ("sweep study=empty.yaml", "study 'empty' has no settings: see conf/study/demo.yaml"),
-    ],
-)
-def test_a_mistake_is_answered_for_what_it_is(
-    line: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("typo.yaml").write_text("setings:\n  ar: method=ar\n")
-    Path("no_baseline.yaml").write_text("settings:\n  kerv: method=kerv\n")
-    Path("empty.yaml").write_text("title: Empty\n")
-    assert says in one_line(kerv(*line.split()), 2)
-
-
 def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path: Path) -> None:
     shown = kerv("sweep", f"results={tmp_path}")
     assert shown.returncode == 0, shown.stderr

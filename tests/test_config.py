@@ -82,16 +82,16 @@ def test_a_method_is_a_composition_whose_parts_can_be_replaced() -> None:
         (["method=spec_vl"], "unknown method 'spec_vl': did you mean spec_vla"),
         (["threshold.rr=3"], "unknown key 'threshold.rr': did you mean threshold.r"),
         (["thresold.r=3"], "did you mean threshold.r"),
-        (["episodes=many"], "episodes: Value 'many'"),
+        (["episodes=many"], "episodes=many: a whole number, e.g. episodes=3 (episodes per task)"),
         (["world.camera.size=big"], "world.camera.size"),
         (["threshold.phi=3"], "unknown key 'threshold.phi'"),  # of another threshold
         (["method=spec_vla", "proposer.neighbours=3"], "unknown key 'proposer.neighbours'"),
-        (["threshold.r=half"], "threshold.r: Value 'half'"),
-        (["proposer=drafter", "proposer.depth=1.5"], "proposer.depth: Value '1.5'"),
+        (["threshold.r=half"], "threshold.r=half: a whole number"),
+        (["proposer=drafter", "proposer.depth=1.5"], "proposer.depth=1.5: a whole number, e.g. proposer.depth=1"),
         (["nonsense"], "'nonsense' is not an override: write key=value, see 'kerv rollout --cfg' for the keys"),
         (["episode:"], "'episode:' is not an override: write key=value, did you mean episodes=?"),
         (["method=ar", "method=kerv"], "method= is given twice, ar and kerv: leave one out"),
-        (["task=[reach"], "input"),
+        (["task=[reach"], "cannot read 'task=[reach': write task=reach"),
     ],
 )
 def test_a_wrong_override_gets_one_line(overrides: list[str], says: str) -> None:

@@ -7,11 +7,11 @@ one line with the nearest known keys.
 from __future__ import annotations
 
 import copy
-import difflib
 import functools
 import itertools
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -21,12 +21,15 @@ from kerv_cli.base import registry
 from kerv_cli.base.errors import GONE, UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.files import to_yaml as plain_yaml
-from kerv_cli.base.limits import check_settings, description
+from kerv_cli.base.limits import check_settings, description, field_of
+from kerv_cli.base.near import KEYS, nearest, question
 from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, part_of
-from kerv_cli.base.settings import DERIVED_FROM, PolicySettings, choices_of
+from kerv_cli.base.settings import DERIVED_FROM, PolicySettings, TrainSettings, choices_of
 
 T = TypeVar("T")
 
+_STRANGE = (ValueError, TypeError, AttributeError, RecursionError)
+"""What Hydra raises at strange words, besides its own."""
 MOST_POINTS = 10_000
 """Points of a grid; more are refused before they are expanded."""
 
@@ -89,12 +92,14 @@ class Composer(Generic[T]):
         overrides = [word.lstrip("+") for word in overrides]  # open mappings take new keys without it
         self._check(overrides)
         many = any(at.name == "task" and str(at.type).startswith("list") for at in fields(self.schema))  # type: ignore[arg-type]
-        words = [_task_list(word) if many else word for word in overrides]
+        parsed = [_parsed(_task_list(word) if many else word) for word in overrides]
+        for word, override in zip(overrides, parsed, strict=True):
+            self._check_one_value(word, override)
         try:
-            settings = self._settings([_parsed(word) for word in words])
+            settings = self._settings(parsed)
         except (HydraException, OmegaConfBaseException) as error:
-            raise _explained(self.command, error, words, self.schema) from error
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
+            raise _explained(self.command, error, overrides, self.schema) from error
+        except _STRANGE as error:
             raise UsageError(f"cannot read '{' '.join(overrides)[:200]}': {_one_line(error)}") from error
         _check_ranges(settings)
         if method is not None:
@@ -111,6 +116,9 @@ class Composer(Generic[T]):
             nodes = _composed(self.command, rest, self.schema)
             self._composed[rest] = nodes, cast(T, OmegaConf.to_object(nodes))
         nodes, settings = self._composed[rest]
+        for override in values:
+            if override.value() == "" and (default := OmegaConf.select(nodes, override.key_or_group)):
+                raise _empty(override.key_or_group, default)
         if all(_is_scalar(nodes, override) for override in values):
             settings = copy.deepcopy(settings)
             for override in values:
@@ -129,8 +137,14 @@ class Composer(Generic[T]):
             if not equals or not key or key[0] == "~":  # nothing is taken away from settings
                 hint = GONE.get((self.command, word)) or f"write key=value, {self._hint(word)}"
                 raise UsageError(f"'{word}' is not an override: {hint}")
+            if key != key.strip() or value != value.strip():
+                raise UsageError(f"'{word}' has spaces around its '=': write {key.strip()}={value.strip()}")
             if key not in self.groups or value in self.groups[key]:
                 continue
+            if not value:
+                raise _empty(key, choices_of(self.schema).get(key, "NAME"))
+            if key in ("study", "method") and "/" in value:
+                raise UsageError(f"{word} is no YAML file: name one that ends in .yaml, or a {key} that kerv has")
             several = [name.strip() for name in value.split(",")]
             if len(several) > 1 and set(several) <= set(self.groups[key]):
                 grid = self.command == "rollout"
@@ -148,8 +162,22 @@ class Composer(Generic[T]):
     def _hint(self, word: str) -> str:
         """What the writer of a word without `=` may have meant, e.g. `episodes:`."""
         keys = [*choices_of(self.schema), *(at.name for at in fields(self.schema))]  # type: ignore[arg-type]
-        near = difflib.get_close_matches(word.rstrip(":"), dict.fromkeys(keys), n=1)
-        return f"did you mean {near[0]}=?" if near else f"see 'kerv {spoken(self.command)} --cfg' for the keys"
+        key, _, value = word.partition(":")
+        near = nearest(key, keys, KEYS)[:1]
+        return question(near, f"={value}") or f"see 'kerv {spoken(self.command)} --cfg' for the keys"
+
+    def _check_one_value(self, word: str, override: Any) -> None:
+        """Refuses several values where one is taken."""
+        if not override.is_sweep_override():
+            return
+        key, _, value = word.partition("=")
+        kind = next((str(at.type) for at in fields(self.schema) if at.name == key), "")  # type: ignore[arg-type]
+        hint = "this command takes one: choose one of them"
+        if kind.startswith("list"):
+            hint = f"write {key}=[{value}]"
+        elif self.command == "rollout":
+            hint = "run each in turn with 'kerv rollout -m', or choose one of them"
+        raise UsageError(f"{word} holds several values: {hint}")
 
     def _is_value(self, override: Any) -> bool:
         """Whether an override sets one key to one value."""
@@ -201,10 +229,32 @@ def _check_ranges(settings: Any) -> None:
 
 @functools.lru_cache(maxsize=4096)
 def _parsed(word: str) -> Any:
-    """The override as Hydra parses it; raises as Hydra."""
+    """The override as Hydra parses it. Raises UsageError: it cannot."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
 
-    return OverridesParser.create().parse_overrides([word])[0]
+    try:
+        return OverridesParser.create().parse_overrides([word])[0]
+    except (HydraException, *_STRANGE) as error:
+        raise UsageError(f"cannot read '{word[:200]}': {_readable(word)}") from error
+
+
+def _readable(word: str) -> str:
+    """What the writer of a word that Hydra cannot parse may have meant."""
+    key, _, value = word.partition("=")
+    if re.search(r"\s[\w.]+=", value):
+        return f"these are several settings, leave out the quotes: {word.replace(', ', ' ')}"
+    names = re.findall(r"[^\s\[\],;]+", value)
+    if re.match(r"\[|[^/~]*[,;]", value) and names:
+        return f"write {key}={names[0]}" if len(names) == 1 else f"write {key}=[{','.join(names)}]"
+    if any(value.count(a) != value.count(b) for a, b in ("[]", "{}", "()")) or value.count("'") % 2:
+        return "its brackets or quotes do not match"
+    quoted = f"{key}='{value}'"
+    return f'quote it: "{quoted}"'
+
+
+def _empty(key: str, default: Any) -> UsageError:
+    return UsageError(f"{key}= is empty: write {key}={default}, or leave it out")
 
 
 def _composed(command: str, overrides: Sequence[str], schema: type) -> Any:
@@ -294,8 +344,8 @@ def expand(overrides: str | Sequence[str]) -> list[list[str]]:
     from hydra.errors import HydraException
 
     words = split_words(overrides) if isinstance(overrides, str) else list(overrides)
+    parsed = [_parsed(word) for word in words]
     try:
-        parsed = [_parsed(word) for word in words]
         points = math.prod(map(_count, parsed))
         if points > MOST_POINTS:
             raise UsageError(f"'{' '.join(words)}' is a grid of {points:.6g} points: at most {MOST_POINTS}")
@@ -304,7 +354,7 @@ def expand(overrides: str | Sequence[str]) -> list[list[str]]:
         axes = [list(_points(o)) for o in parsed]
     except HydraException as error:
         raise UsageError(f"cannot read '{' '.join(words)}': {_one_line(error)}") from error
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:  # Hydra's own, of strange words
+    except _STRANGE as error:
         raise UsageError(f"cannot read '{' '.join(words)[:200]}': {_one_line(error)}") from error
     return [list(point) for point in itertools.product(*axes)]
 
@@ -411,15 +461,56 @@ def _explained(command: str, error: Exception, overrides: Sequence[str], schema:
     except HydraException:  # the choices alone do not compose
         return UsageError(_one_line(error.__cause__ or error))
     for word in overrides:
-        key = word.split("=", 1)[0]
-        if key not in keys and key not in groups():
-            near = difflib.get_close_matches(key, keys, n=3, cutoff=0.5)
-            near += [k for k in keys if k.endswith("." + key.rsplit(".", 1)[-1]) and k not in near][:3]
-            hint = (
-                f"did you mean {' or '.join(near[:3])}?" if near else f"see 'kerv {spoken(command)} --cfg' for the keys"
-            )
+        key, _, value = word.partition("=")
+        if key in keys:
+            continue
+        if key not in groups():
+            near = nearest(key, [one for one in keys if not any(other.startswith(f"{one}.") for other in keys)], KEYS)
+            hint = question(near, f"={value}") or _elsewhere(command, key)
             return UsageError(f"unknown key '{key}': {hint}")
-    return UsageError(_one_line(error.__cause__ or error))
+    return _wrong_value(error, overrides, keys, schema)
+
+
+def _elsewhere(command: str, key: str) -> str:
+    """Which commands have a setting that this one has not."""
+    head, leaf = key.split(".")[0], key.rsplit(".", 1)[-1]
+    owners = []
+    for name, part in registry.parts("command").items():
+        own = {at.name for at in fields(part.settings)}
+        train = {at.name for at in fields(TrainSettings)} if "train" in own else set()
+        if head in own or leaf in train:
+            owners.append(f"'kerv {name}'")
+    others = f"a setting of {', '.join(owners[:3])}; " if 0 < len(owners) < 9 else ""
+    return f"{others}see 'kerv {spoken(command)} --cfg' for the keys"
+
+
+_KINDS = {"Integer": "a whole number", "Float": "a number", "bool": "true or false"}
+_NUMBER = re.compile(r"-?\d+\.?\d*(e[+-]?\d+)?", re.IGNORECASE)
+
+
+def _wrong_value(error: Any, overrides: Sequence[str], keys: Sequence[str], schema: type) -> UsageError:
+    """Says what kind of value a key takes, with one that it would take."""
+    key = str(getattr(error, "full_key", None) or "")
+    value = next((word.split("=", 1)[1] for word in reversed(overrides) if word.startswith(f"{key}=")), None)
+    plain = _one_line(error.__cause__ or error)
+    if not key or value is None:
+        return UsageError(plain)
+    below = [one for one in keys if one.startswith(f"{key}.")]
+    if below:
+        named = [one for one in below if one.rsplit(".", 1)[-1] in ("kind", "name")]
+        return UsageError(f"{key}={value}: {question(named, f'={value}') or 'it has settings: ' + ', '.join(below)}")
+    if "ListConfig" in plain:
+        return UsageError(f"{key}={value}: a list, write {key}=[{value}]")
+    kind = re.search("|".join(_KINDS), plain)
+    if kind is None:
+        return UsageError(plain)
+    number = _NUMBER.match(value)
+    at, example = field_of(schema, key)
+    if number and kind[0] != "bool" and "%" not in value:
+        example = int(float(number[0])) if kind[0] == "Integer" else number[0]
+    such = "" if example is None else f", e.g. {key}={str(example).lower()}"
+    about = f" ({description(at)})" if at is not None and description(at) else ""
+    return UsageError(f"{key}={value}: {_KINDS[kind[0]]}{such}{about}")
 
 
 def keys_of(command: str, choices: Sequence[str], schema: type) -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import Any
+
+from kerv_cli.base.near import nearest, question
 
 
 class KervError(Exception):
@@ -47,8 +48,7 @@ class UnknownName(UsageError):
 
     def __init__(self, kind: str, name: str, names: Iterable[str], more: str = "") -> None:
         names = list(names)
-        near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names)}"
+        hint = question(nearest(name, names)) or f"known: {', '.join(names)}"
         gone = GONE.get((kind.split(".")[0], name))
         hint = f"{hint} ({more})" if more else hint
         super().__init__(f"{kind} '{name}': {gone}" if gone else f"unknown {kind} '{name}': {hint}")

@@ -48,6 +48,15 @@ def choice(default: str, *names: str, help: str = "") -> Any:
     return setting(default, help, names=names)
 
 
+def field_of(schema: type, key: str) -> tuple[Field[Any] | None, Any]:
+    """The field of a dotted key of a settings class, and its default; None for what only a part that is chosen has."""
+    value, at = schema(), None
+    for name in key.split("."):
+        at = next((at for at in fields(value) if at.name == name), None) if is_dataclass(value) else None
+        value = getattr(value, name, None)
+    return at, value
+
+
 def description(at: Field[Any]) -> str:
     """What a setting is: its `help`, behind the names of a `choice`."""
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))

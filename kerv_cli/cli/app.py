@@ -4,12 +4,14 @@ heavy is imported here."""
 from __future__ import annotations
 
 import os
+import shlex
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.near import COMMANDS, nearest, question
 from kerv_cli.base.registry import parts
 from kerv_cli.cli.command import CONTEXT, commands_below, summary_of, typer_command
 from kerv_cli.cli.common import one_line_errors
@@ -65,10 +67,26 @@ class Commands(TyperGroup):
             return args[0], command, args[1:]
         names = self.list_commands(ctx)
         if "=" not in args[0]:
-            raise UnknownName(f"{self.prefix}command", args[0], names)
+            raise self._unknown(args[0], args[1:], names)
         at = next((at for at, word in enumerate(args) if word in names), 0)
         line = [*args[at:], *args[:at]] if at else ["COMMAND", *args]
-        raise UsageError(f"settings follow the command: kerv {self.prefix}{' '.join(line)}")
+        which = f", COMMAND is {' or '.join(names)}" if self.prefix and not at else ""
+        raise UsageError(f"settings follow the command: kerv {self.prefix}{shlex.join(line)}{which}")
+
+    def _unknown(self, word: str, rest: list[str], names: list[str]) -> UsageError:
+        """The refusal of a first word that is no command."""
+        what = f"unknown {self.prefix}command '{word}'"
+        if word == "kerv":
+            return UsageError("kerv stands twice in this line: leave one out")
+        if word in ("help", "version"):
+            line = ["kerv", *self.prefix.split(), *(rest if word == "help" else []), f"--{word}"]
+            return UsageError(f"{what}: did you mean '{' '.join(line)}'?")
+        full = [part.name.removeprefix(self.prefix) for part in commands_below(self.prefix)]
+        called = {name.removeprefix(self.prefix): words for name, words in COMMANDS.items()}
+        near = nearest(word, [*names, *full], called)
+        if not near and self.prefix:
+            near = [f"kerv {one.name}" for one in parts("command").values() if one.name.split()[-1] == word]
+        return UsageError(f"{what}: {question(near)}") if near else UnknownName(f"{self.prefix}command", word, names)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Lists the commands without importing what they run."""

@@ -11,12 +11,15 @@ import inspect
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import Field, fields
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperCommand
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import field_of
+from kerv_cli.base.near import KEYS, nearest, question
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 
@@ -160,20 +163,47 @@ def _divided(part: Part, words: list[str], named: bool) -> tuple[list[str], list
         return words, []
     keys = set(top_keys(part)) if part.settings is not NoSettings else set()
     overrides = [word for word in words if "=" in word and word.lstrip("+").partition("=")[0].split(".")[0] in keys]
-    return overrides, [word for word in words if word not in overrides]
+    names = [word for word in words if word not in overrides]
+    for name in names:
+        key, equals, value = name.partition("=")
+        own = f"{key}=" in part.traits["names"] or Path(name).exists()
+        if equals and re.fullmatch(r"[\w.]+", key) and not own:
+            hint = question(nearest(key, keys, KEYS), f"={value}") or f"known: {', '.join(sorted(keys)) or 'none'}"
+            raise UsageError(f"unknown key '{key}': {hint}")
+    return overrides, names
 
 
 def _check_bare(part: Part, words: list[str]) -> None:
-    """Refuses a value without its key: `kerv rollout reach`.
+    """Refuses settings with spaces in them, and a value without its key: `kerv rollout reach`.
 
     Raises:
-        UsageError: names the key that takes such a value.
+        UsageError: names the setting that is meant.
     """
-    for word in words:
-        if "=" not in word and part.settings is not NoSettings:
-            taking = [key for key in top_keys(part) if {word, f"{word}-v3"} & set(_values(part, key))]
-            if taking:
-                raise UsageError(f"'{word}' is not an override: did you mean {taking[0]}={word}?")
+    if part.settings is NoSettings:
+        return
+    keys = top_keys(part)
+    for number, word in enumerate(words):
+        after = next((one.lstrip("=") for one in words[number + 1 :] if one != "="), "")
+        if "=" in word and (word[-1] not in ",=" or not after or "=" in after):
+            continue
+        taking = [key for key in keys if {word, f"{word}-v3"} & set(_values(part, key))]
+        if word[-1] in ",=":
+            meant = f"{word.rstrip(',')}{after}" if word[-1] == "=" else _listed(word + after)
+        elif word.rstrip(":") in keys and after and "=" not in after:
+            meant = f"{word.rstrip(':')}={after}"
+        elif taking:
+            meant = f"{taking[0]}={word}"
+        elif word.endswith((".yaml", ".yml")) and {"study", "method"} & set(keys):
+            meant = f"{'study' if 'study' in keys else 'method'}={word}"
+        else:
+            continue
+        raise UsageError(f"'{word}' is not an override: did you mean {meant}?")
+
+
+def _listed(word: str) -> str:
+    """A list in brackets: `task=reach,push` -> `task=[reach,push]`."""
+    key, _, value = word.partition("=")
+    return f"{key}=[{value.strip('[]')}]"
 
 
 def _composed(part: Part, words: list[str], cfg: bool) -> Any:
@@ -189,7 +219,13 @@ def _composed(part: Part, words: list[str], cfg: bool) -> Any:
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
     lists = part.traits.get("lists", ())
     plain = [f"{key}=[{value.strip('[]')}]" if key in lists else key + equals + value for key, equals, value in pairs]
-    settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
+    try:
+        settings: Any = compose(part.name.replace(" ", "_"), plain, part.settings)
+    except UsageError as error:
+        for key, name in typed.items():
+            if str(error).startswith(f"{name}="):
+                raise UsageError(key + str(error).removeprefix(name)) from error
+        raise
     if cfg:
         typer.echo(to_yaml(settings), nl=False)
         raise typer.Exit(0)
@@ -202,6 +238,23 @@ class CommandWithSettings(TyperCommand):
     """Adds to the help what the command's words can be."""
 
     part: Part
+
+    def keys(self) -> list[str]:
+        """What can stand in front of `=`."""
+        from kerv_cli.base.config import keys_of
+
+        if self.part.settings is NoSettings:
+            return []
+        below = (keys_of(name.replace(" ", "_"), [], schema) for name, schema in schemas_of(self.part))
+        return [*top_keys(self.part), *(key for keys in below for key in keys)]
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As typer's, whose errors do not always say of which command they are."""
+        try:
+            return super().parse_args(ctx, args)
+        except typer.TyperException as error:
+            error.ctx = ctx  # type: ignore[attr-defined]
+            raise
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Writes the settings that people use, commands below this one, and examples."""
@@ -228,18 +281,11 @@ def _row(part: Part, key: str) -> tuple[str, str]:
     """(key=default, type and description) of a setting. key: as typed."""
     name = part.traits.get("typed", {}).get(key, key)
     schema = next(schema for _, schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
-    at, value = _field(schema, name)
+    at, value = field_of(schema, name)
+    assert at is not None
     default = choices_of(schema).get(name, _of_file(schema, name, value))
     kind = "name" if name in choices_of(schema) else _type_name(at)
     return f"{key}={_plain(default)}", f"{kind}: {at.metadata.get('help', '')}"
-
-
-def _field(schema: type, key: str) -> tuple[Field[Any], Any]:
-    """The field of a dotted key, and its default."""
-    value: Any = schema()
-    for name in key.split("."):
-        at, value = next(at for at in fields(value) if at.name == name), getattr(value, name)
-    return at, value
 
 
 def _of_file(schema: type, key: str, default: Any) -> Any:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from kerv_cli.base.errors import Interrupted, KervError
+from kerv_cli.base.near import KEYS, OPTIONS, nearest, question
 
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
@@ -69,9 +70,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except typer.TyperException as error:
         if "\n" in error.format_message():  # the help, where the command is left out
             raise
-        message, option = error.format_message(), getattr(error, "option_name", None)
-        setting = f"; settings have no dashes: {option.lstrip('-')}=VALUE" if option else ""
-        _refuse(message + setting, error.exit_code, error)
+        _refuse(_parse_error(error, words), error.exit_code, error)
     except KeyboardInterrupt:
         _refuse("interrupted", Interrupted.exit_code, None)
     except BrokenPipeError:
@@ -83,6 +82,27 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
         if isinstance(error, MemoryError) or re.search("allocate memory|bad_alloc|start new thread", str(error)):
             _refuse("out of memory: end other programs, or ask for less", 1, error)
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
+
+
+def _parse_error(error: Any, words: Sequence[str]) -> str:
+    """What typer cannot parse, and what is meant instead. words: of the command line."""
+    name, command = getattr(error, "option_name", None), getattr(error.ctx, "command", None)
+    if name is None or command is None:
+        return str(error.format_message())
+    options = {option: one for one in command.params for option in one.opts if option.startswith("-")}
+    if name in options:
+        return f"{error.message.rstrip('.')}: {options[name].help}"
+    typed = next((word for word in words if word.startswith(name) or re.match(rf"-[^-].*{name[-1]}", word)), name)
+    stem, _, value = typed.lstrip("-").partition("=")
+    key = stem.replace("-", "_")
+    after = [word for word in words[words.index(typed) + 1 :][:1] if "=" not in word and word[:1] != "-"]
+    keys: list[str] = command.keys() if hasattr(command, "keys") else []
+    if key in ("resume", "continue"):
+        return f"No such option: {typed}: leave it out, the same command goes on where it was interrupted"
+    near = nearest(f"--{key}", [*options, *keys], {**KEYS, **OPTIONS})
+    if near and not near[0].startswith("-"):
+        return f"No such option: {typed}; settings have no dashes: {near[0]}={value or (after or ['VALUE'])[0]}"
+    return f"No such option: {typed}: {question(near) or f'{error.ctx.command_path} --help lists them'}"
 
 
 _MOST_SHOWN = 2000

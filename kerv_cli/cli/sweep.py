@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -45,6 +46,10 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
     """Run a study: every setting on every task with the same seeds, in turn. Complete cells are reused. Without study=
     list the studies."""
     if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in words):
+        others = [word for word in words if not word.startswith("results=")]
+        if others:
+            raise UsageError(f"{' '.join(others)} of which study? name one, study=NAME: 'kerv sweep' lists them; "
+                             "'kerv rollout -m' runs a grid of your own")  # fmt: skip
         _list_studies(as_json)
         return
     from kerv_cli.lab.resolve import resolve

@@ -329,7 +329,7 @@ def lines_figure(
         if position(value) - position(below) < _NARROWEST * span:
             ticks.remove(value)
     with mpl.rc_context(STYLE):
-        figure = new_figure(max(8.0, 3.3 * across), 1.8 + 2.7 * down)
+        figure = new_figure(max(10.0, 3.3 * across), 2.0 + (3.6 if down == 1 else 2.7 * down))
         axes = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
         for panel, (head, lines) in zip(axes, panels.items(), strict=False):
             for number, (name, shade) in enumerate(zip(first, shades, strict=True)):

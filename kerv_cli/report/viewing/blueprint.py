@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import rerun.blueprint as rrb
 
@@ -30,12 +30,6 @@ SIGNALS = {
 LIMITS = {"metric": "F*", "similarity": "s_min"}
 """Signal -> name of the limit that a decision compares it with."""
 
-COLOUR_WORDS = ("red", "green", "blue", "olive", "brown", "teal", "purple")
-"""Names of the DoFs' colours, for titles: a legend would hide data in views as small as these."""
-
-
-_PHASES_TITLE = "ms per decode: total grey, vision red, prefill green, verify olive"
-
 
 @dataclass(frozen=True)
 class EpisodeMeta:
@@ -50,21 +44,21 @@ class EpisodeMeta:
     most: float  # the most forwards or the longest acceptance length of a decode
     slowest: float  # milliseconds of the slowest decode
     widest: int  # the largest threshold, bins
-    limited: tuple[str, ...]  # signals with a limit
     centre: tuple[float, float, float]  # middle of the end effector's path, metres
     extent: float  # longest side of the path's bounding box, metres
 
 
 def blueprint(meta: EpisodeMeta) -> rrb.Blueprint:
-    """The layout: camera, path and summary on the left; tokens and series over time in the middle; the current decode
-    on the right."""
-    left: list[rrb.View] = [_path(meta), _document("summary", "Episode")]
-    shares = [4.0, 3.6]
+    """The layout: camera, path, summary and series per decode on the left; in the middle a lane per token, for which
+    the viewer takes 40 pixels; the current decode on the right."""
+    path, episode = _path(meta), _document("summary", "Episode")
+    series, shares = _per_decode(meta)
     if meta.frames:
-        left.insert(0, rrb.Spatial2DView(origin="/camera", name="Camera"))
-        shares.insert(0, 4.0)
-    columns = rrb.Vertical(*left, row_shares=shares), _over_time(meta), _current_decode(meta)
-    return paused(rrb.Horizontal(*columns, column_shares=[3, 5, 4]))
+        views: list[Any] = [rrb.Spatial2DView(origin="/camera", name="Camera"), rrb.Tabs(episode, path)]
+    else:
+        views = [path, episode]
+    left = rrb.Vertical(*views, *series, row_shares=[4.0, 3.6, *shares])
+    return paused(rrb.Horizontal(left, _over_time(meta), _current_decode(meta), column_shares=[3, 5, 4]))
 
 
 def paused(views: rrb.Horizontal) -> rrb.Blueprint:
@@ -97,25 +91,21 @@ def _path(meta: EpisodeMeta) -> rrb.Spatial3DView:
     )
 
 
-def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
-    """A column of views that share the time axis; row shares are roughly hundreds of pixels."""
-    lanes = "Decodes (shades alternate), mode, and what became of each token of the chunk"
-    tokens = ["/tokens/**"] if meta.drafted else []
-    views: list[rrb.View] = [_states(lanes if meta.drafted else "Decodes and mode", "/decodes", "/mode", *tokens)]
-    shares = [1.4 + (min(meta.chunk_steps * len(meta.dofs), 20) * 0.34 if meta.drafted else 0.0)]
+def _per_decode(meta: EpisodeMeta) -> tuple[list[Any], list[float]]:
+    """Series with a number per decode, and their shares of the height; those of a method's own stand in one place."""
     counts = ("decode/forwards", "decode/acceptance")
-    views.append(_series("Per decode: forwards grey, AL blue, drafts accepted green", *counts, top=meta.most + 0.5))
-    shares.append(1.6)
-    if meta.threshold:
-        views.append(_series("Acceptance threshold r, bins", "decode/threshold", top=meta.widest + 1.0))
-        shares.append(1.2)
-    for signal in meta.signals:
-        views.append(_series(_signal_title(signal, meta), f"signals/{signal}"))
-        shares.append(1.1)
-    if not meta.drafted:
-        views += _always(meta)
-        shares += [1.7, 1.7]
-    return rrb.Vertical(*views, row_shares=shares)
+    views: list[Any] = [_series("Per decode", *counts, top=meta.most + 0.5)]
+    own = [_series("Acceptance threshold r, bins", "decode/threshold", top=meta.widest + 1.0)] if meta.threshold else []
+    own += [_series(SIGNALS[signal], f"signals/{signal}") for signal in meta.signals]
+    return [*views, *([rrb.Tabs(*own)] if own else [])], [2.2, *([2.2] if own else [])]
+
+
+def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
+    """The lanes; a method without drafts has two, and room for its series."""
+    if meta.drafted:
+        name = "Decodes (shades alternate), mode, and what became of each token of the chunk"
+        return rrb.Vertical(_states(name, "/decodes", "/mode", "/tokens/**"))
+    return rrb.Vertical(_states("Decodes and mode", "/decodes", "/mode"), *_always(meta), row_shares=[1.4, 2.2, 2.2])
 
 
 def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
@@ -132,29 +122,21 @@ def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
     shares = [0.9 + 0.35 * max(meta.chunk_steps, KEY_ROWS), 5.2]
     if meta.drafted:
         views += _always(meta)
-        shares += [1.6, 1.6]
+        shares += [2.2, 2.2]
     return rrb.Vertical(*views, row_shares=shares)
 
 
 def _always(meta: EpisodeMeta) -> list[rrb.View]:
     """Phases and actions, the series of every method; placed in the middle or right column."""
     return [
-        _series(_PHASES_TITLE, "decode/phases", top=1.1 * meta.slowest),
-        _series(f"Actions: {_coloured(meta.dofs)}; opening yellow", "actions", "gripper"),
+        _series("ms per decode", "decode/phases", top=1.1 * meta.slowest),
+        _series("Actions", "actions", "gripper"),
     ]
 
 
 def _states(name: str, *contents: str) -> rrb.StateTimelineView:
     axis = rrb.TimeAxis(link="LinkToGlobal")
     return rrb.StateTimelineView(origin="/", contents=list(contents), name=name, time_view=axis)
-
-
-def _signal_title(signal: str, meta: EpisodeMeta) -> str:
-    return f"{SIGNALS[signal]}; {LIMITS[signal]} orange" if signal in meta.limited else SIGNALS[signal]
-
-
-def _coloured(names: Sequence[str]) -> str:
-    return ", ".join(f"{name} {COLOUR_WORDS[i % len(COLOUR_WORDS)]}" for i, name in enumerate(names))
 
 
 def _series(name: str, *entities: str, top: float | None = None) -> rrb.TimeSeriesView:
@@ -164,7 +146,7 @@ def _series(name: str, *entities: str, top: float | None = None) -> rrb.TimeSeri
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
-        plot_legend=rrb.PlotLegend(visible=False),
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=True),
     )
 
 

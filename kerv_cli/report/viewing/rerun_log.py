@@ -102,11 +102,11 @@ def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> 
             recording.log(entity.path, archetype, static=True)
         if entity.steps is not None and len(entity.steps):
             recording.send_columns(entity.path, _times(entity.steps, record.space.control_hz), entity.columns)
-    recording.send_blueprint(blueprint(meta_of(record, chunks, limits)))
+    recording.send_blueprint(blueprint(meta_of(record, chunks)))
     return bytes(memory.drain_as_bytes())
 
 
-def meta_of(record: EpisodeRecord, chunks: Chunks, limits: Mapping[str, float]) -> EpisodeMeta:
+def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
     """The properties of the episode that decide its layout."""
     low, high = record.path.min(axis=0), record.path.max(axis=0)
     x, y, z = ((low + high) / 2).tolist()
@@ -120,7 +120,6 @@ def meta_of(record: EpisodeRecord, chunks: Chunks, limits: Mapping[str, float]) 
         most=max(max(d.forwards, acceptance(d.rounds)[0] if d.verifications else 0) for d in record.decodes),
         slowest=1000 * max(d.seconds for d in record.decodes),
         widest=max((max(_threshold(d), default=0) for d in record.decodes), default=0),
-        limited=tuple(limits),
         centre=(x, y, z),
         extent=float((high - low).max()),
     )
