@@ -52,6 +52,8 @@ ANSWERS = [
     ("runs show --json=true", "Option '--json' does not take a value: Print the result as JSON"),
     # what is not there
     ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
+    ("demos import source=file", "file is a file: name the folder of a LeRobot dataset"),
+    ("runs list since=yesterday", "since=yesterday is no date: write 2026-11-23"),
     ("rollout results=file", "results=file is a file: name a folder"),
     ("view nothing.rrd", "nothing.rrd does not exist: name a recording (.rrd) or a folder of them"),
     ("view file", "file is not a recording: its name does not end in .rrd"),

@@ -103,7 +103,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     of it) and since (ISO 8601).
 
     Raises:
-        UnknownName: no such filter or kind.
+        UnknownName: no such filter or kind. UsageError: `since` is no date.
     """
     filter_names = ("kind", "method", "task", "state", "since")
     for key in filters:
@@ -112,6 +112,10 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     kinds = (SWEEP, ROLLOUT, *artifact_kinds())
     if filters.get("kind", SWEEP) not in kinds:
         raise UnknownName("kind of run", filters["kind"], kinds)
+    try:
+        datetime.fromisoformat(filters.get("since", "2026-01-01"))
+    except ValueError:
+        raise UsageError(f"since={filters['since']} is no date: write 2026-11-23 or 2026-11-23T14:00") from None
     return [run for run in runs if _agrees(run, filters)]
 
 

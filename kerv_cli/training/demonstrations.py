@@ -70,10 +70,11 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     config = recorded.get("config") if isinstance(recorded, dict) else None
     episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
+    names = resolve_tasks(tasks) if tasks else ()
     dataset = open_demos(settings.results, name, tasks or target.tasks, episodes)
     there = list(dataset.manifest.tasks)
     same = dataset.manifest.environment == target.environment  # else the spaces differ, which is said instead
-    for task in resolve_tasks(tasks) if tasks and same else ():
+    for task in names if same else ():
         if task not in there:
             raise CheckpointError(
                 f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "

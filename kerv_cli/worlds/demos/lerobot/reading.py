@@ -39,7 +39,10 @@ class Source:
 
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
-        """Raises CheckpointError: no dataset of version 3, or a damaged one. UnknownName: no such camera."""
+        """Raises CheckpointError: no dataset of version 3, or a damaged one. UnknownName: no such camera. UsageError: a
+        file."""
+        if folder.is_file():
+            raise UsageError(f"{folder} is a file: name the folder of a LeRobot dataset, which holds meta/")
         info = read_mapping(folder / layout.INFO)
         version = str(info.get("codebase_version"))
         if not version.startswith("v3."):
