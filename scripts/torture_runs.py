@@ -102,7 +102,7 @@ def run(
             status = code if ended else None
             if not ended and time.monotonic() > until:
                 os.kill(child, signal.SIGKILL)
-            time.sleep(0.003)
+            time.sleep(0.02)
         wall, left = time.monotonic() - began, _left(child)
         calls = struct.unpack_from("i", control)[0]
         output.seek(0)

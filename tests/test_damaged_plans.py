@@ -8,13 +8,15 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from studies_synthetic import run_cell, settings_of, threshold_settings, threshold_study
 
 from kerv_cli.base.config import method_of_file
-from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.errors import CheckpointError, KervError, UnknownName
 from kerv_cli.base.files import read_json, read_mapping, read_table, read_yaml, sha256_of
+from kerv_cli.base.registry import part_of
 from kerv_cli.lab.catalogue import find_runs
 from kerv_cli.lab.store import StudyStore, is_result_of
 from kerv_cli.report.curves import read_log
@@ -69,6 +71,19 @@ def test_a_changed_plan_is_refused(store: StudyStore, old: str, new: str) -> Non
     assert old in text
     store.plan_path.write_text(text.replace(old, new))
     refused(store)
+
+
+@pytest.mark.parametrize("name", [[], {}, None, -1, "nothing"])
+def test_a_part_whose_name_is_no_text_is_unknown(name: Any) -> None:
+    with pytest.raises(UnknownName, match=r"unknown skip.kind"):
+        part_of("skip", name)
+
+
+def test_a_training_with_a_log_of_one_endless_word_is_listed_as_damaged(tmp_path: Path) -> None:
+    folder = tmp_path / "artifacts" / "target" / "mine"
+    folder.mkdir(parents=True)
+    (folder / "log.csv").write_text("step,loss\n1," + "[" * 200_000)
+    assert [run.state for run in find_runs(str(tmp_path))] == ["damaged"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", "a", BOMB, "[" * 5000, "a: *nothing", "cells: 1\nlabels: 2", "\0"])

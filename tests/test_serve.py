@@ -140,6 +140,7 @@ def test_a_client_gets_the_actions_of_the_policy(policy: Policy, policies: Path)
         ({"observation/state": np.zeros(5)}, "has shape (5,), 4 or 39 numbers are wanted"),
         ({"observation/state": ["a"]}, "does not hold numbers"),
         ({"prompt": 3}, "prompt is int"),
+        ({"reset": np.zeros(3)}, "reset is ndarray, true or false is wanted"),
         ({"prompt": "word " * 40}, "has 40 words, the policy takes 10"),
         ({"executed": 99}, "executed=99: 0 to"),
     ],
@@ -450,7 +451,7 @@ def test_a_client_that_breaks_off_is_a_line_of_the_log(policy: Policy, capfd: py
             raise EOFError("stream of frames ended")
         except EOFError:
             _lines(log.append).error("unexpected internal error", exc_info=True)
-        assert log[-1] == "error: unexpected internal error: stream of frames ended"
+        assert log[-1] == "a connection failed: stream of frames ended"
     assert "Traceback" not in capfd.readouterr().err
 
 

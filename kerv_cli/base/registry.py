@@ -208,8 +208,8 @@ def find(kind: str, name: str, what: str = "") -> Part:
         UnknownName: there is none; the message names the nearest ones.
     """
     by_name = parts(kind)
-    if name not in by_name:
-        raise UnknownName(what or kind, name, by_name)
+    if not isinstance(name, str) or name not in by_name:  # a damaged file may hold anything
+        raise UnknownName(what or kind, str(name), by_name)
     return by_name[name]
 
 

@@ -246,7 +246,10 @@ def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
 def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
     if not (folder / LOG).is_file():
         return "complete"  # copied or imported: it has no log
-    rows = list(csv.DictReader(io.StringIO(read_text(folder / LOG))))
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_text(folder / LOG))))
+    except csv.Error as error:
+        raise ValueError(f"{folder / LOG}: {error}") from error
     steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
     return "complete" if step >= steps else f"step {step:.0f} of {steps}"
 

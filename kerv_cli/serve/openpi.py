@@ -86,12 +86,15 @@ class OpenPi:
         """The actions (H, D) for the observation in a message, their time and their forwards.
 
         Raises:
-            UsageError: as `observation_of`, or a wrong `executed`.
+            UsageError: as `observation_of`, or a wrong `executed` or `reset`.
         """
         interface, decoder = self.policy.interface, self.session.decoder
         observation = observation_of(interface, message)
         hand, executed = hand_of(observation), self._executed(message)
-        if message.get(RESET) or not self.begun:
+        reset = message.get(RESET)
+        if not isinstance(reset, bool | int | np.bool_ | np.integer | None):
+            raise UsageError(f"{RESET} is {type(reset).__name__}, true or false is wanted")
+        if reset or not self.begun:
             self.last = self.last[:0]
             self.session.begin(interface.task, self.decodes, hand)
             self.begun = True

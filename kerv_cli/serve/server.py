@@ -257,8 +257,7 @@ def _lines(log: Log) -> logging.Logger:
 
     class Lines(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            error = record.exc_info[1] if record.exc_info else None
-            log(f"error: {record.getMessage()}{f': {error}' if error else ''}"[:LONGEST])
+            log(f"a connection failed: {record.exc_info[1] if record.exc_info else record.getMessage()}"[:LONGEST])
 
     logger = logging.Logger("kerv.serve", logging.ERROR)
     logger.addHandler(Lines())
