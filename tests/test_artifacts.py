@@ -54,7 +54,7 @@ def whole(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(policies, results)
     write_dataset(results / "artifacts/demos/few")
     policy = PolicySettings(target="nano-state")
-    DatastoreBuild(BuildDatastoreSettings(policy, demos="few", task=list(TASKS), results=str(results))).build()
+    DatastoreBuild(BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))).build()
     words = ["task=reach,drawer-close", "demos=few", "held_out=0.4", "decodes=4", "policy.target=nano-state"]
     run = CalibrationRun(compose("calibrate", [*words, f"results={results}"], CalibrateSettings))
     run.load(quiet)
@@ -132,7 +132,7 @@ def test_a_changed_file_is_another_artifact(results: Path) -> None:
     before, store = check(asked), files.load("datastore")
     assert files.load("datastore") is store
     policy = PolicySettings(target="nano-state")
-    built = BuildDatastoreSettings(policy, demos="few", task=list(TASKS), results=str(results), stride=2)
+    built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results), stride=2)
     DatastoreBuild(built).build()
     after = check(asked)
     assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}

@@ -52,7 +52,7 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(policies, folder)
     write_dataset(folder / "artifacts/demos/few", make=recognisable_episode)
     asked = BuildDatastoreSettings(
-        PolicySettings(target="nano-state"), demos="few", task=list(TASKS), results=str(folder)
+        policy=PolicySettings(target="nano-state"), demos="few", task=list(TASKS), results=str(folder)
     )
     DatastoreBuild(asked).build()
     return folder

@@ -261,7 +261,7 @@ def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path: Path) -> None:
     assert run("seeds", "task=reach", results).stdout == "reach-v3: 100000 to 100002\n"
     assert json.loads(run("seeds", "task=reach", "episodes=1", results, "--json").stdout) == {"reach-v3": [100000]}
     assert one_line(run("seeds", "episodes=0"), 2) == "kerv: episodes=0: from 1 to 100"
-    assert one_line(run("seeds", "uses=x"), 2).startswith("kerv: unknown key 'uses': did you mean use ")
+    assert one_line(run("seeds", "uses=x"), 2).startswith("kerv: unknown key 'uses': did you mean use=x?")
     asked = {"_KERV_COMPLETE": "complete_bash", "COMP_WORDS": "kerv seeds use=d", "COMP_CWORD": "2"}
     environment = {**os.environ, "PYTHONPATH": path, "KERV_PLUGINS": "own_command", **asked}
     done = subprocess.run([sys.executable, "-c", BE_KERV], capture_output=True, text=True, env=environment, check=False)

@@ -102,7 +102,9 @@ def copy(results: Path, tmp_path: Path) -> Path:
 
 
 def asked(results: Path, target: str = "nano-state", **changes: Any) -> BuildDatastoreSettings:
-    chosen = BuildDatastoreSettings(PolicySettings(target=target), demos="few", task=list(TASKS), results=str(results))
+    chosen = BuildDatastoreSettings(
+        policy=PolicySettings(target=target), demos="few", task=list(TASKS), results=str(results)
+    )
     return replace(chosen, **changes)
 
 

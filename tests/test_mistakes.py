@@ -98,7 +98,7 @@ ANSWERS = [
     ("calibrate success margin=200", "margin=200.0: above 0, at most 99.9"),
     ("serve port=99999", "port=99999: from 0 to 65535"),
     ("demos episodes=10 seed=100000", "seed 100000 is for evaluation; seeds for training are 0 to 49999"),
-    ("rollout lr=3", "unknown key 'lr': a setting of 'kerv train target', 'kerv train drafter'"),
+    ("rollout lr=3", "unknown key 'lr': a setting of 'kerv train drafter', 'kerv train target'"),
     ("rollout until=decided", "unknown key 'until': a setting of 'kerv calibrate success', 'kerv sweep'"),
 ]
 """A line as typed -> what its answer says."""

@@ -480,7 +480,7 @@ def _elsewhere(command: str, key: str) -> str:
         train = {at.name for at in fields(TrainSettings)} if "train" in own else set()
         if head in own or leaf in train:
             owners.append(f"'kerv {name}'")
-    others = f"a setting of {', '.join(owners[:3])}; " if 0 < len(owners) < 9 else ""
+    others = f"a setting of {', '.join(sorted(owners)[:3])}; " if 0 < len(owners) < 9 else ""
     return f"{others}see 'kerv {spoken(command)} --cfg' for the keys"
 
 

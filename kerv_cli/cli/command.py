@@ -164,10 +164,11 @@ def _divided(part: Part, words: list[str], named: bool) -> tuple[list[str], list
     keys = set(top_keys(part)) if part.settings is not NoSettings else set()
     overrides = [word for word in words if "=" in word and word.lstrip("+").partition("=")[0].split(".")[0] in keys]
     names = [word for word in words if word not in overrides]
+    filters = set(re.findall(r"(\w+)=", part.traits["names"]))
     for name in names:
         key, equals, value = name.partition("=")
-        own = f"{key}=" in part.traits["names"] or Path(name).exists()
-        if equals and re.fullmatch(r"[\w.]+", key) and not own:
+        if equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(name).exists():
+            keys |= filters
             hint = question(nearest(key, keys, KEYS), f"={value}") or f"known: {', '.join(sorted(keys)) or 'none'}"
             raise UsageError(f"unknown key '{key}': {hint}")
     return overrides, names
