@@ -133,15 +133,13 @@ NO_CLOCK = ["task", "seed", "success", "steps", "forwards", "tokens", "accepted"
 
 
 def state(command: str) -> dict[str, str]:
-    """What a command must make again: file -> hash; of a cell: the columns that no clock decides; of a short training's
-    picture its name alone, since it shows the losses of the run that ended it."""
+    """What a command must make again: file -> hash; of a cell: the columns that no clock decides."""
     results, here, made = Path("results"), os.getcwd().encode(), {}
     for path in (path for path in results.glob(COMMANDS[command].makes) if path.is_file()):
         cell = path.name == "episodes.parquet"
         content = (
             pd.read_parquet(path, columns=NO_CLOCK).to_csv().encode() if cell else path.read_bytes().replace(here, b"")
         )
-        content = b"" if path.name == "curves.png" else content
         made[_undated(str(path))] = hashlib.sha256(content).hexdigest()
     return made
 

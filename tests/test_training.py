@@ -110,6 +110,7 @@ def test_ctrl_c_saves_the_step_that_ran_and_the_run_goes_on_there(
     resumed = quadratic(tmp_path / "cut")
     resumed.run(lambda step, metrics: steps.append(step))
     assert steps[0] == last + 1
+    assert resumed.losses == whole.losses
     for name, tensor in whole.module.state_dict().items():
         assert torch.equal(tensor, resumed.module.state_dict()[name])
 

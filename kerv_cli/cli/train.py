@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import typer
@@ -56,7 +55,6 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
     with progress_bar(loading) as advance:
         run.load(advance)
     started = False
-    losses: dict[int, float] = {}
     settings = run.settings
 
     def on_step(step: int, now: dict[str, float]) -> None:
@@ -64,7 +62,6 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
         if not started and step > 1 and run.ranks.first:
             typer.echo(f"resuming at step {step - 1}", err=True)
         started = True
-        losses.setdefault(step, now.get("loss", math.nan))
         log(step, now)
         advance(step, settings.train.steps, _line(now))
 
@@ -79,7 +76,7 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
         return
     from kerv_cli.report.curves import save_curves
 
-    plot = save_curves(run.folder, losses)
+    plot = save_curves(run.folder, run.losses)
     if as_json:
         print_json({"folder": run.folder, "best": metrics, "curves": plot})
         return

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -53,27 +54,29 @@ def curves_figure(log: pd.DataFrame, title: str) -> Figure:
     return figure
 
 
-def loss_figure(losses: Mapping[int, float], title: str) -> Figure:
-    """The loss of every step of a run that is too short for curves of validations. losses: by step."""
+def loss_figure(losses: Sequence[float], title: str) -> Figure:
+    """The loss of every step of a run that is too short for curves of validations."""
     with mpl.rc_context(STYLE):
         figure = new_figure(7.0, 3.6)
         panel = figure.subplots()
-        panel.plot(list(losses), list(losses.values()), color=COLOURS[0], linewidth=1.5)
+        panel.plot(range(1, len(losses) + 1), losses, color=COLOURS[0], linewidth=1.5)
         panel.set(xlabel="step", ylabel="loss")
         entitle(figure, title, f"loss per step of training, {len(losses)} steps")
     return figure
 
 
-def save_curves(folder: Path, losses: Mapping[int, float] | None = None) -> Path:
-    """Writes `curves.png` beside a training's log.csv -> its path. losses: by step, of this run of the command; drawn
-    where there are fewer than `_FEW` validations.
+def save_curves(folder: Path, losses: Sequence[float] = ()) -> Path:
+    """Writes `curves.png` beside a training's log.csv -> its path. losses: of every step; drawn where there are fewer
+    than `_FEW` validations.
 
     Raises:
         CheckpointError: as `read_log`. StorageError: the disk refused.
     """
     path = folder / "curves.png"
     log, title = read_log(folder), f"{folder.parent.name} {folder.name}"
-    figure = loss_figure(losses, title) if losses and len(log) < _FEW else curves_figure(log, title)
+    figure = (
+        loss_figure(losses, title) if any(map(math.isfinite, losses)) and len(log) < _FEW else curves_figure(log, title)
+    )
     content = figure_bytes(figure, "png")
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)

@@ -85,6 +85,7 @@ class Loop:
         self.folder, self.identity, self.ranks, self.borders = folder, identity, ranks, borders
         self.step, self.best = 0, -math.inf
         self.history: list[Metrics] = []
+        self.losses: list[float] = []  # of every step; of those of an older kerv's run nan
         decay = [p for p in self.module.parameters() if p.dim() >= 2]
         rest = [p for p in self.module.parameters() if p.dim() < 2]
         groups = [{"params": decay, "weight_decay": settings.weight_decay}, {"params": rest, "weight_decay": 0.0}]
@@ -106,6 +107,7 @@ class Loop:
             while self.step < settings.steps:
                 metrics, stopping = self.update(stop)
                 self.step += 1
+                self.losses.append(metrics["loss"])
                 on_step(self.step, metrics)
                 if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
                     self.check(metrics)
@@ -180,6 +182,7 @@ class Loop:
         tensors |= {f"ema.{k}": v for k, v in self.ema.items()}
         for i, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
+        tensors["losses"] = torch.tensor(self.losses, dtype=torch.float64)
         best = self.best if self.history else None
         progress = Progress(self.identity, self.step, best, self.history)
         write_state(self.folder / "resume.safetensors", tensors, progress)
@@ -219,6 +222,7 @@ class Loop:
         self.optimiser.load_state_dict({"state": state, "param_groups": groups})
         self.step, self.history = progress.step, progress.history
         self.best = -math.inf if progress.best is None else progress.best
+        self.losses = tensors["losses"].tolist() if "losses" in tensors else [math.nan] * self.step
         self.log()  # the run may have ended before it wrote the log
 
 

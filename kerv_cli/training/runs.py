@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -57,7 +57,7 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
 
 class Run(ABC):
     """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
-    `plan` says in one line what would be done. borders: as in `draw_samples`."""
+    `plan` says in one line what would be done. borders: as in `draw_samples`. losses: of every step, once trained."""
 
     kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
@@ -67,6 +67,7 @@ class Run(ABC):
     ranks: Ranks
     learnt: Lesson
     borders: Tensor | None = None
+    losses: Sequence[float] = ()
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
@@ -86,7 +87,10 @@ class Run(ABC):
         parts = {"train": run_settings(train), "demos": self.dataset.sha256, **self.identity()}
         identity = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
         self.learnt.module.train()
-        return Loop(self.learnt, self.save, train, self.folder, identity, self.ranks, self.borders).run(on_step)
+        loop = Loop(self.learnt, self.save, train, self.folder, identity, self.ranks, self.borders)
+        metrics = loop.run(on_step)
+        self.losses = loop.losses
+        return metrics
 
     def begin(self) -> None:
         """Chooses the device, and joins the other processes where torchrun started several.
