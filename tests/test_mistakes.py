@@ -53,6 +53,10 @@ ANSWERS = [
     # what is not there
     ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
     ("demos import source=file", "file is a file: name the folder of a LeRobot dataset"),
+    ("runs list state=finished", "unknown state 'finished': known: complete, begun, damaged, step"),
+    ("rollout --gpu 0", "settings have no dashes: runtime.device=cuda"),
+    ("prepare for=all", "(without for= it is all of them)"),
+    ("calibrate task=all", "unknown task or suite 'all'"),
     ("runs list since=yesterday", "since=yesterday is no date: write 2026-11-23"),
     ("rollout results=file", "results=file is a file: name a folder"),
     ("view nothing.rrd", "nothing.rrd does not exist: name a recording (.rrd) or a folder of them"),

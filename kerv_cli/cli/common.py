@@ -100,6 +100,8 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
     if key in ("resume", "continue"):
         return f"No such option: {typed}: leave it out, the same command goes on where it was interrupted"
     near = nearest(f"--{key}", [*options, *keys], {**KEYS, **OPTIONS})
+    if near[:1] == ["runtime.device"] and (value or (after or ["0"])[0]).isdigit():
+        after, value = ["cuda"], ""  # a GPU's number
     if near and not near[0].startswith("-"):
         return f"No such option: {typed}; settings have no dashes: {near[0]}={value or (after or ['VALUE'])[0]}"
     return f"No such option: {typed}: {question(near) or f'{error.ctx.command_path} --help lists them'}"

@@ -99,12 +99,16 @@ def find_run(results: str | Path, name: str, exact: bool = False) -> RunEntry:
     return near[0]
 
 
+_STATES = ("complete", "begun", "damaged", "step ")
+"""How states begin that do not begin with a number."""
+
+
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
     """Those runs that agree with every filter: kind, method, task (patterns such as `drawer*` too), state (a beginning
     of it) and since (ISO 8601).
 
     Raises:
-        UnknownName: no such filter or kind. UsageError: `since` is no date.
+        UnknownName: no such filter, kind or state. UsageError: `since` is no date.
     """
     filter_names = ("kind", "method", "task", "state", "since")
     for key in filters:
@@ -113,6 +117,9 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     kinds = (SWEEP, ROLLOUT, *artifact_kinds())
     if filters.get("kind", SWEEP) not in kinds:
         raise UnknownName("kind of run", filters["kind"], kinds)
+    state = filters.get("state", "")
+    if not any(one.startswith(state) or state.startswith(one) for one in _STATES) and not state[:1].isdigit():
+        raise UnknownName("state", state, _STATES)
     if "since" in filters and not re.fullmatch(r"\d{4}(-\d\d){0,2}(T.*)?", filters["since"]):
         raise UsageError(f"since={filters['since']} is no date: write 2026-11-23 or 2026-11-23T14:00")
     return [run for run in runs if _agrees(run, filters)]

@@ -69,7 +69,7 @@ def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[st
     names = groups()["method"]
     for name in methods:
         if name not in names:
-            raise UnknownName("method", name, names)
+            raise UnknownName("method", name, names, more="without for= it is all of them")
     artifacts = parts("artifact")
     seeing = {kind for kind, part in artifacts.items() if part.traits.get("sees")}
     kinds: set[str] = set()

@@ -13,7 +13,6 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.spec import EnvironmentSpec, Task
 
 _SPECS: dict[str, EnvironmentSpec] = {}
-NO_WORLD = f"{__name__}:NoWorld"
 
 
 def register_recorded(
