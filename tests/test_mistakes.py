@@ -53,6 +53,7 @@ ANSWERS = [
     # what is not there
     ("rollout policy.target=mine", "no target 'mine' in results/artifacts/target/mine"),
     ("demos import source=file", "file is a file: name the folder of a LeRobot dataset"),
+    ("rollout episodes=1e400", "episodes=1e400: a whole number, e.g. episodes=3"),
     ("runs list state=finished", "unknown state 'finished': known: complete, begun, damaged, step"),
     ("rollout --gpu 0", "settings have no dashes: runtime.device=cuda"),
     ("prepare for=all", "(without for= it is all of them)"),

@@ -126,6 +126,9 @@ def test_a_setting_that_raises_is_dropped_from_its_block_alone(store: StudyStore
     assert [event for event in events if isinstance(event, CellEnd) and event.reason] == [failure]
     assert execute(cells, prepare, store).failed == []
     assert not trace.exists()
+    store.write_failure(bad.id, "of a command that was killed before it removed this")
+    assert len(execute(cells, prepare, store).reused) == len(cells)
+    assert not store.failures.exists()
 
 
 def test_an_error_of_kerv_is_told_in_its_own_words(store: StudyStore) -> None:

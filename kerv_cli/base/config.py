@@ -506,7 +506,7 @@ def _wrong_value(error: Any, overrides: Sequence[str], keys: Sequence[str], sche
         return UsageError(plain)
     number = _NUMBER.match(value)
     at, example = field_of(schema, key)
-    if number and kind[0] != "bool" and "%" not in value:
+    if number and math.isfinite(float(number[0])) and kind[0] != "bool" and "%" not in value:
         example = int(float(number[0])) if kind[0] == "Integer" else number[0]
     such = "" if example is None else f", e.g. {key}={str(example).lower()}"
     about = f" ({description(at)})" if at is not None and description(at) else ""

@@ -129,12 +129,15 @@ class _Sweep:
         return dataclasses.replace(self.outcome, seconds=time.perf_counter() - clock)
 
     def _damaged(self, cells: Sequence[Cell]) -> Ends:
-        """The damaged cells by id; complete ones are added to the outcome."""
-        damaged = {}
+        """The damaged cells by id; complete ones are added to the outcome, and what a command that was killed has left
+        of their failed attempts is removed."""
+        damaged, failed = {}, self.store.failures.is_dir()
         for cell in (cell for block in blocks_of(cells) for cell in block.cells):
             try:
                 if self.store.has_cell(cell.id):
                     self.outcome.reused.append(cell)
+                    if failed:
+                        self.store.clear_failure(cell.id)
             except CheckpointError as error:
                 damaged[cell.id] = failure(cell, error)
         return damaged
