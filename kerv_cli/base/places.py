@@ -31,8 +31,9 @@ def results_dir(results: str) -> Path:
     return path
 
 
-def check_writable(results: str) -> None:
-    """Refuses a results folder that nothing could be stored in, before anything is computed for it. Leaves no trace.
+def check_writable(results: str) -> Path:
+    """Refuses a results folder that nothing could be stored in, before anything is computed for it -> the folder, or
+    the nearest of those above it that exists. Leaves no trace.
 
     Raises:
         UsageError: it is a file, or lies below one.
@@ -48,6 +49,7 @@ def check_writable(results: str) -> None:
             pass
     except OSError as error:
         raise StorageError(f"cannot write {folder}: {error.strerror}") from error
+    return parent
 
 
 def artifact(results: str, kind: str, name: str) -> Path:

@@ -250,7 +250,7 @@ class CommandWithSettings(TyperCommand):
         return [*top_keys(self.part), *(key for keys in below for key in keys)]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As typer's, whose errors do not always say of which command they are."""
+        """Reads options and words; an error says of which command it is, which typer leaves out for some."""
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:

@@ -176,10 +176,9 @@ def _disk(settings: DoctorSettings) -> Finding:
 
     folder = results_dir(settings.results)
     try:
-        check_writable(settings.results)
+        parent = check_writable(settings.results)
     except StorageError as error:
         return Finding("results", False, str(error))
-    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     free = shutil.disk_usage(parent).free / 1e9
     return Finding("results", free > 2, f"{folder.resolve()} can be written, {free:.0f} GB free")
 
