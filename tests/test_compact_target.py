@@ -199,7 +199,7 @@ def seven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     assert {f"l1_{name}" for name in SEVEN.names} <= metrics.keys()
     for drafter in (
         DrafterSettings(samples=12, unroll=2),
-        EarlySettings(layers=1, width=16, rank=4, history=2, samples=30),
+        EarlySettings(layers=1, width=16, rank=4, samples=30),
     ):
         asked = TrainDrafterSettings(
             policy=PolicySettings(target="arm"), drafter=drafter, train=train, results=str(tmp_path)

@@ -17,7 +17,6 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.settings import TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.cli.app import app
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.methods.artifacts import MadeFor, Request
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (
@@ -25,7 +24,6 @@ from kerv_cli.methods.early.drafter import (
     EarlyDrafter,
     choose,
     choose_with_odds,
-    padded,
 )
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
@@ -53,7 +51,7 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
-SMALL = EarlySettings(layers=2, width=32, rank=8, history=2, samples=1000)
+SMALL = EarlySettings(layers=2, width=32, rank=8, samples=1000)
 SHAPE = TargetSettings(width=16, chunk=2, grid=2, instruction_tokens=3, scene_tokens=2)  # 4 vision tokens, P = 10
 STRICT = torch.from_numpy(ACTIONS.strict_tokens(8))
 
@@ -86,73 +84,54 @@ def test_pooling_takes_every_part_of_the_prompt_once() -> None:
     assert state.pooled_width == 4 * 16
 
 
-def test_history_is_the_newest_actions_and_says_what_is_missing() -> None:
-    past = ActionHistory(4)
-    assert [x.tolist() for x in padded(past.values(), 2, 4)] == [[[0.0] * 4] * 2, [0.0, 0.0]]
-    past.append(np.full(4, 0.25))
-    assert [x.tolist() for x in padded(past.values(), 2, 4)] == [[[0.0] * 4, [0.25] * 4], [0.0, 1.0]]
-    for value in (0.5, 0.75):
-        past.append(np.full(4, value))
-    assert [x.tolist() for x in padded(past.values(), 2, 4)] == [[[0.5] * 4, [0.75] * 4], [1.0, 1.0]]
-    assert padded(past.values(), 0, 4)[0].shape == (0, 4)
-
-
 def test_a_draft_is_the_argmax_of_the_forward_and_depends_on_all_it_is_shown() -> None:
     early, target = drafter(), shaped()
-    prompt, history = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1)), np.full((5, 4), 0.5)
+    prompt = torch.randn(1, 10, 16, generator=torch.Generator().manual_seed(1))
 
-    def drafted(prompt: torch.Tensor, history: np.ndarray, radius: int = 0) -> list[int]:
-        return early.drafted(target.pooled(prompt), history, radius).tokens
+    def drafted(prompt: torch.Tensor, radius: int = 0) -> list[int]:
+        return early.drafted(target.pooled(prompt), radius).tokens
 
-    logits = early(target.pooled(prompt), torch.full((1, 2, 4), 0.5), torch.ones(1, 2))
+    logits = early(target.pooled(prompt))
     assert logits.shape == (1, 8, 255)
-    plain = drafted(prompt, history)
+    plain = drafted(prompt)
     assert plain == logits[0].argmax(-1).tolist()
-    assert drafted(prompt, history, 9) == choose(logits, 9, STRICT)[0].tolist()
-    assert drafted(prompt, -history) != plain
-    zeros = torch.zeros(1, 2, 4)
-    unknown, zero = (early(target.pooled(prompt), zeros, known) for known in (torch.zeros(1, 2), torch.ones(1, 2)))
-    assert not torch.allclose(unknown, zero)
-    assert drafted(prompt, np.zeros((0, 4))) == unknown[0].argmax(-1).tolist()
+    assert drafted(prompt, 9) == choose(logits, 9, STRICT)[0].tolist()
     for token in range(10):
         moved = prompt.clone()
         moved[:, token] += 3.0
-        assert drafted(moved, history) != plain
+        assert drafted(moved) != plain
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("history", [0, 2])
-def test_packed_weights_give_the_same_logits(history: int) -> None:
+def test_packed_weights_give_the_same_logits() -> None:
     torch.manual_seed(0)
-    early = drafter(EarlySettings(layers=2, width=24, rank=6, history=history))
+    early = drafter(EarlySettings(layers=2, width=24, rank=6))
     for parameter in early.parameters():  # fresh blocks begin as the identity, with gains of one
         parameter.data += 0.3 * torch.randn_like(parameter)
     features = torch.randn(9, early.mean.numel())
     early.standardise(5.0 * features + 2.0)
-    shown = (features[:1], torch.randn(1, history, 4), torch.ones(1, history))
     early.eval().requires_grad_(False)
-    plain = early(*shown)
+    plain = early(features[:1])
     pack(early)
     assert early.packed is not None
-    assert torch.allclose(early(*shown), plain, rtol=1e-4, atol=1e-4)
-    assert not torch.allclose(early(torch.zeros_like(shown[0]), *shown[1:]), plain, rtol=1e-2)
-    assert len(early(*(torch.cat([part, part]) for part in shown))) == 2
+    assert torch.allclose(early(features[:1]), plain, rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(early(torch.zeros_like(features[:1])), plain, rtol=1e-2)
+    assert len(early(features[:2])) == 2
     early.train()
     assert early.packed is None
 
 
 def test_features_are_standardised_and_constants_survive() -> None:
-    early = drafter(dataclasses.replace(SMALL, history=0))
+    early = drafter()
     features = torch.randn(50, FEATURES, generator=torch.Generator().manual_seed(0)) * 30 + 7
     features[:, 3] = 1.25
     early.standardise(features)
-    plain = drafter(dataclasses.replace(SMALL, history=0))
-    empty = torch.zeros(50, 0, 4), torch.zeros(50, 0)
+    plain = drafter()
     expected = (features - features.mean(0)) / features.std(0).clamp_min(1e-3)
-    assert torch.allclose(early(features, *empty), plain(expected, *empty), atol=1e-3)
+    assert torch.allclose(early(features), plain(expected), atol=1e-3)
 
 
-@pytest.mark.parametrize("wrong", ["drafter.width=0", "drafter.rank=0", "drafter.layers=-1", "drafter.history=-1"])
+@pytest.mark.parametrize("wrong", ["drafter.width=0", "drafter.rank=0", "drafter.layers=-1"])
 def test_impossible_shapes_are_refused(wrong: str) -> None:
     with pytest.raises(UsageError, match=wrong):
         compose("train_drafter", ["drafter=early", wrong], TrainDrafterSettings)
@@ -212,9 +191,7 @@ def test_plain_and_perturbed_episodes_count_alike() -> None:
     """Three perturbed samples that fail at once and one plain sample that is drafted whole: half, not a quarter."""
     tokens = torch.full((4, 8), 50)
     perturbed = torch.tensor([True, True, True, False])
-    samples = EarlySamples(
-        torch.zeros(4, 0, 4), torch.zeros(4, 0), tokens, torch.arange(4), perturbed, torch.zeros(4, 1)
-    )
+    samples = EarlySamples(tokens, torch.arange(4), perturbed, torch.zeros(4, 1))
     drafts = tokens.clone()
     drafts[:3, 0] += 20
     logits = 20.0 * torch.nn.functional.one_hot(drafts, 255)
@@ -226,13 +203,12 @@ def test_plain_and_perturbed_episodes_count_alike() -> None:
 
 
 def test_the_network_learns_what_the_teacher_says() -> None:
-    """Tokens that are a function of features and history are learned, and the score shows it."""
+    """Tokens that are a function of the features are learned, and the score shows it."""
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(256, FEATURES, generator=generator).sign()
-    history = torch.randn(256, 2, 4, generator=generator).sign()
-    tokens = torch.where(history[:, 1, 0] > 0, 200, 40)[:, None].repeat(1, 8)
+    tokens = torch.where(features[:, 1] > 0, 200, 40)[:, None].repeat(1, 8)
     tokens[:, 1] = torch.where(features[:, 0] > 0, 90, 170)
-    samples = EarlySamples(history, torch.ones(256, 2), tokens, torch.arange(256), torch.arange(256) % 2 == 0, features)
+    samples = EarlySamples(tokens, torch.arange(256), torch.arange(256) % 2 == 0, features)
     torch.manual_seed(0)
     early = EarlyDrafter(SMALL, ACTIONS, 2, FEATURES)
     run = EarlyDistillation(early, samples, samples, TrainSettings(label_sigma=1.0))
@@ -273,15 +249,9 @@ def nano(policies: Path) -> CompactTarget:
     return load_target(policies / "artifacts/target/nano-state")[0]
 
 
-def test_observations_come_with_what_was_executed_before_them(nano: CompactTarget) -> None:
+def test_observations_are_those_of_the_demonstration(nano: CompactTarget) -> None:
     demo = episode(10)
-    some = columns_of(nano, demo, 3, np.arange(10), 2)
-    assert some["valid"][:3].tolist() == [[0, 0], [0, 1], [1, 1]]
-    normal = nano.actions.normalise(demo.executed)
-    for t in range(2, 10):
-        assert np.allclose(some["history"][t], normal[t - 2 : t])
-    assert np.allclose(some["history"][1, 1], normal[0])
-    assert some["episodes"].tolist() == [3] * 10
+    assert columns_of(demo, 3, 10)["episodes"].tolist() == [3] * 10
     states = [one.state for one in observations_of(nano, demo, np.arange(10), OBSERVATION)]
     assert np.array_equal(np.stack(states), demo.states)
 
@@ -319,7 +289,7 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(results: Path, name: st
 
 def test_a_single_episode_cannot_be_held_out() -> None:
     zeros = torch.zeros(4, dtype=torch.long)
-    one = EarlySamples(torch.zeros(4, 0, 4), torch.zeros(4, 0), zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
+    one = EarlySamples(zeros[:, None], zeros, zeros.bool(), torch.zeros(4, 1))
     with pytest.raises(CheckpointError, match="at least two"):
         split(one, 0.1)
 
@@ -338,7 +308,7 @@ def test_it_trains_from_the_command_line_and_drafts_for_its_target_alone(results
     assert own.provenance["settings"]["drafter"]["width"] == early.settings.width == 32
     assert early.scale.min() > 0
     assert not torch.equal(early.scale, torch.ones_like(early.scale))
-    drafted = early.drafted(torch.randn(1, target.pooled_width), np.zeros((0, 4)), 0).tokens
+    drafted = early.drafted(torch.randn(1, target.pooled_width), 0).tokens
     assert len(drafted) == target.chunk * 4
     assert all(0 <= token < 255 for token in drafted)
     other = load_target(results / "artifacts/target/nano-state")[1]
@@ -386,8 +356,8 @@ def test_a_saved_drafter_drafts_the_same_and_a_missing_one_says_what_to_run(tmp_
         EarlyArtifact().load(tmp_path, Request(description, target))
     EarlyArtifact().save(tmp_path, early, MadeFor.of(description), {}, settings=dataclasses.asdict(early.settings))
     loaded = EarlyArtifact().load(tmp_path, Request(description, target))
-    features, history = torch.randn(1, target.pooled_width), np.zeros((1, 4))
-    assert loaded.drafted(features, history, 0).tokens == early.drafted(features, history, 0).tokens
+    features = torch.randn(1, target.pooled_width)
+    assert loaded.drafted(features, 0).tokens == early.drafted(features, 0).tokens
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     with pytest.raises(CheckpointError, match="does not match"):

@@ -1,7 +1,6 @@
 """Training the early drafter on the frozen target's own greedy decodes (docs/methods.md §5).
 
 Prompts are pooled to features right after encoding, so that neither frames nor prompts of the data set stay in memory.
-The history is what the demonstration *executed*, noise included.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from torch import Tensor, nn
 from kerv_cli.base.settings import TrainSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.batched import greedy
-from kerv_cli.engine.protocol import ReadableTarget, Target
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, padded
+from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, split
@@ -33,10 +32,8 @@ RADII = {"strict": 0, "r3": 3, "r9": 9}
 
 @dataclass(frozen=True)
 class Decodes(Rows):
-    """The target's greedy decodes of n observations, in episode order, with the actions before each."""
+    """The target's greedy decodes of n observations, in episode order."""
 
-    history: Tensor  # (n, h, D) float32, the last executed actions, normalised, oldest first
-    valid: Tensor  # (n, h) float32, 0 where the episode had not begun yet
     tokens: Tensor  # (n, N) int64
     episodes: Tensor  # (n,) int64
     perturbed: Tensor  # (n,) bool, the observation's episode was executed with noise
@@ -67,7 +64,7 @@ def teach_early(
         for index in range(len(dataset.episodes)):
             episode = dataset.load(index)
             steps = evenly(steps_of(target, episode), share)
-            columns.append(columns_of(target, episode, index, steps, settings.history))
+            columns.append(columns_of(episode, index, len(steps)))
             yield from observations_of(target, episode, steps, dataset.manifest.observation)
             on_progress(index + 1, len(dataset.episodes))
 
@@ -91,13 +88,9 @@ def evenly(steps: np.ndarray, share: float) -> np.ndarray:
     return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
 
 
-def columns_of(target: Target, episode: DemoEpisode, index: int, steps: np.ndarray, history: int) -> dict[str, Tensor]:
-    """The fields of `Decodes` that do not need the target, for some control steps (n,) of one episode."""
-    executed = target.actions.normalise(episode.executed)
-    histories = [padded(executed[:t], history, target.actions.dofs) for t in steps.tolist()]
-    actions, valid = (torch.from_numpy(np.stack(x)) for x in zip(*histories, strict=True))
-    episodes, perturbed = (torch.full((len(steps),), value) for value in (index, episode.perturbed))
-    return {"history": actions, "valid": valid, "episodes": episodes, "perturbed": perturbed}
+def columns_of(episode: DemoEpisode, index: int, count: int) -> dict[str, Tensor]:
+    """The fields of `Decodes` that do not need the target, for `count` control steps of one episode."""
+    return {"episodes": torch.full((count,), index), "perturbed": torch.full((count,), episode.perturbed)}
 
 
 class EarlyDistillation:
@@ -119,8 +112,7 @@ class EarlyDistillation:
 
     def outputs(self, module: Any, samples: Any, indices: Tensor) -> tuple[Tensor, ...]:
         """What the module says of the samples at `indices` (B,): first of all its logits (B, N, V)."""
-        inputs = (samples.features, samples.history, samples.valid)
-        return (module(*(x[indices].to(self.device).float() for x in inputs)),)
+        return (module(samples.features[indices].to(self.device).float()),)
 
     def token_loss(self, logits: Tensor, indices: Tensor) -> Tensor:
         """Cross-entropy of logits (B, N, V) with the softened tokens of the target at `indices` (B,)."""
@@ -175,7 +167,13 @@ class EarlyRun(DrafterRun):
     """`kerv train drafter drafter=early`; errors as `DrafterRun`."""
 
     artifact = EarlyArtifact()
-    before: ClassVar[Mapping[str, float]] = {"noise": 0.0, "unroll": 3, "state_weight": 1.0, "token_weight": 0.1}
+    before: ClassVar[Mapping[str, float]] = {
+        "history": 0,
+        "noise": 0.0,
+        "unroll": 3,
+        "state_weight": 1.0,
+        "token_weight": 0.1,
+    }
 
     def lesson(self, progress: Callable[[int, int], None]) -> EarlyDistillation:
         """The target's tokens and pooled prompts."""

@@ -6,8 +6,9 @@ observation. The first `scene_steps` train the stem and its positions alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -50,7 +51,7 @@ def teach_scout(
         episode = dataset.load(index)
         chosen = evenly(np.arange(len(episode.frame_steps)), share)
         rows = read_observations(episode, target.settings, target.observation, target.words, chosen)
-        columns = columns_of(target, episode, index, rows.steps.numpy(), settings.history)
+        columns = columns_of(episode, index, len(rows))
         tokens, places = [], []
         for indices in torch.arange(len(rows)).split(BATCH):
             prompt, located = target.encode_batch(rows.inputs(indices, target.device))
@@ -70,8 +71,7 @@ class ScoutDistillation(EarlyDistillation):
 
     def outputs(self, module: Scout, samples: ScoutSamples, indices: Tensor) -> tuple[Tensor, ...]:
         """Logits (B, N, V) and positions (B, K, 3) for the samples at `indices` (B,)."""
-        past = (samples.history[indices].to(self.device), samples.valid[indices].to(self.device))
-        return module(samples.inputs(indices, self.device), *past)
+        return module(samples.inputs(indices, self.device))
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """The token loss and the weighted position loss at `indices` (B,)."""
@@ -95,6 +95,7 @@ class ScoutRun(DrafterRun):
     """`kerv train drafter drafter=scout`; errors as `DrafterRun`, and a target that does not see."""
 
     artifact = ScoutArtifact()
+    before: ClassVar[Mapping[str, float]] = {"history": 0}
 
     def lesson(self, progress: Progress) -> ScoutDistillation:
         """The target's tokens and positions."""

@@ -13,13 +13,12 @@ _DRAFTER = "kerv_cli.methods.early.drafter:"
 
 @dataclass
 class EarlySettings:
-    """A residual network from the prompt and the last actions to the whole chunk, and its training (§5)."""
+    """A residual network from the prompt to the whole chunk, and its training (§5)."""
 
     kind: str = "early"
     layers: int = number(2, 0, 1024)  # residual blocks
     width: int = number(384, 1, 65_536)  # hidden units
     rank: int = number(32, 1, 65_536)  # features per token in front of the bins
-    history: int = number(0, 0, 1024)  # last executed actions it reads
     samples: int = number(100_000, 1, 10**8)  # observations whose greedy decodes it is trained on, at most
 
 

@@ -1,9 +1,8 @@
 """The early drafter: drafts the whole chunk from the encoded prompt, before the target's trunk runs (docs/methods.md
 §5, ours).
 
-It reads the pooled prompt (scene, proprioception, words and vision tokens) and the last executed actions: a residual
-network gives every token a few features, and one head turns features into bins. Nothing is autoregressive, so a chunk
-costs one small pass.
+It reads the pooled prompt (scene, proprioception, words and vision tokens): a residual network gives every token a few
+features, and one head turns features into bins. Nothing is autoregressive, so a chunk costs one small pass.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.engine.transfer import read, upload
+from kerv_cli.engine.transfer import read
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early import EarlySettings
@@ -33,16 +32,6 @@ from kerv_cli.targets.compact.packable import Packable, Packed
 
 SURE = 0.05
 """Estimate from which fallback sources do not draft: 89 % of such chunks were accepted whole (mt10-vision, r = 9)."""
-
-
-def padded(history: np.ndarray, length: int, dofs: int) -> tuple[np.ndarray, np.ndarray]:
-    """history (m, D), oldest first -> its newest `length` actions (length, D) and which of them were executed
-    (length,), 1 or 0, both float32; at an episode's start the missing actions are zeros in front."""
-    actions, valid = np.zeros((length, dofs), np.float32), np.zeros(length, np.float32)
-    newest = history[max(0, len(history) - length) :]
-    if len(newest):
-        actions[-len(newest) :], valid[-len(newest) :] = newest, 1.0
-    return actions, valid
 
 
 class Block(nn.Module):
@@ -62,7 +51,7 @@ class Block(nn.Module):
 
 
 class EarlyDrafter(Packable):
-    """A residual network from (pooled prompt (F,), h past actions (h, D)) to the logits (N, V) of all tokens.
+    """A residual network from the pooled prompt (F,) to the logits (N, V) of all tokens.
 
     actions: the action space of its tokens; chunk: H; features: F.
     """
@@ -76,11 +65,11 @@ class EarlyDrafter(Packable):
         super().__init__()
         self.settings, self.actions, self.chunk = settings, actions, chunk
         self.tokens = chunk * actions.dofs
-        # prompt embeddings differ in size by orders of magnitude; actions lie in [-1, 1] as they are
+        # prompt embeddings differ in size by orders of magnitude
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("scale", torch.ones(features))
         self.register_buffer("strict", torch.from_numpy(actions.strict_tokens(self.tokens)), persistent=False)
-        self.enter = nn.Linear(features + settings.history * (actions.dofs + 1), settings.width)
+        self.enter = nn.Linear(features, settings.width)
         self.blocks = nn.ModuleList(Block(settings.width) for _ in range(settings.layers))
         self.norm = nn.RMSNorm(settings.width, eps=1e-5)
         self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
@@ -100,30 +89,23 @@ class EarlyDrafter(Packable):
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
-    def forward(self, features: Tensor, history: Tensor, valid: Tensor) -> Tensor:
-        """pooled prompts (B, F), history (B, h, D) normalised, valid (B, h) -> logits (B, N, V)."""
+    def forward(self, features: Tensor) -> Tensor:
+        """pooled prompts (B, F) -> logits (B, N, V)."""
         if self.packed is not None and len(features) == 1:
-            return self.packed(torch.cat([features[0], history.flatten(), valid[0]]))[None]
-        x = torch.cat([(features - self.mean) * self.scale, history.flatten(1), valid], -1)
-        x = self.enter(x)
+            return self.packed(features[0])[None]
+        x = self.enter((features - self.mean) * self.scale)
         for block in self.blocks:
             x = block(x)
         return self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
 
-    def drafted(self, features: Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
-        """features (1, F), history (m, D) normalised executed actions, oldest first -> the draft of all N tokens.
-        radius: r in bins, see `choose`."""
-        return EarlyDraft.of(read(self.on_device(features, [history], radius)[0])[0])
+    def drafted(self, features: Tensor, radius: int) -> EarlyDraft:
+        """features (1, F) -> the draft of all N tokens. radius: r in bins, see `choose`."""
+        return EarlyDraft.of(read(self.on_device(features, radius)[0])[0])
 
     @torch.inference_mode()
-    def on_device(self, features: Tensor, histories: Sequence[np.ndarray], radius: int) -> Tensor:
-        """features (B, F) and the executed actions of B episodes, each as in `drafted` -> N tokens and the odds of
-        each, (B, N + 1) float64, without a wait for the device."""
-        weight = self.head.weight
-        inputs = [padded(history, self.settings.history, self.actions.dofs) for history in histories]
-        actions, valid = (upload(np.stack(x), weight.device).to(weight.dtype) for x in zip(*inputs, strict=True))
-        logits = self(features.to(weight.dtype), actions, valid)
-        tokens, odds = choose_with_odds(logits, radius, self.strict)
+    def on_device(self, features: Tensor, radius: int) -> Tensor:
+        """features (B, F) -> N tokens and the odds of each draft, (B, N + 1) float64, without a wait for the device."""
+        tokens, odds = choose_with_odds(self(features.to(self.head.weight.dtype)), radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
 
@@ -147,10 +129,9 @@ class PackedEarly(Packed):
     """Packed weights of `EarlyDrafter.forward` for one observation; standardisation is folded into the first layer."""
 
     def __init__(self, early: EarlyDrafter) -> None:
-        weight, features = early.enter.weight.clone(), len(early.mean)
-        weight[:, :features] *= early.scale
+        weight = early.enter.weight * early.scale
         self.enter = FastLinear(weight)
-        self.enter_bias = early.enter.bias - weight[:, :features] @ early.mean
+        self.enter_bias = early.enter.bias - weight @ early.mean
         blocks: Any = early.blocks
         self.blocks = [PackedBlock(block) for block in blocks]
         self.norm = RowNorm(early.norm)
@@ -158,9 +139,9 @@ class PackedEarly(Packed):
         self.head, self.head_bias = FastLinear(early.head.weight), early.head.bias
         self.shape = early.tokens, early.settings.rank
 
-    def __call__(self, inputs: Tensor) -> Tensor:
-        """inputs (F + h (D + 1),): pooled prompt, past actions and which of them are valid -> logits (N, V)."""
-        x = self.enter.added_to_vector(self.enter_bias, inputs)
+    def __call__(self, features: Tensor) -> Tensor:
+        """The pooled prompt (F,) -> logits (N, V)."""
+        x = self.enter.added_to_vector(self.enter_bias, features)
         for block in self.blocks:
             x = block(x)
         spread = self.spread.of_vector(x, self.norm.of_vector(x)).add_(self.spread_bias)
@@ -232,8 +213,8 @@ class EarlyProposer(ChainProposer):
     def drafted(self, chunk: Chunk) -> EarlyDraft:
         """The draft of the chunk's N tokens."""
         if self._drafted is None or self._drafted[0] is not chunk:
-            history, radius = chunk.situation.history.values(), max(chunk.limits, default=0)
-            self._drafted = chunk, self.early.drafted(self.features(chunk), history, radius)
+            radius = max(chunk.limits, default=0)
+            self._drafted = chunk, self.early.drafted(self.features(chunk), radius)
         return self._drafted[1]
 
     def features(self, chunk: Chunk) -> Tensor:
@@ -242,9 +223,8 @@ class EarlyProposer(ChainProposer):
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
         """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyDrafter.on_device`."""
-        histories = [chunk.situation.history.values() for chunk in chunks]
         features = torch.cat([self.features(chunk) for chunk in chunks])
-        return self.early.on_device(features, histories, max(chunks[0].limits, default=0))
+        return self.early.on_device(features, max(chunks[0].limits, default=0))
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
         """The draft on the device, (N + 1,), see `EarlyDraft.of`; None where the host has it."""

@@ -71,7 +71,7 @@ class Scout(nn.Module):
         scene = scene_features(felt, places, self.centre)
         return torch.cat([*seen, words, scene], -1), places
 
-    def forward(self, inputs: Inputs, history: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Observations, history (B, h, D) normalised, valid (B, h) -> logits (B, N, V), positions (B, K, 3)."""
+    def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """Observations -> logits (B, N, V), positions (B, K, 3)."""
         features, places = self.see(inputs)
-        return self.drafter(features, history, valid), places
+        return self.drafter(features), places

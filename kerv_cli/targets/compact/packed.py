@@ -202,7 +202,7 @@ class PackedVision(Packed):
         add_upsampled(half, quarter, self.size // 4)
         add_upsampled(heat, half, self.size // 2)
         tokens = (cells(self.patch(coarse)) + self.grid_position)[None]
-        weight = heat.sub_(heat.amax(0)).exp2_()
+        weight = heat.sub_(column_max(heat)).exp2_()
         total, columns, rows = self.moments @ weight
         return tokens, torch.cat([columns / total, rows / total])[None]
 
@@ -216,6 +216,12 @@ def scaled(conv: nn.Conv2d, factor: Tensor) -> tuple[Tensor, Tensor]:
 def cells(maps: Tensor) -> Tensor:
     """(1, C, h, w) channels-last -> (h w, C), a view."""
     return maps.permute(0, 2, 3, 1).view(-1, maps.shape[1])
+
+
+def column_max(rows: Tensor) -> Tensor:
+    """The maximum of each column (K,) of rows (s², K). Reduced row by row, 16 columns take 97 µs; as s wide rows, 6."""
+    side = math.isqrt(len(rows))
+    return rows.view(side, -1).amax(0).view(side, -1).amax(0)
 
 
 def add_upsampled(heat: Tensor, coarse: Tensor, size: int) -> None:
