@@ -23,8 +23,7 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CalibrateSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.chunk import Chunk, Situation
-from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.record import Round
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (

@@ -17,7 +17,7 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.settings import TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.cli.app import app
-from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.chunk import ActionHistory
 from kerv_cli.methods.artifacts import MadeFor, Request
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import (

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer

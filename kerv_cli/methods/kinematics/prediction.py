@@ -16,8 +16,7 @@ import numpy as np
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings, find
-from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.history import WINDOW
+from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.kinematics import CompensateSettings

@@ -1,16 +1,25 @@
-"""The scout's network: a stem and positions of its own, then the early drafter's network (docs/methods.md §5.1).
+"""The scout: its network, its proposer and its files (docs/methods.md §5.1, ours).
 
 It reads the image, the hand and the instruction, and nothing that the target computes: so a chunk that is executed
-unverified costs no encoding of the target's, and what goes wrong in one view need not go wrong in the other.
+unverified costs no encoding of the target's, and what goes wrong in one view need not go wrong in the other. Behind its
+stem and its estimate of positions stands the early drafter's network.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.methods.early.drafter import EarlyDrafter
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.methods.artifacts import Weights, WeightsDescription
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, scene_features, scene_width
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
@@ -75,3 +84,58 @@ class Scout(nn.Module):
         """Observations, history (B, h, D) normalised, valid (B, h) -> logits (B, N, V), positions (B, K, 3)."""
         features, places = self.see(inputs)
         return self.drafter(features, history, valid), places
+
+
+class ScoutProposer(EarlyProposer):
+    """The scout's chunk, drafted once per observation, without the target's encoder."""
+
+    name = "scout"
+
+    def __init__(self, scout: Scout, target: CompactTarget) -> None:
+        super().__init__(scout.drafter, target)
+        self.scout, self.inputs = scout, target.inputs
+
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> ScoutProposer:
+        """proposer=scout."""
+        return cls(context.artifact("scout"), context.target)
+
+    @torch.inference_mode()
+    def features(self, chunk: Chunk) -> Tensor:
+        """What the network reads of the chunk's observation, (1, F)."""
+        assert chunk.observation is not None
+        return self.scout.see(self.inputs(chunk.observation))[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoutDescription(WeightsDescription):
+    """A scout's JSON."""
+
+    settings: ScoutSettings
+
+
+class ScoutArtifact(Weights[ScoutDescription]):
+    """The scout's files."""
+
+    kind, noun = "scout", "scout"
+    command = ("train", "drafter", "drafter=scout")
+    schema = ScoutDescription
+
+    def module(self, description: ScoutDescription, target: ReadableTarget) -> Scout:
+        """A fresh scout, which looks through the target's camera.
+
+        Raises:
+            CheckpointError: as `check_sees`.
+        """
+        return Scout.beside(description.settings, check_sees(target))
+
+
+def check_sees(target: object) -> CompactTarget:
+    """The target, if it sees.
+
+    Raises:
+        CheckpointError: it is of another family, or is given the state.
+    """
+    if not isinstance(target, CompactTarget) or not target.cameras:
+        raise CheckpointError("a scout looks through the camera of a compact target that sees; this target has none")
+    return target
