@@ -59,11 +59,5 @@ class JacobiProposer(ChainProposer):
 
 
 # without the trait `chains`: its first guess is made behind the prefill
-add(
-    "proposer",
-    "jacobi",
-    "kerv_cli.methods.jacobi:JacobiProposer.build",
-    JacobiProposerSettings,
-    colour=0x8A7FD4,
-    when=STATES,
-)
+_BUILD = "kerv_cli.methods.jacobi:JacobiProposer.build"
+add("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, when=STATES)
