@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -38,6 +37,7 @@ from kerv_cli.methods.heisd import (
     HybridAcceptanceSettings,
     HybridProposerSettings,
     RandomBoundarySettings,
+    RetrievalProposerSettings,
     SequenceAcceptanceSettings,
     SimilaritySkipSettings,
 )
@@ -154,8 +154,8 @@ class RetrievalProposer(ChainProposer):
         self._nearest: tuple[Chunk, Neighbours] | None = None
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> RetrievalProposer:
-        """proposer=retrieval, and retrieval's side of hybrid: settings of either have neighbours and nodes."""
+    def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
+        """proposer=retrieval, and retrieval's side of hybrid."""
         return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:

@@ -243,10 +243,11 @@ def build_predictor(
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
     """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
-    name, target = settings.kind, context.target
-    if name in FILTERS:
-        return context.calibration.predictor(name, horizon=target.chunk)
-    return PLAIN[name](target.actions.is_strict, PLAIN[name].least, horizon=target.chunk)
+    name, held, horizon = settings.kind, context.target.actions.is_strict, context.target.chunk
+    if name in PLAIN:
+        return PLAIN[name](held, PLAIN[name].least, horizon=horizon)
+    fitted = context.calibration
+    return FILTERS[name](held, fitted.noise[name], window=fitted.window, horizon=horizon)
 
 
 class PredictionProposer(ChainProposer):

@@ -51,16 +51,16 @@ class Scout(nn.Module):
         )
         self.cells = nn.Linear(s.cell_width, s.cell_features)
         self.words = nn.Embedding(words, s.word_width)
-        felt, places = len(observation.proprioception), len(observation.places)
+        p, places = len(observation.proprioception), len(observation.places)
         self.locate = nn.Sequential(
-            nn.Linear(2 * s.keypoints * views + felt + s.word_width, 128),
+            nn.Linear(2 * s.keypoints * views + p + s.word_width, 128),
             nn.SiLU(),
             nn.Linear(128, 64),
             nn.SiLU(),
             nn.Linear(64, 3 * places),
         )
-        seen = (s.cell_width + s.grid**2 * s.cell_features) * views
-        self.drafter = EarlyDrafter(s, actions, chunk, seen + s.word_width + scene_width(observation))
+        of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
+        self.drafter = EarlyDrafter(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 
     @classmethod
     def beside(cls, settings: ScoutSettings, target: CompactTarget) -> Scout:
@@ -71,14 +71,14 @@ class Scout(nn.Module):
     def see(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """What the drafter's network reads (B, F), and the estimated positions of the places (B, K, 3), metres."""
         assert inputs.images is not None
-        felt, words = inputs.proprioception, self.words(inputs.words).mean(1)
+        proprioception, words = inputs.proprioception, self.words(inputs.words).mean(1)
         views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
-        seen = [part for cells, _ in views for part in (cells.mean(1), self.cells(cells).flatten(1))]
+        cells = [part for grid, _ in views for part in (grid.mean(1), self.cells(grid).flatten(1))]
         points = [points for _, points in views]
-        located = self.locate(torch.cat([*points, hand_features(felt, self.centre), words], -1))
+        located = self.locate(torch.cat([*points, hand_features(proprioception, self.centre), words], -1))
         places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
-        scene = scene_features(felt, places, self.centre)
-        return torch.cat([*seen, words, scene], -1), places
+        scene = scene_features(proprioception, places, self.centre)
+        return torch.cat([*cells, words, scene], -1), places
 
     def forward(self, inputs: Inputs, history: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Observations, history (B, h, D) normalised, valid (B, h) -> logits (B, N, V), positions (B, K, 3)."""
