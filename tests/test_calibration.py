@@ -23,8 +23,7 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CalibrateSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.chunk import Chunk, Situation
-from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.record import Round
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (
@@ -39,7 +38,7 @@ from kerv_cli.methods.calibration import (
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.methods.kinematics import KinematicThresholdSettings
-from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise
+from kerv_cli.methods.kinematics.prediction import PREDICTORS, Noise, build_predictor
 from kerv_cli.methods.spec_vla import FixedThresholdSettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.training.calibration import CalibrationRun, distribution
@@ -244,7 +243,9 @@ def test_a_run_writes_what_the_next_session_reads(results: Path, target: str) ->
     assert "kept" not in loaded.provenance
     assert [line.split(":")[0] for line in run.notes] == ["skip levels"]
     for kind in PREDICTORS:
-        ahead = loaded.predictor(kind).predict(np.full((10, 4), 0.25), 4)
+        ahead = build_predictor(kind, SPACE.is_strict, loaded.noise, window=loaded.window).predict(
+            np.full((10, 4), 0.25), 4
+        )
         np.testing.assert_allclose(ahead, 0.25)
 
 

@@ -12,10 +12,9 @@ from test_decoding_lossless import plain_greedy
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import find
-from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.kinematics import CompensateSettings
 from kerv_cli.methods.kinematics.prediction import Compensation, Hold, Linear, assemble

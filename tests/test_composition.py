@@ -14,6 +14,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
 from kerv_cli.lab.policy import check as check_rollout
+from kerv_cli.methods.agreement import WatchSettings
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
@@ -32,7 +33,6 @@ from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
 from kerv_cli.methods.streak import StreakSkipSettings
-from kerv_cli.methods.watch import WatchSettings
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {

@@ -12,7 +12,7 @@ from kerv_cli.bench.model import open_model
 from kerv_cli.bench.phases import flipped
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.jacobi.proposer import JacobiProposer
+from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.compact.captured import CapturedCache
 from kerv_cli.targets.compact.trunk import Trunk
 

@@ -25,7 +25,7 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.settings import EVALUATION_SEED, BuildDatastoreSettings, PolicySettings
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.draft import ROOT, TokenTree, merge
+from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.methods.heisd import QdrantSearchSettings
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, Shard, check_seeds, prompt_key
 from kerv_cli.methods.heisd.rules import neighbour_tree

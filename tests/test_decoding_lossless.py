@@ -17,12 +17,13 @@ from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import ActionSpace, Group, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.draft import ROOT, Draft
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
-from kerv_cli.methods.jacobi.proposer import JacobiProposer
+from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target, save_module, target_fields
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget

@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_decoding_lossless import random_prompt, random_target
 
-from kerv_cli.engine.draft import ROOT, TokenTree
+from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
 from kerv_cli.targets.compact.target import CompactTarget

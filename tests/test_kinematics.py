@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.engine.history import WINDOW, ActionHistory
+from kerv_cli.engine.chunk import WINDOW, ActionHistory
 from kerv_cli.methods.kinematics.prediction import (
     FILTERS,
     HORIZON,

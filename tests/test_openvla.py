@@ -28,7 +28,7 @@ from kerv_cli.cli.app import app
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
-from kerv_cli.methods.jacobi.proposer import JacobiProposer
+from kerv_cli.methods.jacobi import JacobiProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Language, Shape, Statistics, action_space, read_shape
 from kerv_cli.targets.openvla.image import as_in_libero, cropped, pixels_of

@@ -28,9 +28,8 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, as_plain, settings_from
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
-from kerv_cli.engine.chunk import Situation
+from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.lab.catalogue import find_runs, matching
 from kerv_cli.lab.policy import check
 from kerv_cli.methods.artifacts import Artifacts, MadeFor

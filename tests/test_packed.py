@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.settings import TargetSettings
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.draft import ROOT, Draft
+from kerv_cli.engine.draft import Draft
+from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter
 from kerv_cli.targets.compact import kernels

@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterProposer
-from kerv_cli.methods.early.drafter import EarlyDraft, EarlyProposer
+from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.datastore import Datastore, Manifest, prompt_key
 from kerv_cli.methods.heisd.rules import HybridProposer, Random, RetrievalProposer, VerifySkip
@@ -41,8 +40,8 @@ class KnownDraft:
         self.odds = random.random()
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def drafted(self, features: torch.Tensor, history: np.ndarray, radius: int) -> EarlyDraft:
-        return EarlyDraft(self.tokens, self.odds)
+    def draft(self, features: torch.Tensor, histories: list[np.ndarray], radius: int) -> torch.Tensor:
+        return torch.tensor([[*self.tokens, self.odds]], dtype=torch.float64)
 
 
 def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:

@@ -15,7 +15,7 @@ from studies_synthetic import episode, prepare, still_episode, threshold_setting
 from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
-from kerv_cli.engine.cost import Profile, predicted, sequence_of_record
+from kerv_cli.engine.cost import Profile, predicted, work_of_record
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO, measure
@@ -69,7 +69,7 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(data: StudyData) -> 
     for cell in data.plan.cells:
         for seed in cell.seeds:
             record = episode(cell, seed)
-            priced = [predicted(sequence_of_record(decode), PROFILE) for decode in record.decodes]
+            priced = [predicted(work_of_record(decode), PROFILE) for decode in record.decodes]
             seconds.setdefault(cell.label, []).append(sum(priced))
             steps.setdefault(cell.label, []).append(record.steps)
     for label in ("naive_sd", "spec_vla r=9"):

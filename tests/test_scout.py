@@ -24,10 +24,8 @@ from kerv_cli.methods.certified.certificate import Candidate, Certificate, certi
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.methods.scout.network import Scout
-from kerv_cli.methods.scout.proposer import ScoutArtifact, ScoutProposer, check_sees
-from kerv_cli.methods.streak import StreakSkipSettings
-from kerv_cli.methods.streak.skip import StreakSkip
+from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, ScoutProposer, check_sees
+from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.certificate import _needed, _values
 from kerv_cli.targets.checkpoint import load_target

@@ -14,8 +14,7 @@ from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.self_cache import SelfCacheSettings
 from kerv_cli.methods.self_cache.proposer import SelfCacheProposer
-from kerv_cli.methods.streak import StreakSkipSettings
-from kerv_cli.methods.streak.skip import StreakSkip
+from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 from kerv_cli.targets.compact.target import CompactTarget
 
 TASK = "reach-v3"

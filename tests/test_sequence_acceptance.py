@@ -16,8 +16,9 @@ from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.engine.acceptance import Acceptance, Strict, accept_by_distance, accept_by_group
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.draft import ROOT, Draft, TokenTree
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
+from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.context import Context
 from kerv_cli.worlds.metaworld.spec import SPEC
 

@@ -10,13 +10,12 @@ import torch
 from examples.own_target import MockTarget
 from test_unverified import SHOWN, Near
 
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.loss import chunk_loss
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.methods.merged.proposer import MergedProposer
-from kerv_cli.methods.spec_vla.rules import Relaxed
-from kerv_cli.methods.streak import StreakSkipSettings
-from kerv_cli.methods.streak.skip import StreakSkip
+from kerv_cli.methods.spec_vla import Relaxed
+from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 
 
 def decoder_of(source: Any, target: MockTarget, draft: Any = None, radius: int = 0, **settings: Any) -> Decoder:
@@ -119,14 +118,13 @@ def test_another_sources_accepted_chain_does_not_count() -> None:
 
 
 @torch.inference_mode()
-def test_the_loss_is_a_share_of_the_scale_and_one_where_a_strict_dof_flips() -> None:
+def test_the_distance_is_the_mean_difference_and_infinite_where_a_strict_dof_flips() -> None:
     target = MockTarget()
     space, truth = target.actions, np.array(near(target).drafted)
+    chunk = Chunk(torch.zeros(1, 1, 1), target.chunk, space, target.new_cache(1, 1), Situation("t", ActionHistory(4)))
     strict = space.strict_tokens(len(truth))
     off = np.where(strict, truth, np.where(truth + 4 < space.tokens, truth + 4, truth - 4))
-    expected = 4 * 2 / space.tokens * (~strict).mean()
-    assert chunk_loss(space, off, truth, 1.0) == pytest.approx(expected)
-    assert chunk_loss(space, off, truth, expected / 2) == 1.0
+    assert chunk.distance(off, truth) == pytest.approx(4 * 2 / space.tokens * (~strict).mean())
     flipped = truth.copy()
     flipped[np.flatnonzero(strict)[0]] ^= 1
-    assert chunk_loss(space, flipped, truth, 1.0) == 1.0
+    assert chunk.distance(flipped, truth) == np.inf

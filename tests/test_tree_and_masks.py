@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.engine.acceptance import accept_by_distance
-from kerv_cli.engine.draft import ROOT, Draft, TokenTree, ancestors_of, ancestors_on_device, merge
+from kerv_cli.engine.draft import Draft, ancestors_of, ancestors_on_device
+from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.methods.merged.proposer import rows_of
 from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.compact.trunk import Trunk

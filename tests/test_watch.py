@@ -24,7 +24,7 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.rows import DECODE_SCHEMA, decode_rows
-from kerv_cli.methods.watch import FARTHEST, Watch, WatchSettings, check_source
+from kerv_cli.methods.agreement import FARTHEST, Watch, WatchSettings, check_source
 from kerv_cli.serve.policy import Policy
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 

@@ -39,7 +39,6 @@ OWN = (
     "kerv_cli.methods.unverified",
     "kerv_cli.methods.sp_vla",
     "kerv_cli.methods.agreement",
-    "kerv_cli.methods.watch",
     "kerv_cli.methods.heisd",
     "kerv_cli.methods.jacobi",
     "kerv_cli.methods.merged",

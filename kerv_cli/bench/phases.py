@@ -17,13 +17,14 @@ from kerv_cli.bench.machine import Machine, measure_machine
 from kerv_cli.bench.model import Model, Sizes, blank
 from kerv_cli.engine.chunk import Chunk, Clock
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.draft import ROOT, Draft
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.record import Round
+from kerv_cli.engine.tree import ROOT
 from kerv_cli.lab.policy import decoder_for
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.spec_vla.rules import Relaxed
+from kerv_cli.methods.spec_vla import Relaxed
 
 _WARM_UP = 2  # cycles that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read between decodes: a simulator leaves nothing in the caches

@@ -1,14 +1,16 @@
 """Which drafts are good enough (docs/methods.md §2.1). Pure functions of tokens; the longest accepted path wins, ties
-go to the smaller summed distance, then to the node proposed first."""
+go to the smaller summed distance, then to the node proposed first. Nothing heavy is imported here."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.draft import ROOT, TokenTree
+from kerv_cli.engine.tree import ROOT, TokenTree
+
+if TYPE_CHECKING:
+    from kerv_cli.base.spaces import ActionSpace
 
 Bounds = Sequence[tuple[int, int]]
 """Per DoF: the first DoF of its kinematic group, and one past the last (`ActionSpace.bounds`)."""

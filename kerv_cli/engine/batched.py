@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, actions_of, deviation, record_of
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.parts import TakesMany
 from kerv_cli.engine.protocol import Cache, EncodesMany, Target
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, Round

@@ -1,9 +1,11 @@
-"""What the parts of a decode share: the chunk, the situation before it, the clock."""
+"""What the parts of a decode share: the clock, the actions and positions before the decode, the chunk."""
 
 from __future__ import annotations
 
 import itertools
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -14,11 +16,11 @@ from torch import Tensor
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.history import ActionHistory
 from kerv_cli.engine.protocol import Cache
 from kerv_cli.engine.record import PARALLEL, PHASES, Round
 
 Mode = Literal["retrieval", "drafter"]
+WINDOW = 10  # KERV's action context AC, control steps
 
 
 class Clock:
@@ -73,6 +75,40 @@ def steps_of(chunk: int, trained: int) -> int:
     if not 0 <= chunk <= trained:
         raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
     return chunk or trained
+
+
+class ActionHistory:
+    """The last `window` executed actions, normalised and continuous."""
+
+    def __init__(self, dofs: int, window: int = WINDOW) -> None:
+        self.dofs = dofs
+        self._actions: deque[np.ndarray] = deque(maxlen=window)
+        self._stacked = np.zeros((0, dofs))  # these actions as one array, which nobody writes to
+        self._stacked.flags.writeable = False
+
+    def append(self, action: np.ndarray) -> None:
+        """An action (D,) in [-1, 1] was executed.
+
+        Raises:
+            ValueError: another shape, or a number that is not finite.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self.dofs,) or not np.isfinite(action).all():
+            raise ValueError(f"an executed action must be {self.dofs} finite numbers, not {action}")
+        self._actions.append(action)
+        self._stacked = np.array(self._actions)
+        self._stacked.flags.writeable = False
+
+    def values(self, pending: np.ndarray | None = None) -> np.ndarray:
+        """(m, D), oldest first, m ≤ window.
+
+        pending: (k, D) steps of the present chunk that are decided but not yet executed. They are appended as
+        if executed, so that the next step is one step ahead instead of k + 1.
+        """
+        if pending is None or not len(pending):
+            return self._stacked
+        steps = np.concatenate([self._stacked, np.asarray(pending, dtype=np.float64)])
+        return steps[-(self._actions.maxlen or 0) :]
 
 
 @dataclass(frozen=True)
@@ -177,6 +213,26 @@ class Chunk:
         """K: mean difference of draft and target over the judged tokens, normalised action units; None where none was
         judged. Strict DoFs are left out: one flip would outweigh all others (docs/methods.md §3.2)."""
         return float(np.mean(self._differences)) if self._differences else None
+
+    def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
+        """Mean absolute difference of two token sequences from a chunk's first token on, normalised action units;
+        infinite where a strict DoF's tokens differ."""
+        first, second = np.array(tokens), np.array(others)
+        if (first != second)[self.space.strict_tokens(len(first))].any():
+            return math.inf
+        return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
+
+    def targets_along(self, chain: Sequence[int]) -> list[int] | None:
+        """The target's tokens along a drafted chain, from the chunk's first verification; None where that judged
+        another draft, or less than all but the last token of the chain. The next round forgets what lies behind the
+        rejection: call it before."""
+        if not self.rounds:
+            return None
+        verification, rejection = self.rounds[-1], self.rejection
+        path = [*verification.drafted, *rejection.draft]
+        if verification.start or len(path) < self.size - 1 or path != list(chain[: len(path)]):
+            return None
+        return [*verification.target_tokens[: len(verification.drafted)], *rejection.target[: len(rejection.draft)]]
 
     def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
         """Commits `tokens` after a forward. record: of its round."""

@@ -61,12 +61,9 @@ class Profile:
 
     def decode(self, tokens: int) -> float:
         """Of an autoregressive decode of N tokens."""
-        return self.seconds("encode", 1) + self.seconds("prefill", self.prompt) + (tokens - 1) * self.one_token
-
-    @property
-    def one_token(self) -> float:
-        """A forward of one token."""
-        return self.seconds("verify", 1)
+        return (
+            self.seconds("encode", 1) + self.seconds("prefill", self.prompt) + (tokens - 1) * self.seconds("verify", 1)
+        )
 
     def drafting(self, depth: int) -> float:
         """A chain of `depth` tokens from the drafter."""
@@ -189,7 +186,7 @@ def work_of(
     )
 
 
-def sequence_of_record(decode: DecodeRecord) -> Work:
+def work_of_record(decode: DecodeRecord) -> Work:
     """The work of a decode that was just recorded."""
     names = ("mode", "proposer", "start", "tree_size", "accepted")
     return work_of(

@@ -12,14 +12,14 @@ from torch import Tensor
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.acceptance import Acceptance, Strict
-from kerv_cli.engine.chunk import Chunk, Clock, Rejection, Situation, steps_of
-from kerv_cli.engine.draft import EMPTY, Draft, TokenTree
-from kerv_cli.engine.history import ActionHistory
+from kerv_cli.engine.chunk import ActionHistory, Chunk, Clock, Rejection, Situation, steps_of
+from kerv_cli.engine.draft import EMPTY, Draft
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold, Watches
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Look, Round
 from kerv_cli.engine.transfer import read, upload
+from kerv_cli.engine.tree import TokenTree
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,16 @@
-"""What drafts: the base of proposers, and that of those that draft whole chunks (docs/extending.md)."""
+"""What drafts: the base of proposers, and that of those that draft a chain of the host's tokens (docs/extending.md).
+Nothing heavy is imported here."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
-from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.draft import EMPTY, Draft
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.draft import Draft
 
 
 class Proposer:
@@ -42,10 +45,13 @@ class Proposer:
 
 
 class ChainProposer(Proposer):
-    """Drafts whole chunks without the target's hidden states: a source of merged drafts and of unverified chunks."""
+    """Drafts chains on the host. One that does so before the prefill (trait `chains`) is a source of merged drafts and
+    of unverified chunks."""
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The first chain; an empty draft where there is none."""
+        from kerv_cli.engine.draft import EMPTY, Draft
+
         chains = self.chains(chunk, depth)
         return Draft.of(chains[0]) if chains else EMPTY
 
@@ -53,6 +59,10 @@ class ChainProposer(Proposer):
         """Drafts of the tokens behind the committed ones, best first, at most `depth` tokens each; an empty list where
         it has no draft."""
         raise NotImplementedError
+
+    def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
+        """The first chains of B chunks of which nothing is committed, N tokens each."""
+        return [self.chains(chunk, chunk.size)[0] for chunk in chunks]
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether it expects its first chain to be accepted whole."""

@@ -15,9 +15,6 @@ from kerv_cli.base.spaces import ActionSpace
 PARALLEL = "parallel"
 """Mode of a round, and of its decode, in which the target decoded all tokens at once."""
 
-TRUSTED, STREAK = "trusted", "streak"
-"""Reasons of a decode: executed unverified; verified because the verifications before do not allow more."""
-
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode's inference time; their seconds add up to `DecodeRecord.seconds`. vision: `Target.encode`."""
 

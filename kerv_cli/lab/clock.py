@@ -16,7 +16,7 @@ from kerv_cli.base.files import sha256_of
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CONSTANT, MEASURED, PROFILE, REAL, RolloutSettings
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.cost import Profile, predicted, read_profile, sequence_of_record
+from kerv_cli.engine.cost import Profile, predicted, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Delay
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.kinematics.prediction import Noise, Predictor, build_predictor
@@ -197,7 +197,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None, meas
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
     """The cost model's seconds for a decode's forwards, its host seconds as measured, all times `scale`."""
-    return lambda decode: scale * predicted(sequence_of_record(decode), profile)
+    return lambda decode: scale * predicted(work_of_record(decode), profile)
 
 
 def _profile_path(results: str, name: str) -> Path:

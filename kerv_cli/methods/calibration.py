@@ -12,7 +12,7 @@ from typing import Any, Literal
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.methods.artifacts import Artifact, MadeFor, check_sources
 from kerv_cli.methods.heisd.rules import LEAST, BoundaryRanges
-from kerv_cli.methods.kinematics.prediction import FILTERS, HORIZON, MINIMUM, Noise, Predictor, build_predictor
+from kerv_cli.methods.kinematics.prediction import FILTERS, MINIMUM, Noise
 
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
@@ -157,14 +157,6 @@ class Calibration:
             )
         row = self.skip.tasks[task]
         return row.low, row.s_min, row.high
-
-    def predictor(self, kind: str, minimum: int = MINIMUM, horizon: int = HORIZON) -> Predictor:
-        """The predictor `kind` with the fitted noise.
-
-        Raises:
-            UnknownName: no such predictor.
-        """
-        return build_predictor(kind, self.target.actions.is_strict, self.noise, minimum, self.window, horizon)
 
 
 class CalibrationArtifact(Artifact[Calibration]):

@@ -15,6 +15,7 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.parallel import ParallelPass
+from kerv_cli.targets.checkpoint import TargetDescription
 
 _BATCHED = {
     ("none", "none", "none"): "ar",
@@ -26,7 +27,7 @@ _BATCHED = {
 
 
 def is_parallel(target: object) -> bool:
-    """Whether a target decodes all tokens at once; see `targets.protocol.ParallelTarget`."""
+    """Whether a target decodes all tokens at once; see `engine.protocol.ParallelTarget`."""
     return bool(getattr(target, "parallel", False))
 
 
@@ -62,7 +63,7 @@ class Method:
         kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
         return tuple(dict.fromkeys(kinds))
 
-    def check(self, target: Any, batch: int = 1, key: str = "rollout.batch") -> None:
+    def check(self, target: Target | TargetDescription, batch: int = 1, key: str = "rollout.batch") -> None:
         """Refuses parts that do not belong together or to the target, and numbers out of range, before anything heavy
         is loaded. target: a description of one, or a loaded one. batch: episodes whose decodes are computed together;
         key: the setting that says so.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.registry import NoSettings, add
 from kerv_cli.engine.parts import Skip
@@ -36,9 +36,8 @@ class AlwaysSkip(Skip):
         return True
 
     def take_many(self, chunks: Sequence[Chunk], cache: Callable[[int], Cache]) -> None:
-        """Fills chunks with the drafts of one pass, where the source is an `EarlyProposer`."""
-        source: Any = self.source
-        for chunk, tokens in zip(chunks, source.tokens_of(chunks), strict=True):
+        """Fills B chunks with the source's drafts."""
+        for chunk, tokens in zip(chunks, self.source.tokens_of(chunks), strict=True):
             chunk.skip(tokens, self.source.name)
 
 

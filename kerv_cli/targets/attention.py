@@ -1,5 +1,5 @@
-"""Attention of a trunk that decodes with a cache: the cache, its slots, the mask and the rotation, shared by the
-families of targets.
+"""Attention of a trunk that decodes with a cache: the cache, its slots, the mask and the rotation. Both families of
+targets use it.
 
 Shapes: B batch, T new tokens, S cached tokens, A heads (of keys and values), C channels of a head.
 """
@@ -38,34 +38,25 @@ class Cache:
         self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length = start + n
 
+    def next_slots(self, tokens: int) -> Slots:
+        """The slots behind the valid ones, for so many tokens."""
+        start, stop = self.length, self.length + tokens
+        return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
-class Slots:
-    """The slots of a cache that a forward of `tokens` tokens writes: a slice, for fixed shapes a tensor `index`
-    (T,)."""
 
-    def __init__(self, cache: Cache, tokens: int) -> None:
-        self.start, self.stop = cache.length, cache.length + tokens
-        self.index: Tensor | None = None
-        if cache.fixed:
-            self.index = torch.arange(self.start, self.stop, device=cache.buffer.device)
+Slots = slice | Tensor
+"""Slots of a cache that a forward of T tokens writes: a slice, for fixed shapes their indices (T,)."""
 
-    @classmethod
-    def at(cls, index: Tensor) -> Slots:
-        """The slots `index` (T,) of a cache of fixed shapes."""
-        slots = cls.__new__(cls)
-        slots.start = slots.stop = 0
-        slots.index = index
-        return slots
 
-    def write(self, layer: Tensor, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """k, v (B, A, T, C) into a layer (2, B, A, capacity, C) -> the keys and values to attend to."""
-        if self.index is not None:
-            layer[0].index_copy_(2, self.index, k)
-            layer[1].index_copy_(2, self.index, v)
-            return layer[0], layer[1]
-        layer[0][:, :, self.start : self.stop] = k
-        layer[1][:, :, self.start : self.stop] = v
-        return (layer[0][:, :, : self.stop], layer[1][:, :, : self.stop]) if self.start else (k, v)
+def write(layer: Tensor, slots: Slots, k: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """k, v (B, A, T, C) into the slots of a layer (2, B, A, capacity, C) -> the keys and values to attend to."""
+    if isinstance(slots, Tensor):
+        layer[0].index_copy_(2, slots, k)
+        layer[1].index_copy_(2, slots, v)
+        return layer[0], layer[1]
+    layer[0][:, :, slots] = k
+    layer[1][:, :, slots] = v
+    return (layer[0][:, :, : slots.stop], layer[1][:, :, : slots.stop]) if slots.start else (k, v)
 
 
 def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:

@@ -25,9 +25,6 @@ FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"
 """How weights are stored."""
 SCALE = ".scale"
 """Behind the name of a matrix of integers: its scales, a row each."""
-WEIGHTS_ELSEWHERE = "weights"
-"""Trait of a target's part: `module:function`, called with (folder, description), for weights that do not lie in the
-target's own folder."""
 
 
 @dataclass(frozen=True)
@@ -266,12 +263,12 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 
 
 def read_target(folder: Path) -> TargetDescription:
-    """A target's description; errors as `read_description`. A family whose weights lie elsewhere (trait `weights`)
-    checks them itself."""
+    """A target's description; errors as `read_description`. A family whose weights lie in another folder checks them
+    itself: its trait `weights` names a function of (folder, description)."""
     description = described(folder, "target", TargetDescription)
     family = parts("target").get(description.family)
-    if family is not None and WEIGHTS_ELSEWHERE in family.traits:
-        load(family.traits[WEIGHTS_ELSEWHERE])(folder, description)
+    if family is not None and "weights" in family.traits:
+        load(family.traits["weights"])(folder, description)
     else:
         check_weights(folder, "target", description.sha256)
     return description

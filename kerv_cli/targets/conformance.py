@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from kerv_cli.base.findings import Failed, Finding, run
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.protocol import Cache, Target
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
 """Largest difference of logits relative to their spread, by number format: products are summed in other orders."""
@@ -54,16 +53,16 @@ def check_target(target: Target, observation: Observation, seed: int = 0) -> lis
     return findings + run(checks)
 
 
-def _members(target: Any) -> str:
+def _members(target: Target) -> str:
     missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(target, name)]
     if missing:
         raise Failed(f"{type(target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
     if not isinstance(target.actions, ActionSpace):
-        raise Failed(f"actions is {type(target.actions).__name__}, an ActionSpace is wanted")
+        raise Failed(f"actions is {type(target.actions).__name__}, must be an ActionSpace")
     if target.chunk < 1 or target.width < 1 or target.max_prompt < 1:
         raise Failed(f"chunk {target.chunk}, width {target.width}, max_prompt {target.max_prompt}: at least 1 each")
     if isinstance(target.cameras, str):
-        raise Failed(f"cameras is the text '{target.cameras}', a tuple of names is wanted")
+        raise Failed(f"cameras is the text '{target.cameras}', must be a tuple of names")
     size = target.chunk * target.actions.dofs
     return (
         f"{type(target).__name__}: D={target.actions.dofs}, N={size}, {target.actions.tokens} tokens, E={target.width}"
@@ -88,7 +87,7 @@ class Trial:
         """The prompt: shape, length, finite, the same twice."""
         prompt = self.target.encode(self.observation)
         if prompt.ndim != 3 or len(prompt) != 1 or prompt.shape[2] != self.target.width:
-            raise Failed(f"encode gives {tuple(prompt.shape)}, (1, P, {self.target.width}) is wanted")
+            raise Failed(f"encode gives {tuple(prompt.shape)}, must be (1, P, {self.target.width})")
         if not 1 <= prompt.shape[1] <= self.target.max_prompt:
             raise Failed(f"a prompt of {prompt.shape[1]} tokens, max_prompt is {self.target.max_prompt}")
         if not torch.isfinite(prompt).all():
@@ -144,7 +143,7 @@ class Trial:
         self.same(self.plain(self.tokens[:, :4])[:, : length + 4], whole[:, : length + 4], "a token sees later ones")
         return self.says()
 
-    def cached(self, lengths: Sequence[int]) -> tuple[Any, list[Tensor]]:
+    def cached(self, lengths: Sequence[int]) -> tuple[Cache, list[Tensor]]:
         """Prompt, then the tokens in pieces of these lengths -> the cache and the pieces' hidden states."""
         cache, length = self.target.new_cache(1, self.capacity), self.prompt.shape[1]
         if cache.capacity < self.capacity or cache.length:
@@ -172,7 +171,7 @@ class Trial:
         drawn = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random)
         return drawn.to(self.prompt.device)
 
-    def grown(self, cache: Any, start: int, before: int) -> tuple[Tensor, Tensor]:
+    def grown(self, cache: Cache, start: int, before: int) -> tuple[Tensor, Tensor]:
         """Forwards the token at `start` and a tree behind it -> the tree's tokens (1, n), hidden (1, 1 + n, E). before:
         tokens that were forwarded."""
         drafted, at = self.drafted(), self.prompt.shape[1] + before

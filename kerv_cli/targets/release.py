@@ -41,7 +41,7 @@ def install(settings: BuildPolicySettings) -> Path:
         if policy.name not in RELEASED and not settings.sha256:
             raise UsageError(f"{policy.name} is no policy of kerv: set sha256={digest} if you trust {settings.source}")
         folder = results_dir(settings.results) / "pretrained" / policy.name
-        if not write_folder(folder, lambda place: shutil.copytree(policy, place, dirs_exist_ok=True)):
+        if not write_folder(folder, lambda new: shutil.copytree(policy, new, dirs_exist_ok=True)):
             raise UsageError(f"{folder} is there already: remove it first")
     return folder
 
@@ -62,14 +62,14 @@ def _archive(source: str, scratch: Path) -> Path:
     return path
 
 
-def _unpacked(archive: Path, place: Path, source: str) -> Path:
+def _unpacked(archive: Path, content: Path, source: str) -> Path:
     """The one folder in the archive."""
     try:
         with tarfile.open(archive) as file:
-            file.extractall(place, filter="data")
+            file.extractall(content, filter="data")
     except (tarfile.TarError, EOFError, OSError) as error:
         raise CheckpointError(f"source={source} is no intact archive (.tar.gz): {error}") from error
-    folders = [path for path in place.iterdir() if (path / "target" / "target.json").is_file()]
+    folders = [path for path in content.iterdir() if (path / "target" / "target.json").is_file()]
     if len(folders) != 1:
         raise CheckpointError(f"source={source} holds no policy: one folder with target/target.json in it")
     return folders[0]

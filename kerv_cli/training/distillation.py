@@ -19,7 +19,7 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact, DrafterProposer
-from kerv_cli.methods.spec_vla.rules import Relaxed
+from kerv_cli.methods.spec_vla import Relaxed
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.recorded import StatesByLength, TeacherStates, teach
 from kerv_cli.training.runs import DrafterRun

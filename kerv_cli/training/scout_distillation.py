@@ -17,8 +17,7 @@ from torch import Tensor
 from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.methods.scout.network import Scout
-from kerv_cli.methods.scout.proposer import ScoutArtifact, check_sees
+from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, check_sees
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.early_distillation import Decodes, EarlyDistillation, columns_of, evenly, share_of
 from kerv_cli.training.imitation import position_loss

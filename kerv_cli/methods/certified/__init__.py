@@ -4,7 +4,6 @@ registration."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import PREFILL, add, part_of
@@ -28,7 +27,7 @@ class ScopedSettings:
     outside: str = "merged"
 
 
-def _needs(settings: Any) -> tuple[str, ...]:
+def _needs(settings: ScopedSettings) -> tuple[str, ...]:
     """The certificate, which brings what its draft reads, and what the other draft reads."""
     outside = part_of("prefill_draft", settings.outside)
     return "certificate", *outside.needs(outside.default)

@@ -18,10 +18,11 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.draft import HOST, ROOT, Draft
+from kerv_cli.engine.draft import HOST, Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import ReadableTarget, Target
 from kerv_cli.engine.transfer import upload
+from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Request, Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle import DrafterSettings

@@ -98,13 +98,10 @@ class EarlyDrafter(Packable):
             x = block(x)
         return self.head(self.spread(self.norm(x)).unflatten(-1, (self.tokens, self.settings.rank)))
 
-    def drafted(self, features: Tensor, radius: int) -> EarlyDraft:
-        """features (1, F) -> the draft of all N tokens. radius: r in bins, see `choose`."""
-        return EarlyDraft.of(read(self.on_device(features, radius)[0])[0])
-
     @torch.inference_mode()
-    def on_device(self, features: Tensor, radius: int) -> Tensor:
-        """features (B, F) -> N tokens and the odds of each draft, (B, N + 1) float64, without a wait for the device."""
+    def draft(self, features: Tensor, radius: int) -> Tensor:
+        """features (B, F) -> N tokens and the odds that all are accepted, (B, N + 1) float64, without a wait for the
+        device. radius: r in bins, see `choose`."""
         tokens, odds = choose_with_odds(self(features.to(self.head.weight.dtype)), radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
@@ -146,19 +143,6 @@ class PackedEarly(Packed):
             x = block(x)
         spread = self.spread.of_vector(x, self.norm.of_vector(x)).add_(self.spread_bias)
         return self.head(spread.view(self.shape)).add_(self.head_bias)
-
-
-@dataclass(frozen=True)
-class EarlyDraft:
-    """A draft. tokens: N of them. odds: the drafter's estimate that all are accepted, see `choose_with_odds`."""
-
-    tokens: list[int]
-    odds: float
-
-    @classmethod
-    def of(cls, numbers: np.ndarray) -> EarlyDraft:
-        """numbers: (N + 1,), a row of `EarlyDrafter.on_device`."""
-        return cls(numbers[:-1].astype(np.int64).tolist(), float(numbers[-1]))
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
@@ -203,38 +187,38 @@ class EarlyProposer(ChainProposer):
     def __init__(self, early: EarlyDrafter, target: ReadableTarget) -> None:
         self.early, self.target = early, target
         self.waits = target.device.type == "cpu"
-        self._drafted: tuple[Chunk, EarlyDraft] | None = None
+        self._drafted: tuple[Chunk, list[int], float] | None = None  # the chunk, its draft and the odds
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> EarlyProposer:
         """proposer=early."""
         return cls(context.artifact("early"), context.target)
 
-    def drafted(self, chunk: Chunk) -> EarlyDraft:
-        """The draft of the chunk's N tokens."""
+    def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
+        """The draft of the chunk's N tokens, and the odds that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
-            radius = max(chunk.limits, default=0)
-            self._drafted = chunk, self.early.drafted(self.features(chunk), radius)
-        return self._drafted[1]
+            self.receive(chunk, read(self._rows([chunk])[0])[0])
+        assert self._drafted is not None
+        return self._drafted[1:]
 
     def features(self, chunk: Chunk) -> Tensor:
         """What the network reads of the chunk's observation, (1, F): the pooled prompt."""
         return self.target.pooled(chunk.prompt)
 
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
-        """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyDrafter.on_device`."""
+        """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyDrafter.draft`."""
         features = torch.cat([self.features(chunk) for chunk in chunks])
-        return self.early.on_device(features, max(chunks[0].limits, default=0))
+        return self.early.draft(features, max(chunks[0].limits, default=0))
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
-        """The draft on the device, (N + 1,), see `EarlyDraft.of`; None where the host has it."""
+        """The draft and its odds on the device, (N + 1,); None where the host has them."""
         if self.waits or (self._drafted is not None and self._drafted[0] is chunk):
             return None
         return self._rows([chunk])[0]
 
     def receive(self, chunk: Chunk, numbers: np.ndarray) -> None:
         """The host has read the vector of `on_device`."""
-        self._drafted = chunk, EarlyDraft.of(numbers)
+        self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """The drafted chain."""
@@ -246,7 +230,7 @@ class EarlyProposer(ChainProposer):
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """The drafted tokens behind the committed ones."""
-        return [self.drafted(chunk).tokens[len(chunk.tokens) : chunk.size][:depth]]
+        return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
 
     def tokens_of(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """The drafts of B chunks whose limits are equal."""
@@ -254,7 +238,7 @@ class EarlyProposer(ChainProposer):
 
     def is_sure(self, chunk: Chunk) -> bool:
         """Whether the estimate that the whole chunk is accepted reaches SURE."""
-        return self.drafted(chunk).odds >= SURE
+        return self.drafted(chunk)[1] >= SURE
 
 
 @dataclass(frozen=True, kw_only=True)

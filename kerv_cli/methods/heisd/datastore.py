@@ -205,7 +205,7 @@ class ExactIndex:
         seeds: np.ndarray,
         shards: Mapping[str, slice],
         digest: str = "",
-        settings: Any = None,
+        settings: object = None,
     ) -> None:
         """vectors (rows, d) float32, seeds (rows,), shards: task -> rows; digest, settings: read by other searches."""
         self.seeds, self.shards = seeds, shards

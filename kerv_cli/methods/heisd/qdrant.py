@@ -103,7 +103,7 @@ class EmbeddedEngine:
         self.folder = folder
         self.close = weakref.finalize(self, _discard, self.shard, folder)
 
-    def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
+    def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, str | int]]) -> None:
         """Stores rows first, first + 1, …: vectors (n, d), one payload each."""
         points = [
             self.q.Point(first + i, vector, payload)
@@ -175,7 +175,7 @@ class ServerEngine:
         with self._errors():
             return self.client.count(self.collection, exact=True).count
 
-    def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, Any]]) -> None:
+    def put(self, first: int, vectors: np.ndarray, payloads: list[dict[str, str | int]]) -> None:
         """Stores rows first, first + 1, …: vectors (n, d), one payload each."""
         ids = list(range(first, first + len(vectors)))
         batch = self.models.Batch(ids=ids, vectors=vectors.tolist(), payloads=payloads)

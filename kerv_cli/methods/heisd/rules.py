@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import count
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -24,12 +23,13 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.acceptance import Acceptance, Accepted, Strict, accept_by_group
 from kerv_cli.engine.chunk import Choice, Chunk
-from kerv_cli.engine.draft import ROOT, Draft, TokenTree
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.record import path_length
 from kerv_cli.engine.transfer import read
+from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.methods.heisd import (
@@ -37,11 +37,12 @@ from kerv_cli.methods.heisd import (
     HybridAcceptanceSettings,
     HybridProposerSettings,
     RandomBoundarySettings,
+    RetrievalProposerSettings,
     SequenceAcceptanceSettings,
     SimilaritySkipSettings,
 )
 from kerv_cli.methods.heisd.datastore import Datastore, Neighbours
-from kerv_cli.methods.spec_vla.rules import Relaxed
+from kerv_cli.methods.spec_vla import Relaxed
 
 CROSS = 0.1  # probability that a path of retrieved groups changes to other neighbours
 LEAST = 3  # positions; fewer have no curvature
@@ -153,8 +154,8 @@ class RetrievalProposer(ChainProposer):
         self._nearest: tuple[Chunk, Neighbours] | None = None
 
     @classmethod
-    def build(cls, settings: Any, context: Context) -> RetrievalProposer:
-        """proposer=retrieval, and retrieval's side of hybrid: settings of either have neighbours and nodes."""
+    def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
+        """proposer=retrieval, and retrieval's side of hybrid."""
         return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:

@@ -16,8 +16,7 @@ import numpy as np
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings, find
-from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.history import WINDOW
+from kerv_cli.engine.chunk import WINDOW, Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.kinematics import CompensateSettings
@@ -244,10 +243,11 @@ def build_predictor(
 
 def predictor_of(settings: NoSettings, context: Context) -> Predictor:
     """A kinematic predictor over the target's chunk; a filter's noise comes from the calibration."""
-    name, target = settings.kind, context.target
-    if name in FILTERS:
-        return context.calibration.predictor(name, horizon=target.chunk)
-    return PLAIN[name](target.actions.is_strict, PLAIN[name].least, horizon=target.chunk)
+    name, held, horizon = settings.kind, context.target.actions.is_strict, context.target.chunk
+    if name in PLAIN:
+        return PLAIN[name](held, PLAIN[name].least, horizon=horizon)
+    fitted = context.calibration
+    return FILTERS[name](held, fitted.noise[name], window=fitted.window, horizon=horizon)
 
 
 class PredictionProposer(ChainProposer):

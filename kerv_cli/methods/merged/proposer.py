@@ -10,9 +10,10 @@ import torch
 
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.draft import ROOT, Draft, TokenTree, merge
+from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.engine.transfer import read, upload
+from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.heisd import RetrievalProposerSettings
@@ -113,8 +114,3 @@ def rows_of(tree: TokenTree, chains: Sequence[Sequence[int]]) -> list[int]:
             rows[node] = first + index
     total = sum(len(chain) for chain in chains)
     return [total + row for row in rows]
-
-
-def first_source(draft: Any) -> ChainProposer:
-    """What drafts whole chunks before the prefill: an in-prefill draft, of a merged one its first source."""
-    return draft.sources[0] if isinstance(draft, MergedProposer) else draft

@@ -22,7 +22,7 @@ class ScoutSettings(EarlySettings):
     word_width: int = number(32, 1, 4096, help="numbers of a word")
 
 
-add("artifact", "scout", "kerv_cli.methods.scout.proposer:ScoutArtifact", sees=True)
+add("artifact", "scout", "kerv_cli.methods.scout.drafter:ScoutArtifact", sees=True)
 add("drafter", "scout", "kerv_cli.training.scout_distillation:ScoutRun", ScoutSettings)
-_build = "kerv_cli.methods.scout.proposer:ScoutProposer.build"
+_build = "kerv_cli.methods.scout.drafter:ScoutProposer.build"
 add("proposer", "scout", _build, needs=("scout",), colour=0x7BC8A4, when=PREFILL, chains=True)

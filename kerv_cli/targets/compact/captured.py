@@ -7,12 +7,12 @@ how it is tested on a CPU.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from kerv_cli.targets.attention import Cache, Slots
+from kerv_cli.targets.attention import Cache
 
 _AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # buckets of verifications; those of prefills follow with the first ones
 _WARM_UP = 3  # runs before a capture: libraries choose kernels and allocate workspaces
@@ -25,15 +25,8 @@ def bucket(tokens: int) -> int:
     return -(-tokens // 16) * 16
 
 
-class Stack(Protocol):
-    """What a graph captures: the layers of a `LayerStack` of width E."""
-
-    width: int
-
-    def compute(
-        self, x: Tensor, positions: Tensor, cache: Cache | None, slots: Slots | None, mask: Tensor | None
-    ) -> Tensor:
-        """The layers at `slots` of the cache, see `LayerStack.compute`."""
+Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
+"""What a graph captures, `LayerStack.compute`: (x, positions, cache, slots, mask) -> output of the last layer."""
 
 
 class CapturedCache(Cache):
@@ -44,25 +37,25 @@ class CapturedCache(Cache):
         super().__init__(layers, batch, heads, capacity, channels, like, fixed=True)
         self.steps: dict[int, _Step] = {}
 
-    def run(self, stack: Stack, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
+    def run(self, compute: Compute, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """The layers in a graph: x (1, T, E) at `positions` (T,), mask (T, slots) as `attention_mask` -> output of the
         last layer (1, T, E), valid until the next forward of the same bucket; the new tokens lie behind the cached
         ones."""
         if self.buffer.is_cuda and not self.steps:  # in the warm-up: a capture in the middle of an episode is timed
-            self.steps = {size: _Step(stack, self, size) for size in _AT_ONCE if size <= self.capacity}
+            self.steps = {size: _Step(compute, self, size, x.shape[2]) for size in _AT_ONCE if size <= self.capacity}
         size = bucket(x.shape[1])
         if size not in self.steps:
-            self.steps[size] = _Step(stack, self, size)
+            self.steps[size] = _Step(compute, self, size, x.shape[2])
         return self.steps[size].run(x, positions, mask)
 
 
 class _Step:
     """The buffers of one bucket, and its graph."""
 
-    def __init__(self, stack: Stack, cache: Cache, size: int) -> None:
-        self.stack, self.cache = stack, cache
+    def __init__(self, compute: Compute, cache: Cache, size: int, width: int) -> None:
+        self.compute, self.cache = compute, cache
         like, slots = cache.buffer, cache.buffer.shape[-2]
-        self.x = like.new_zeros((1, size, stack.width))
+        self.x = like.new_zeros((1, size, width))
         self.positions = torch.zeros(size, dtype=torch.long, device=like.device)
         self.index = torch.full((size,), slots - 1, dtype=torch.long, device=like.device)
         self.mask = like.new_full((size, slots), -torch.inf)
@@ -82,7 +75,7 @@ class _Step:
         return graph
 
     def _compute(self) -> Tensor:
-        return self.stack.compute(self.x, self.positions, self.cache, Slots.at(self.index), self.mask)
+        return self.compute(self.x, self.positions, self.cache, self.index, self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """Copies the inputs to the graph's buffers and replays it, see `CapturedCache.run`."""

@@ -72,8 +72,8 @@ class RowNorm:
 
 
 def gain_of(norm: nn.RMSNorm) -> Tensor:
-    """The factor (E,) that `RowNorm` leaves out: gain · √E."""
-    return norm.weight * norm.weight.shape[0] ** 0.5
+    """The factor (E,) that `RowNorm` leaves out, gain · √E, in float32."""
+    return norm.weight.float() * norm.weight.shape[0] ** 0.5
 
 
 def with_pairs(qkv: Tensor, channels: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Packed weights: a second form of a frozen float32 policy's weights for speed on a CPU, made by `pack`.
 
 They are the same numbers in other layouts (oneDNN's blocked one halves the time of 30 tokens; one token goes through
-numpy, `row_step.py`), with linear factors folded together: a norm's gain or a temperature into the weights behind it.
+numpy), with linear factors folded together: a norm's gain or a temperature into the weights behind it.
 At these widths half of a one-token forward was the overhead of calls, the other half reading the weights: so a layer
 has as few calls and copies as possible.
 
@@ -17,6 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -24,10 +25,17 @@ from torch import Tensor, nn
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
-from kerv_cli.targets.compact.kernels import FastConv, FastLinear, RowNorm, gain_of, has_blocked_layouts, with_pairs
+from kerv_cli.targets.compact.kernels import (
+    FastConv,
+    FastLinear,
+    RowNorm,
+    gain_of,
+    has_blocked_layouts,
+    row_product,
+    with_pairs,
+)
 from kerv_cli.targets.compact.packable import Packable, Packed
 from kerv_cli.targets.compact.packed_bfloat16 import BlockedLayers, multiplies_bfloat16
-from kerv_cli.targets.compact.row_step import RowLayer, RowLayers
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, PackedStack
 from kerv_cli.targets.compact.vision import VisionEncoder
@@ -128,15 +136,14 @@ class PackedLayers(PackedStack):
         turns = torch.cat([turn.repeat(1, 2 * stack.heads), torch.ones_like(turn).repeat(1, stack.heads)], -1)
         self.turns = torch.view_as_real(turns).flatten(1)
         self.layers = [PackedLayer(layer) for layer in stack.layers]  # type: ignore[arg-type]
-        rows = [RowLayer(layer.qkv, layer.out, layer.gate_up, layer.down) for layer in self.layers]
-        qk = self.turns[:, : 2 * stack.width].contiguous()
-        self.rows, self.gain = RowNorm(stack.norm), gain_of(stack.norm)
-        self.one_row = RowLayers(rows, qk, stack.heads, self.rows.width_eps)
+        self.rows, self.gain, self.heads = RowNorm(stack.norm), gain_of(stack.norm), stack.heads
+        self.width_eps = np.float32(self.rows.width_eps)
+        self.turns_of_qk: np.ndarray = self.turns[:, : 2 * stack.width].contiguous().numpy().view(np.complex64)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
         """All layers: x (B, T, E) -> hidden states (B, T, E), before the norm."""
         if cache is not None and x.shape[0] * x.shape[1] == 1:
-            return self.one_row(x.view(-1), int(positions), cache, mask).view(1, 1, -1)
+            return self.step(x.view(-1), int(positions), cache, mask).view(1, 1, -1)
         turn = self.turns.index_select(0, positions).view(torch.complex64)
         start = cache.length if cache is not None else 0
         for i, layer in enumerate(self.layers):
@@ -146,8 +153,46 @@ class PackedLayers(PackedStack):
     def norm(self, x: Tensor) -> Tensor:
         """The final RMSNorm with its gain."""
         if x.shape[0] * x.shape[1] == 1:
-            return self.one_row.norm(x.view(-1), self.gain).view(1, 1, -1)
+            row = self.normed(x.view(-1).numpy())
+            row *= self.gain.numpy()
+            return torch.from_numpy(row).view(1, 1, -1)
         return self.rows(x).mul_(self.gain)
+
+    def step(self, x: Tensor, position: int, cache: Cache, mask: Tensor | None) -> Tensor:
+        """`__call__` for one token of one sequence, in numpy: x (E,) -> (E,); mask (1, S + 1).
+
+        A token of `small` is 64 products and norms of a few microseconds each; a call of torch costs four, one of numpy
+        less than one (measured on an AMD EPYC: 0.85 ms with torch, 0.41 ms here, of which the products are 0.22).
+        """
+        width, stop = x.shape[0], cache.length + 1
+        channels = width // self.heads
+        scale = np.float32(channels**-0.5)
+        keys, values = (cache.buffer[:, i, 0].numpy() for i in range(2))  # (layers, A, slots, C)
+        row, turn, unseen = x.numpy().copy(), self.turns_of_qk[position], None if mask is None else mask.numpy()
+        with np.errstate(over="ignore"):  # e^-g of SiLU may be infinite
+            for layer, k, v in zip(self.layers, keys, values, strict=True):
+                qkv = row_product(layer.qkv.array, self.normed(row))
+                qk: np.ndarray = qkv[: 2 * width].view(np.complex64)
+                qk *= turn
+                q, k[:, stop - 1], v[:, stop - 1] = qkv.reshape(3, self.heads, channels)
+                weights = np.matmul(k[:, :stop], q[:, :, None])[:, :, 0]
+                weights *= scale
+                if unseen is not None:
+                    weights += unseen
+                weights -= weights.max(1, keepdims=True)
+                np.exp(weights, out=weights)
+                weights /= weights.sum(1, keepdims=True)
+                attended = np.matmul(weights[:, None], v[:, :stop])
+                row += row_product(layer.out.array, attended.reshape(width))
+                gate, up = row_product(layer.gate_up.array, self.normed(row)).reshape(2, -1)
+                gate /= np.exp(-gate) + np.float32(1)
+                gate *= up
+                row += row_product(layer.down.array, gate)
+        return torch.from_numpy(row)
+
+    def normed(self, row: np.ndarray) -> np.ndarray:
+        """row (E,) -> its RMSNorm without the gain and √E, as `RowNorm`."""
+        return row * (np.float32(1) / np.sqrt(np.dot(row, row) + self.width_eps))
 
 
 class PackedStage:
@@ -257,13 +302,13 @@ class PackedPrompt(Packed):
 
     def __init__(self, target: CompactTarget) -> None:
         centre, space = target.centre.double(), target.observation
-        felt, places = len(space.proprioception), len(space.places)
+        p, places = len(space.proprioception), len(space.places)
         self.encoders, self.words, self.size = target.encoders, target.word_embedding, target.settings.image_size
         self.tokens, self.places = target.settings.scene_tokens, places
-        self.hand = affine(lambda x: hand_features(x, centre), felt)
+        self.hand = affine(lambda x: hand_features(x, centre), p)
         bias, weight = affine(
-            lambda x: scene_features(x[:, :felt], x[:, felt:].unflatten(1, (places, 3)), centre, saturate=lambda v: v),
-            felt + 3 * places,
+            lambda x: scene_features(x[:, :p], x[:, p:].unflatten(1, (places, 3)), centre, saturate=lambda v: v),
+            p + 3 * places,
         )
         saturating = saturating_columns(space)
         order = [column for column in range(len(bias)) if column not in saturating] + saturating
@@ -277,11 +322,11 @@ class PackedPrompt(Packed):
 
     def __call__(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """One observation -> prompt embeddings (1, P, E) and positions of the places (1, K, 3), metres."""
-        words, felt = self.words(inputs.words), inputs.proprioception
-        hand = torch.addmm(self.hand[0], felt, self.hand[1])
+        words, proprioception = self.words(inputs.words), inputs.proprioception
+        hand = torch.addmm(self.hand[0], proprioception, self.hand[1])
         tokens, points = self.see(inputs.images)
         places = perceptron(torch.cat([*points, hand, words.mean(1)], -1), self.locate)
-        features = torch.addmm(self.lines[0], torch.cat([felt, places], -1), self.lines[1])
+        features = torch.addmm(self.lines[0], torch.cat([proprioception, places], -1), self.lines[1])
         features[:, self.straight :].tanh_()
         scene = perceptron(features, self.scene).view(1, self.tokens, -1)
         prompt = torch.cat([*tokens, words, scene, perceptron(hand, self.proprioception)[None]], 1)

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.compact.kernels import RowNorm, has_blocked_layouts, with_pairs
+from kerv_cli.targets.compact.kernels import RowNorm, gain_of, has_blocked_layouts, with_pairs
 from kerv_cli.targets.compact.trunk import Layer, PackedStack, Rotary
 
 ROWS = 32  # for which the layout is chosen; measured, 154 M weights: one row 27 ms, 31 rows 33 ms, 47 rows 41 ms
@@ -27,11 +27,6 @@ def multiplies_bfloat16() -> bool:
     """Whether this CPU has products of bfloat16, and this build of torch the layouts for them."""
     supported = torch.ops.mkldnn._is_mkldnn_bf16_supported() if has_blocked_layouts() else False
     return bool(supported) and (torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
-
-
-def full_gain(norm: nn.RMSNorm) -> Tensor:
-    """The factor (E,) that `RowNorm` leaves out, gain · √E, in float32."""
-    return norm.weight.float() * norm.weight.shape[0] ** 0.5
 
 
 class BlockedLinear:
@@ -50,12 +45,11 @@ class BlockedLayer:
     def __init__(self, layer: Layer) -> None:
         self.heads, self.channels = layer.heads, layer.channels
         self.width = layer.heads * layer.channels
-        self.scale = layer.channels**-0.5
         self.norm = RowNorm(layer.attention_norm)
-        qkv = layer.qkv.weight.float() * full_gain(layer.attention_norm)
+        qkv = layer.qkv.weight.float() * gain_of(layer.attention_norm)
         self.qkv = BlockedLinear(with_pairs(qkv, self.channels))
         self.out = BlockedLinear(layer.out.weight)
-        self.gate_up = BlockedLinear(layer.gate_up.weight.float() * full_gain(layer.feed_norm))
+        self.gate_up = BlockedLinear(layer.gate_up.weight.float() * gain_of(layer.feed_norm))
         self.down = BlockedLinear(layer.down.weight)
 
     def __call__(self, rows: Tensor, turn: Tensor, cache: Tensor | None, start: int, mask: Tensor | None) -> Tensor:
@@ -108,7 +102,7 @@ class BlockedLayers(PackedStack):
         half = rotary.cos.shape[-1] // 2
         self.turns = torch.complex(rotary.cos[:, :half].float(), rotary.sin[:, half:].float())[:, None]
         self.layers = [BlockedLayer(layer) for layer in layers]
-        self.rows, self.gain = RowNorm(norm), full_gain(norm)
+        self.rows, self.gain = RowNorm(norm), gain_of(norm)
 
     def __call__(self, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None) -> Tensor:
         """All layers: x (B, T, E) bfloat16 -> hidden states (B, T, E), before the norm."""

@@ -79,7 +79,7 @@ class CompactTarget(Packable):
         self.cameras = (camera,) if s.observation == "vision" else ()
         views = len(views_of(camera)) if self.cameras else 0
         self.segments, self.frame_shape = _segments(s, views), frame_shape(camera, s.image_size)
-        felt, places = len(observation.proprioception), len(observation.places)
+        p, places = len(observation.proprioception), len(observation.places)
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.embedding = nn.Embedding(actions.tokens, s.width)
         self.embedding.weight.data = _smooth_table(actions.tokens, s.width)
@@ -89,13 +89,13 @@ class CompactTarget(Packable):
         self.scene = nn.Sequential(
             nn.Linear(features, 2 * s.width), nn.SiLU(), nn.Linear(2 * s.width, s.scene_tokens * s.width)
         )
-        self.proprioception = nn.Sequential(nn.Linear(felt, s.width), nn.SiLU(), nn.Linear(s.width, s.width))
+        self.proprioception = nn.Sequential(nn.Linear(p, s.width), nn.SiLU(), nn.Linear(s.width, s.width))
         if s.observation == "vision":
             shapes = s.image_size, s.grid, s.keypoints, s.channels, s.width
             self.vision = VisionEncoder(*shapes)
             self.further_views = nn.ModuleList(VisionEncoder(*shapes) for _ in range(views - 1))
             self.locate = nn.Sequential(
-                nn.Linear(2 * s.keypoints * views + felt + s.width, 256),
+                nn.Linear(2 * s.keypoints * views + p + s.width, 256),
                 nn.SiLU(),
                 nn.Linear(256, 128),
                 nn.SiLU(),
@@ -146,15 +146,16 @@ class CompactTarget(Packable):
         Raises:
             CheckpointError: numbers or images of another size than the policy was trained on.
         """
-        felt, state = (
+        proprioception, state = (
             upload(np.asarray(x, dtype=np.float32), self.device)[None]
             for x in (observation.proprioception, observation.state)
         )
-        if felt.shape[1] != len(self.observation.proprioception) or state.shape[1] != self.observation.state:
+        given = proprioception.shape[1], state.shape[1]
+        sizes = len(self.observation.proprioception), self.observation.state
+        if given != sizes:
             raise CheckpointError(
-                f"the target takes {len(self.observation.proprioception)} numbers of proprioception and "
-                f"{self.observation.state} of state, the environment gives {felt.shape[1]} and {state.shape[1]}: "
-                "it was trained for another environment"
+                f"the target takes {sizes[0]} numbers of proprioception and {sizes[1]} of state, the environment gives "
+                f"{given[0]} and {given[1]}: it was trained for another environment"
             )
         images = None
         for camera in self.cameras:
@@ -167,7 +168,7 @@ class CompactTarget(Packable):
                 )
             images = upload(image, self.device).permute(2, 0, 1)[None]
         words = self.words.encode(observation.instruction, self.settings.instruction_tokens)
-        return Inputs(images, felt, state, upload([words], self.device))
+        return Inputs(images, proprioception, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
         """The prompt's embeddings (1, P, E); errors as `inputs`."""

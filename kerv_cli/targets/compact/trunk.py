@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate
+from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
 from kerv_cli.targets.compact.captured import CapturedCache
 from kerv_cli.targets.compact.packable import Packable, Packed, wants_gradient
 
@@ -70,7 +70,7 @@ class Layer(nn.Module):
         k = qk[:, :, self.heads :].transpose(1, 2)
         v = qkv[:, :, 2 * self.heads :].transpose(1, 2)
         if cache is not None and slots is not None:
-            k, v = slots.write(cache, k, v)
+            k, v = write(cache, slots, k, v)
         causal = mask is None and tokens > 1
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal)
         x = x + self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
@@ -133,9 +133,9 @@ class LayerStack(Packable):
         elif self.captures(x, cache):
             assert isinstance(cache, CapturedCache)
             assert mask is not None
-            x = cache.run(self, x, positions, mask)
+            x = cache.run(self.compute, x, positions, mask)
         else:
-            slots = Slots(cache, x.shape[1]) if cache is not None else None
+            slots = cache.next_slots(x.shape[1]) if cache is not None else None
             x = self.compute(x, positions, cache, slots, mask)
         if cache is not None:
             cache.length += x.shape[1]

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate
+from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, write
 from kerv_cli.targets.openvla.config import Language
 
 
@@ -52,7 +52,7 @@ class LlamaAttention(nn.Module):
         k = rotate(self.k_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2), *rotary)
         v = self.v_proj(x).view(batch, tokens, self.shared, -1).transpose(1, 2)
         if cache is not None and slots is not None:
-            k, v = slots.write(cache, k, v)
+            k, v = write(cache, slots, k, v)
         causal = mask is None and tokens > 1
         shared = self.shared != self.heads
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
@@ -112,7 +112,7 @@ def run_layers(
     `attention_mask`; mask: one that is given instead."""
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
     mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
-    slots = Slots(cache, x.shape[1]) if cache is not None else None
+    slots = cache.next_slots(x.shape[1]) if cache is not None else None
     for i, layer in enumerate(layers):
         x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
     if cache is not None:

@@ -8,8 +8,6 @@ Shapes: B batch, n patches, W width of a tower, E width of the language model.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -147,6 +145,6 @@ class Projector(nn.Module):
         self.fc2 = nn.Linear(4 * width, hidden)
         self.fc3 = nn.Linear(hidden, hidden)
 
-    def forward(self, patches: Tensor) -> Any:
+    def forward(self, patches: Tensor) -> Tensor:
         """See the class."""
         return self.fc3(F.gelu(self.fc2(F.gelu(self.fc1(patches)))))

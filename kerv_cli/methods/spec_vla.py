@@ -1,14 +1,26 @@
-"""Acceptance token by token: strict, and Spec-VLA's within its one radius (docs/methods.md §2.1)."""
+"""Acceptance token by token, strict or within Spec-VLA's one radius (docs/methods.md §2.1). Its drafter is `eagle`.
+Nothing heavy is imported here."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.limits import MOST_BINS, number
+from kerv_cli.base.registry import NoSettings, add
 from kerv_cli.engine.acceptance import Strict
 from kerv_cli.engine.parts import Fixed
-from kerv_cli.methods.context import Context
-from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.context import Context
+
+
+@dataclass
+class RelaxedAcceptanceSettings:
+    """Spec-VLA: a draft token within r bins of the target's is kept."""
+
+    kind: str = "relaxed"
+    strict_dofs: bool = True  # ours: the action space's strict DoFs must match; the paper has one r for all
 
 
 @dataclass(frozen=True)
@@ -28,8 +40,16 @@ class Relaxed(Strict):
 
 
 def strict(settings: NoSettings, context: Context) -> Strict:
-    """acceptance=strict."""
+    """acceptance=strict: a draft token must equal the target's, which is lossless."""
     return Strict(context.target.actions)
+
+
+@dataclass
+class FixedThresholdSettings:
+    """Spec-VLA: one radius."""
+
+    kind: str = "fixed"
+    r: int = number(9, 0, MOST_BINS)
 
 
 def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
@@ -40,3 +60,9 @@ def fixed(settings: FixedThresholdSettings, context: Context) -> Fixed:
     """
     context.check_radius("r", settings.r)
     return Fixed(settings.r)
+
+
+_FILE = "kerv_cli.methods.spec_vla:"
+add("acceptance", "strict", _FILE + "strict")
+add("acceptance", "relaxed", _FILE + "Relaxed.build", RelaxedAcceptanceSettings)
+add("threshold", "fixed", _FILE + "fixed", FixedThresholdSettings)

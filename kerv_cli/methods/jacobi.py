@@ -1,19 +1,31 @@
-"""Guesses all tokens of a chunk at once, up to a fixed point (docs/methods.md §6)."""
+"""Jacobi decoding, as in PD-VLA (docs/methods.md §6). Nothing heavy is imported here."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from torch import Tensor
+from kerv_cli.base.limits import MOST_TOKENS, number
+from kerv_cli.base.registry import STATES, add
+from kerv_cli.engine.proposer import ChainProposer
 
-from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.context import Context
-from kerv_cli.methods.jacobi import JacobiProposerSettings
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.methods.context import Context
 
 
-class JacobiProposer(Proposer):
+@dataclass
+class JacobiProposerSettings:
+    """PD-VLA: the parallel argmax of the guess before, over the rest of the chunk (§6)."""
+
+    kind: str = "jacobi"
+    depth: int = number(0, 0, MOST_TOKENS)  # tokens guessed at once; 0: all that are left
+
+
+class JacobiProposer(ChainProposer):
     """PD-VLA's parallel decoding: guess all tokens, take the parallel argmax as the next guess, up to its fixed point.
 
     With strict acceptance the fixed point is AR's chunk. The first guess is the target tokens that the in-prefill
@@ -36,11 +48,16 @@ class JacobiProposer(Proposer):
         tokens = chunk.rejection.target[: chunk.remaining]
         self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.remaining - len(tokens))]
 
-    def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """The present guess as a chain."""
-        return Draft.of(self.guess[: min(depth, self.depth or depth)])
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """The present guess."""
+        return [self.guess[: min(depth, self.depth or depth)]]
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """The next guess: this round's target tokens behind the committed ones, then the old guess."""
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
+
+
+# without the trait `chains`: its first guess is made behind the prefill
+_BUILD = "kerv_cli.methods.jacobi:JacobiProposer.build"
+add("proposer", "jacobi", _BUILD, JacobiProposerSettings, colour=0x8A7FD4, when=STATES)

@@ -1,0 +1,141 @@
+"""The scout: its network, its proposer and its files (docs/methods.md §5.1, ours).
+
+It reads the image, the hand and the instruction, and nothing that the target computes: so a chunk that is executed
+unverified costs no encoding of the target's, and what goes wrong in one view need not go wrong in the other. Behind its
+stem and its estimate of positions stands the early drafter's network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.registry import NoSettings
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.methods.artifacts import Weights, WeightsDescription
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
+from kerv_cli.methods.scout import ScoutSettings
+from kerv_cli.targets.compact.features import hand_features, scene_features, scene_width
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.vision import VisionEncoder
+
+
+class Scout(nn.Module):
+    """From one observation to the logits (N, V) of a chunk. Shapes: B batch, p proprioception, K places, W words."""
+
+    centre: Tensor
+
+    def __init__(
+        self,
+        settings: ScoutSettings,
+        actions: ActionSpace,
+        observation: ObservationSpace,
+        chunk: int,
+        views: int,
+        size: int,
+        words: int,
+    ) -> None:
+        """chunk: H. views, size: of the camera's frame, pixels. words: of the target's vocabulary."""
+        super().__init__()
+        s = self.settings = settings
+        self.observation, self.size = observation, size
+        self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
+        self.stems = nn.ModuleList(
+            VisionEncoder(size, s.grid, s.keypoints, s.channels, s.cell_width, single=True) for _ in range(views)
+        )
+        self.cells = nn.Linear(s.cell_width, s.cell_features)
+        self.words = nn.Embedding(words, s.word_width)
+        p, places = len(observation.proprioception), len(observation.places)
+        self.locate = nn.Sequential(
+            nn.Linear(2 * s.keypoints * views + p + s.word_width, 128),
+            nn.SiLU(),
+            nn.Linear(128, 64),
+            nn.SiLU(),
+            nn.Linear(64, 3 * places),
+        )
+        of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
+        self.drafter = EarlyDrafter(s, actions, chunk, of_views + s.word_width + scene_width(observation))
+
+    @classmethod
+    def beside(cls, settings: ScoutSettings, target: CompactTarget) -> Scout:
+        """A fresh scout for the target's spaces, H, camera and vocabulary."""
+        shape = len(target.encoders), target.settings.image_size, target.words.size
+        return cls(settings, target.actions, target.observation, target.chunk, *shape)
+
+    def see(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """What the drafter's network reads (B, F), and the estimated positions of the places (B, K, 3), metres."""
+        assert inputs.images is not None
+        proprioception, words = inputs.proprioception, self.words(inputs.words).mean(1)
+        views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
+        cells = [part for grid, _ in views for part in (grid.mean(1), self.cells(grid).flatten(1))]
+        points = [points for _, points in views]
+        located = self.locate(torch.cat([*points, hand_features(proprioception, self.centre), words], -1))
+        places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
+        scene = scene_features(proprioception, places, self.centre)
+        return torch.cat([*cells, words, scene], -1), places
+
+    def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """Observations -> logits (B, N, V), positions (B, K, 3)."""
+        features, places = self.see(inputs)
+        return self.drafter(features), places
+
+
+class ScoutProposer(EarlyProposer):
+    """The scout's chunk, drafted once per observation, without the target's encoder."""
+
+    name = "scout"
+
+    def __init__(self, scout: Scout, target: CompactTarget) -> None:
+        super().__init__(scout.drafter, target)
+        self.scout, self.inputs = scout, target.inputs
+
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> ScoutProposer:
+        """proposer=scout."""
+        return cls(context.artifact("scout"), context.target)
+
+    @torch.inference_mode()
+    def features(self, chunk: Chunk) -> Tensor:
+        """What the network reads of the chunk's observation, (1, F)."""
+        assert chunk.observation is not None
+        return self.scout.see(self.inputs(chunk.observation))[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoutDescription(WeightsDescription):
+    """A scout's JSON."""
+
+    settings: ScoutSettings
+
+
+class ScoutArtifact(Weights[ScoutDescription]):
+    """The scout's files."""
+
+    kind, noun = "scout", "scout"
+    command = ("train", "drafter", "drafter=scout")
+    schema = ScoutDescription
+
+    def module(self, description: ScoutDescription, target: ReadableTarget) -> Scout:
+        """A fresh scout, which looks through the target's camera.
+
+        Raises:
+            CheckpointError: as `check_sees`.
+        """
+        return Scout.beside(description.settings, check_sees(target))
+
+
+def check_sees(target: object) -> CompactTarget:
+    """The target, if it sees.
+
+    Raises:
+        CheckpointError: it is of another family, or is given the state.
+    """
+    if not isinstance(target, CompactTarget) or not target.cameras:
+        raise CheckpointError("a scout looks through the camera of a compact target that sees; this target has none")
+    return target

@@ -1,0 +1,83 @@
+"""Trust for as long as verification agrees (docs/methods.md §4.5, ours). Nothing heavy is imported here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from kerv_cli.base.limits import number
+from kerv_cli.base.registry import add
+from kerv_cli.engine.parts import Skip
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.proposer import ChainProposer
+    from kerv_cli.methods.context import Context
+
+TRUSTED, STREAK = "trusted", "streak"
+"""`DecodeRecord.reason`: executed unverified; verified because the verifications before do not allow more."""
+
+
+@dataclass
+class StreakSkipSettings:
+    """Verified chunks that agree with their draft allow 1, 2, 4, … unverified decodes (§4.5). The draft is the
+    in-prefill one, of `merged` its first source's."""
+
+    kind: str = "streak"
+    most: int = number(8, 1)  # decodes in a row without a verification
+    opening: int = number(0, 0)  # decodes that an episode begins with, unverified
+    tolerance: float = number(0.05, 0)  # mean abs difference that still agrees, normalised; 0: accepted whole
+
+
+class StreakSkip(Skip):
+    """A chunk whose draft agrees with the target's tokens allows one unverified decode before the next verification,
+    the next one in a row two, then four, up to `most`; a chunk that does not agree ends it. An episode begins with a
+    verification, or with `opening` unverified decodes."""
+
+    def __init__(self, settings: StreakSkipSettings, source: ChainProposer) -> None:
+        self.settings, self.source = settings, source
+        self.allowed = 0  # unverified decodes after the last verification
+        self.left = 0  # of these, how many are still to come
+        self.chain: tuple[int, ...] = ()  # the source's draft of this chunk
+
+    @classmethod
+    def build(cls, settings: StreakSkipSettings, context: Context) -> StreakSkip:
+        """skip=streak."""
+        draft = context.built["prefill_draft"]
+        return cls(settings, getattr(draft, "sources", [draft])[0])  # of a merged draft its first source
+
+    def begin(self, task: str, seed: int) -> None:
+        """An episode begins."""
+        self.allowed = self.left = self.settings.opening
+
+    def take(self, chunk: Chunk) -> bool:
+        """Fills the chunk with the source's draft while unverified decodes are left -> whether it did."""
+        chains = self.source.chains(chunk, chunk.size)
+        self.chain = tuple(chains[0]) if chains else ()
+        trusted = self.left > 0 and len(self.chain) == chunk.size
+        chunk.reason = TRUSTED if trusted else STREAK
+        if not trusted:
+            return False
+        self.left -= 1
+        chunk.skip(self.chain, self.source.name)
+        return True
+
+    def verified(self, chunk: Chunk) -> None:
+        """The prefill verified the chunk: allows twice as many unverified decodes, or none."""
+        self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
+        self.left = self.allowed
+
+    def _agrees(self, chunk: Chunk) -> bool:
+        """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's
+        tokens along it, strict DoFs equal."""
+        targets = chunk.targets_along(self.chain)
+        if targets is None:
+            return False
+        if chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted):
+            return True
+        tolerance = self.settings.tolerance
+        return tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance
+
+
+_BUILD = "kerv_cli.methods.streak:StreakSkip.build"
+add("skip", "streak", _BUILD, StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
