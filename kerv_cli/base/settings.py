@@ -34,9 +34,9 @@ def part(kind: str, name: str = "none", help: str = "") -> Any:
     return setting(chosen(kind, name), help, group=name)
 
 
-@dataclass
+@dataclass(unsafe_hash=True)  # worlds keep cameras by it; Hydra could not override a frozen one
 class CameraSettings:
-    """The policy's view: a camera of the environment."""
+    """The policy's view: a camera of the environment, or several side by side (`views.views_of`)."""
 
     name: str = setting("", "empty: the environment's first camera; joined names are several views side by side")
     fovy: float = number(45.0, above=0, most=179, help="vertical field of view, degrees")

@@ -14,6 +14,7 @@ from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError
 
@@ -106,8 +107,6 @@ class EncodedFrames:
             return np.stack(list(pool.map(self._decode, range(len(self)))))
 
     def _decode(self, i: int) -> NDArray[np.uint8]:
-        from PIL import Image
-
         path, start = self.sources[self.source[i]], int(self.start[i])
         try:
             with path.open("rb") as file:
@@ -131,8 +130,6 @@ def header_of(data: bytes) -> tuple[dict[str, Any], int]:
 
 def encode_png(frame: NDArray[np.uint8]) -> bytes:
     """frame (h, w, 3) uint8 -> PNG."""
-    from PIL import Image
-
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()

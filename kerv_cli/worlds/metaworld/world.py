@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.worlds.camera import CameraConfig, load_mujoco
+from kerv_cli.worlds.camera import load_mujoco
 from kerv_cli.worlds.metaworld.experts import OURS
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.world import MujocoWorld
@@ -49,9 +49,7 @@ class MetaWorld(MujocoWorld):
 
     stressable = MujocoWorld.stressable | {"range"}
 
-    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
-        super().__init__(spec, task, camera, horizon)
-        self._env: Any = None
+    _env: Any = None
 
     @property
     def initial_state(self) -> NDArray[np.float64]:

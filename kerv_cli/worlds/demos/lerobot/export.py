@@ -8,7 +8,6 @@ between them are left out and the rate is lower.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, visible, write_folder, write_json
 from kerv_cli.base.views import VIEWS
 from kerv_cli.worlds import instruction_of
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import encode_png
 from kerv_cli.worlds.demos.lerobot import layout
@@ -130,7 +129,7 @@ class Export:
         order = [*keys, *(name for name in arrays if name not in (*layout.COUNTERS, *keys)), *layout.COUNTERS]
         return pa.table({name: arrays[name] for name in order})
 
-    def write_data(self, progress: Callable[[int, int], None]) -> None:
+    def write_data(self, progress: OnProgress) -> None:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
@@ -195,7 +194,7 @@ class Export:
         write_json(self.folder / layout.INFO, self.info())
 
 
-def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], None]) -> Export:
+def export(dataset: DemoDataset, folder: Path, progress: OnProgress) -> Export:
     """Writes `dataset` as a LeRobot dataset to `folder`.
 
     Raises:

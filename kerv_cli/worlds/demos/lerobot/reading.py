@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
-from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
-from kerv_cli.worlds.demos.dataset import FORMAT, entry_of, episode_path, totals
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, limits_of
+from kerv_cli.worlds.demos.dataset import FORMAT, EpisodeEntry, OnProgress, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
 
@@ -106,7 +106,7 @@ class Source:
 
 
 def import_lerobot(
-    settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None] = lambda done, total: None
+    settings: DemosImportSettings, folder: Path, progress: OnProgress = lambda done, total: None
 ) -> dict[str, Any]:
     """Writes the dataset's episodes as demonstrations -> the manifest.
 
@@ -126,13 +126,11 @@ def import_lerobot(
         raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
 
 
-def _import(
-    source: Source, settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None]
-) -> dict[str, Any]:
+def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> dict[str, Any]:
     """Fills a new folder -> the manifest."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
-    entries: dict[str, list[dict[str, Any]]] = {}
+    entries: dict[str, list[EpisodeEntry]] = {}
     actions: list[np.ndarray] = []
     state = 0
     for done, row in enumerate(chosen):
@@ -178,7 +176,7 @@ def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], t
 def _manifest(
     source: Source,
     settings: DemosImportSettings,
-    entries: Mapping[str, list[dict[str, Any]]],
+    entries: Mapping[str, list[EpisodeEntry]],
     names: Mapping[int, str],
     actions: np.ndarray,
     state: int,
@@ -223,11 +221,8 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
     unknown = [name for name in strict if name not in names]
     if unknown:
         raise UnknownName("strict DoF", unknown[0], names)
-    low, high = actions.min(0).astype(float), actions.max(0).astype(float)
-    still = high - low < 1e-6
-    low, high = np.where(still, low - 1, low), np.where(still, high + 1, high)
-    rate = float(source.info["fps"])
-    return ActionSpace(names, _groups(names, strict), strict, rate, tuple(low.tolist()), tuple(high.tolist()))
+    low, high = limits_of(actions.min(0).astype(float), actions.max(0).astype(float))
+    return ActionSpace(names, _groups(names, strict), strict, float(source.info["fps"]), low, high)
 
 
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
