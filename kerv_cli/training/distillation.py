@@ -6,7 +6,7 @@ embeddings and tokens are what the drafter imitates, under the same causal mask 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -23,6 +23,7 @@ from kerv_cli.methods.spec_vla.rules import Relaxed
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.recorded import StatesByLength, TeacherStates, teach
 from kerv_cli.training.runs import DrafterRun
+from kerv_cli.worlds.demos.dataset import OnProgress
 
 
 class Distillation:
@@ -126,7 +127,7 @@ class EagleRun(DrafterRun):
                 f"drafter.noise={noise} is drawn for a whole batch: train with one process, or without noise"
             )
 
-    def lesson(self, progress: Callable[[int, int], None]) -> Distillation:
+    def lesson(self, progress: OnProgress) -> Distillation:
         """The target's states of training and validation."""
         settings, share = self.settings.drafter, self.settings.train.held_out
         states, held_out = teach(self.target, self.dataset, settings.samples, share, progress)

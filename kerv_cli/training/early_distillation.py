@@ -6,7 +6,7 @@ The history is what the demonstration *executed*, noise included.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -25,7 +25,7 @@ from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Rows, split
 from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
 from kerv_cli.training.runs import DrafterRun
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 RADII = {"strict": 0, "r3": 3, "r9": 9}
@@ -54,7 +54,7 @@ def teach_early(
     target: ReadableTarget,
     dataset: DemoDataset,
     settings: EarlySettings,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> EarlySamples:
     """The target's decodes of about `settings.samples` observations, spread evenly over all episodes.
 
@@ -177,7 +177,7 @@ class EarlyRun(DrafterRun):
     artifact = EarlyArtifact()
     before: ClassVar[Mapping[str, float]] = {"noise": 0.0, "unroll": 3, "state_weight": 1.0, "token_weight": 0.1}
 
-    def lesson(self, progress: Callable[[int, int], None]) -> EarlyDistillation:
+    def lesson(self, progress: OnProgress) -> EarlyDistillation:
         """The target's tokens and pooled prompts."""
         settings, train = self.settings.drafter, self.settings.train
         samples = teach_early(self.target, self.dataset, settings, progress)

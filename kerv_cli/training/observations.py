@@ -25,8 +25,7 @@ from kerv_cli.worlds.demos.frames import EncodedFrames
 
 @dataclass(frozen=True)
 class Rows:
-    """Base of dataclasses whose tensors have one row per sample. An optional tensor may be None, and frames may stay
-    encoded."""
+    """Base of dataclasses with one row per sample: of tensors, encoded frames, or None for frames that are not seen."""
 
     def __len__(self) -> int:
         return next(len(x) for x in vars(self).values() if x is not None)
@@ -52,7 +51,7 @@ def _joined(column: Sequence[Any]) -> Any:
 class Observations(Rows):
     """n observations, in the order of episodes and control steps."""
 
-    frames: Tensor | EncodedFrames | None  # (n, size, size x views, 3) uint8; None for a state policy
+    frames: EncodedFrames | None  # (n, size, size x views, 3) uint8; None for a state policy
     proprioception: Tensor  # (n, p) float32
     states: Tensor  # (n, s) float32, privileged
     words: Tensor  # (n, L) int64
@@ -62,9 +61,7 @@ class Observations(Rows):
         """The observations at `indices` (B,) as a batch on `device`."""
         images = None
         if self.frames is not None:
-            chosen = self.frames[indices]
-            pixels = torch.from_numpy(chosen.pixels()) if isinstance(chosen, EncodedFrames) else chosen
-            images = pixels.to(device).permute(0, 3, 1, 2)
+            images = torch.from_numpy(self.frames[indices].pixels()).to(device).permute(0, 3, 1, 2)
         return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
@@ -75,7 +72,7 @@ def read_observations(
     words: WordTokenizer,
     chosen: slice | np.ndarray = slice(None),
 ) -> Observations:
-    """The observations of an episode that a policy of these settings learns from: those with a frame, for a state
+    """The observations of a stored episode that a policy of these settings learns from: those with a frame, for a state
     policy every step. chosen: which of them, default all.
 
     Raises:
@@ -85,8 +82,8 @@ def read_observations(
     steps = (episode.frame_steps if sees else np.arange(episode.steps))[chosen]
     if sees:
         check_frames(episode, settings.image_size)
-        pictures = episode.frames[chosen]
-        frames = pictures if isinstance(pictures, EncodedFrames) else torch.from_numpy(pictures)
+        assert isinstance(episode.frames, EncodedFrames)
+        frames = episode.frames[chosen]
     states = torch.from_numpy(episode.states[steps]).float()
     ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
     proprioception = states[:, : len(space.proprioception)]
@@ -145,7 +142,7 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
 
 
-def check_shown(dataset: DemoDataset, description: TargetDescription) -> None:
+def check_demonstrations(dataset: DemoDataset, description: TargetDescription) -> None:
     """Refuses demonstrations of another environment than a target's, or, for a compact one that sees, of other views.
 
     Raises:
@@ -169,20 +166,24 @@ def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> No
         raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
 
 
+def held_out_every(episodes: int, share: float) -> int:
+    """k, of so many episodes of which every k-th is held out. share: above 0, at most 0.5.
+
+    Raises:
+        CheckpointError: a single episode.
+    """
+    if episodes < 2:
+        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
+    return min(max(2, round(1 / share)), episodes)
+
+
 S = TypeVar("S", bound=Rows)
 
 
 def split(samples: S, share: float) -> tuple[S, S]:
     """(training, held out) by whole episodes, of samples with a tensor `episodes`. Every k-th episode is held out, so
-    that each task, plain and perturbed, is in both parts. share: above 0, at most 0.5.
-
-    Raises:
-        CheckpointError: a single episode.
-    """
+    that each task, plain and perturbed, is in both parts. share and errors: as `held_out_every`."""
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
-    count = int(episodes.max()) + 1
-    if count < 2:
-        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    every = min(max(2, round(1 / share)), count)
+    every = held_out_every(int(episodes.max()) + 1, share)
     held_out = episodes % every == every - 1
     return samples.where(~held_out), samples.where(held_out)

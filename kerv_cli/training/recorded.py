@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.protocol import EncodesMany, Target
-from kerv_cli.training.observations import Rows, check_frames
+from kerv_cli.training.observations import Rows, check_frames, held_out_every
 from kerv_cli.worlds import instruction_of
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 64
@@ -110,22 +110,17 @@ class StatesByLength:
 
 @torch.inference_mode()
 def teach(
-    target: Target, dataset: DemoDataset, limit: int, held_out: float, on_progress: Callable[[int, int], None]
+    target: Target, dataset: DemoDataset, limit: int, held_out: float, on_progress: OnProgress
 ) -> tuple[StatesByLength, StatesByLength]:
     """The target's greedy decodes of at most `limit` observations, evenly spread -> (training, held out) by whole
     episodes, as `observations.split` divides them.
 
     Raises:
-        UsageError: a share out of range. CheckpointError: a single episode, or a damaged one.
+        CheckpointError: a single episode, or a damaged one.
     """
-    count = len(dataset.episodes)
-    if count < 2:
-        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    if not 0 < held_out <= 0.5:
-        raise UsageError(f"train.held_out={held_out}: more than 0, at most 0.5")
-    every = min(max(2, round(1 / held_out)), count)
+    every = held_out_every(len(dataset.episodes), held_out)
     sides: tuple[list[tuple[int, int]], ...] = ([], [])
-    for index in range(count):
+    for index in range(len(dataset.episodes)):
         sides[index % every == every - 1].extend((index, int(t)) for t in steps_of(target, dataset.load(index)))
     states = _decodes(target, dataset, sides[0], limit, on_progress)
     return states, _decodes(target, dataset, sides[1], max(60, limit // 50), lambda done, total: None)
@@ -136,7 +131,7 @@ def _decodes(
     dataset: DemoDataset,
     rows: Sequence[tuple[int, int]],
     limit: int,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> StatesByLength:
     """The decodes of at most `limit` of the rows, (episode, control step), evenly spread."""
     chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]

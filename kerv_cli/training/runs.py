@@ -35,12 +35,11 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Lesson, Loop, Metrics
-from kerv_cli.training.observations import check_camera, check_shown, check_spaces
+from kerv_cli.training.observations import check_camera, check_demonstrations, check_spaces
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
-Progress = Callable[[int, int], None]
 RANGED = 200
 """Episodes from which the range of states is taken."""
 
@@ -187,9 +186,8 @@ class TargetRun(Run):
             + (f", beginning with {self.init}" if self.init else "")
         )
 
-    def load(self, progress: Progress) -> None:
-        """Reads the demonstrations and the weights of `train.init` into memory, and makes the target; progress(done,
-        total).
+    def load(self, progress: OnProgress) -> None:
+        """Reads the demonstrations and the weights of `train.init` into memory, and makes the target.
 
         Raises:
             CheckpointError: one of them is damaged or of another environment.
@@ -266,14 +264,14 @@ class DrafterRun(Run):
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task, settings.starts)
         description = read_target(self.target_folder)
-        check_shown(self.dataset, description)
+        check_demonstrations(self.dataset, description)
         description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
 
     @abstractmethod
-    def lesson(self, progress: Progress) -> Lesson:
-        """Reads the demonstrations through `target`: a fresh module and what it learns; progress(done, total)."""
+    def lesson(self, progress: OnProgress) -> Lesson:
+        """Reads the demonstrations through `target`: a fresh module and what it learns."""
 
     def summary(self) -> str:
         """What is trained and on what, for --plan."""
@@ -285,8 +283,8 @@ class DrafterRun(Run):
         train = self.settings.train
         return f"{self.folder}: {self.summary()}, {train.steps} steps of {train.batch}"
 
-    def load(self, progress: Progress) -> None:
-        """Loads the target and reads the demonstrations; progress(done, total).
+    def load(self, progress: OnProgress) -> None:
+        """Loads the target and reads the demonstrations.
 
         Raises:
             CheckpointError: target or demonstrations are damaged. UsageError: as `begin`.

@@ -6,7 +6,7 @@ entry's own, the expert's next actions. The neighbour's chunk would have been ex
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.methods.calibration import NEVER, SkipLevel, SkipSection
+from kerv_cli.worlds.demos.dataset import OnProgress
 
 if TYPE_CHECKING:
     from kerv_cli.methods.heisd.datastore import Datastore
@@ -112,7 +113,7 @@ def skip_section(
     tasks: Sequence[str],
     epsilon: float,
     confidence: float,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> SkipSection | None:
     """The calibration's section `skip`: levels of those `tasks` that the datastore holds, and its hash. None where it
     holds none of them."""
