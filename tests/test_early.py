@@ -42,8 +42,7 @@ from kerv_cli.training.early_distillation import (
     teach_early,
 )
 from kerv_cli.training.imitation import load_samples
-from kerv_cli.training.observations import split
-from kerv_cli.training.recorded import observations_of
+from kerv_cli.training.observations import observations_of, split
 from kerv_cli.training.runs import drafter_run
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode

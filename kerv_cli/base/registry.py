@@ -24,7 +24,7 @@ from kerv_cli.base.limits import check_settings
 
 PLUGINS = "KERV_PLUGINS"
 
-OWN = (
+MODULES = (
     "kerv_cli.worlds.registration",
     "kerv_cli.targets.registration",
     "kerv_cli.methods.ar",
@@ -241,10 +241,10 @@ def load_plugins() -> None:
     Raises:
         UsageError: a plugin that cannot be imported.
     """
-    for name in OWN:
+    for name in MODULES:
         importlib.import_module(name)
-    named = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
-    for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *named]:
+    files = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
+    for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *files]:
         try:
             importlib.import_module(name)
         except ImportError as error:

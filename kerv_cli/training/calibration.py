@@ -14,8 +14,8 @@ import numpy as np
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
-from kerv_cli.base.provenance import provenance
-from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
+from kerv_cli.base.provenance import provenance_of
+from kerv_cli.base.settings import CalibrateSettings, RolloutSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -30,7 +30,7 @@ from kerv_cli.methods.calibration import (
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.observations import check_demonstrations
+from kerv_cli.training.observations import observations_of
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
@@ -38,7 +38,6 @@ from kerv_cli.training.predictor_fit import (
     prediction_errors,
     read_windows,
 )
-from kerv_cli.training.recorded import observations_of
 from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
@@ -98,7 +97,6 @@ class CalibrationRun:
         self.path = self.artifacts.path("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
-        check_demonstrations(self.dataset, self.description)
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
         self.datastore = self.artifacts.path("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()
@@ -195,11 +193,7 @@ class CalibrationRun:
         assert self.windows is not None
         space, chunk = self.description.actions, self.description.chunk
         noise = fit_filters(self.windows, self.settings.fit_steps or chunk, space.is_strict)
-        origin = {
-            "command": "kerv calibrate",
-            "settings": as_plain(self.settings),
-            **provenance(self.settings.runtime.device),
-        }
+        provenance = provenance_of("kerv calibrate", self.settings, self.settings.runtime.device)
         sections, earlier = self._fill_empty({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
             target=MadeFor.of(self.description),
@@ -208,7 +202,7 @@ class CalibrationRun:
             noise=noise,
             errors=prediction_errors(self.windows, noise, space),
             **sections,
-            provenance={**origin, "kept": earlier} if earlier else origin,
+            provenance={**provenance, "kept": earlier} if earlier else provenance,
         )
         write_json(self.path, asdict(calibration))
         return calibration

@@ -17,7 +17,7 @@ import torch
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
 from kerv_cli.base.places import artifact
-from kerv_cli.base.provenance import provenance
+from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDatastoreSettings
 from kerv_cli.base.spaces import ObservationSpace
@@ -36,8 +36,7 @@ from kerv_cli.methods.heisd.datastore import (
 )
 from kerv_cli.training.demonstrations import demos_for, subset
 from kerv_cli.training.imitation import WITHIN
-from kerv_cli.training.observations import check_demonstrations, read_chunks
-from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
+from kerv_cli.training.observations import observations_of, prompts_of, read_chunks, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import OnProgress
@@ -68,7 +67,7 @@ def entries_of(
     Raises:
         CheckpointError: too few labels, or frames of another size than the target takes.
     """
-    steps = steps_of(target, episode)[::stride]
+    steps = steps_of(episode, bool(target.cameras))[::stride]
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
     observations = observations_of(target, episode, steps, space)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
@@ -107,8 +106,6 @@ class DatastoreBuild:
         self.folder = self.artifacts.path("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
-        description = self.artifacts.description
-        check_demonstrations(self.dataset, description)
         entries = self.dataset.episodes  # of every task the first ones by seed
         by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)
         most = settings.episodes or None
@@ -186,7 +183,6 @@ class DatastoreBuild:
                 np.save(buffer, content)
             (folder / name).write_bytes(buffer.getbuffer())
         target = self.artifacts.description
-        origin = {"command": "kerv build datastore", "settings": asdict(self.settings), **provenance(self.device)}
         manifest = Manifest(
             format=2,
             kind="datastore",
@@ -199,7 +195,7 @@ class DatastoreBuild:
             demos=self.dataset.sha256,
             files={name: sha256_of(folder / name) for name in files},
             tasks=shards,
-            provenance=origin,
+            provenance=provenance_of("kerv build datastore", self.settings, self.device),
         )
         write_json(folder / "manifest.json", asdict(manifest))
 

@@ -22,8 +22,7 @@ from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose, padded
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Rows, split
-from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
+from kerv_cli.training.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.training.runs import DrafterRun
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -66,7 +65,7 @@ def teach_early(
     def observations() -> Iterator[Observation]:
         for index in range(len(dataset.episodes)):
             episode = dataset.load(index)
-            steps = evenly(steps_of(target, episode), share)
+            steps = evenly(steps_of(episode, bool(target.cameras)), share)
             columns.append(columns_of(target, episode, index, steps, settings.history))
             yield from observations_of(target, episode, steps, dataset.manifest.observation)
             on_progress(index + 1, len(dataset.episodes))

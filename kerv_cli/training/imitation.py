@@ -206,10 +206,10 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
         UsageError: the first shape that differs.
     """
     for name, value in asdict(settings).items():
-        there = description.settings.get(name)
-        if name not in ("size", "chunk", "parallel") and there != value:
+        stored = description.settings.get(name)
+        if name not in ("size", "chunk", "parallel") and stored != value:
             raise UsageError(
-                f"train.init: the target in {folder} has {name}={there}, the run target.{name}={value}: set both alike"
+                f"train.init: the target in {folder} has {name}={stored}, the run target.{name}={value}: set both alike"
             )
     trained = description.cameras[0] if description.cameras else ""
     if settings.observation == "vision" and not f"{camera}+".startswith(f"{trained}+"):

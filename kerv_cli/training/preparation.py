@@ -100,8 +100,8 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         return MISSING
     try:
         described = files.checked(path, artifacts.description)
-        made = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
-        artifacts.check(made[: made.index(kind) + 1])
+        present = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
+        artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
         if isinstance(files, Weights):
             name = f"{kind}/{path.name}"

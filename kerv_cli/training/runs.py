@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import artifact, find_target
-from kerv_cli.base.provenance import provenance
+from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
@@ -24,7 +24,14 @@ from kerv_cli.methods.artifacts import MadeFor, Weights
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.demonstrations import demos_for, name_of, open_demos, subset
+from kerv_cli.training.demonstrations import (
+    check_camera,
+    check_spaces,
+    demos_for,
+    name_of,
+    open_demos,
+    subset,
+)
 from kerv_cli.training.imitation import (
     Imitation,
     check_init,
@@ -35,7 +42,6 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Lesson, Loop, Metrics
-from kerv_cli.training.observations import check_camera, check_demonstrations, check_spaces
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -102,15 +108,12 @@ class Run(ABC):
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Writes the weights with their provenance; metrics: of their validation."""
-        origin = {
-            "command": f"kerv train {self.kind}",
-            "settings": asdict(self.settings),
+        figures = {
             "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
-            **provenance(self.device),
         }
-        self.write(module, origin)
+        self.write(module, provenance_of(f"kerv train {self.kind}", self.settings, self.device, **figures))
 
 
 def freeze(target: CompactTarget, names: list[str]) -> None:
@@ -263,9 +266,7 @@ class DrafterRun(Run):
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task, settings.starts)
-        description = read_target(self.target_folder)
-        check_demonstrations(self.dataset, description)
-        description.check_autoregressive(
+        read_target(self.target_folder).check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
 

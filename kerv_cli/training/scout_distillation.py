@@ -21,8 +21,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.early_distillation import Decodes, EarlyDistillation, columns_of, evenly, share_of
 from kerv_cli.training.imitation import position_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Observations, read_observations, split
-from kerv_cli.training.recorded import BATCH
+from kerv_cli.training.observations import BATCH, Observations, read_observations, split
 from kerv_cli.training.runs import DrafterRun
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 

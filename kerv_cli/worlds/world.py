@@ -134,11 +134,11 @@ class EpisodeWorld(ABC):
         Frames for recordings have their own delayed images."""
         views = views_of(config.name)
         images = {
-            view.shown: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
+            view.name: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
         }
         if observed:
             images = {camera: self.stress.see(camera, image, self.steps) for camera, image in images.items()}
-        parts = [self._at((config, view, observed), images[view.shown]) for view in views]
+        parts = [self._at((config, view, observed), images[view.name]) for view in views]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def _at(self, key: tuple[CameraSettings, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -34,10 +34,10 @@ class Moments:
     """Running statistics of one feature: min, max, mean, standard deviation, count."""
 
     shape: tuple[int, ...] = ()
-    low: Any = np.inf
-    high: Any = -np.inf
-    total: Any = 0.0
-    squares: Any = 0.0
+    low: np.ndarray | float = np.inf
+    high: np.ndarray | float = -np.inf
+    total: np.ndarray | float = 0.0
+    squares: np.ndarray | float = 0.0
     count: int = 0
 
     def add(self, values: np.ndarray) -> None:

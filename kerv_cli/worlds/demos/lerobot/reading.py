@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +24,9 @@ from kerv_cli.worlds.demos.dataset import FORMAT, EpisodeEntry, OnProgress, entr
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
 
+Row: TypeAlias = Mapping[str, Any]
+"""A row of a table, or an object of a JSON file."""
+
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
 
@@ -32,8 +35,8 @@ class Source:
     """A LeRobot folder. info: meta/info.json; episodes: rows of meta/episodes; tasks: instruction by task_index."""
 
     folder: Path
-    info: Mapping[str, Any]
-    episodes: Sequence[Mapping[str, Any]]
+    info: Row
+    episodes: Sequence[Row]
     tasks: Mapping[int, str]
     camera: str
 
@@ -61,8 +64,8 @@ class Source:
         ]
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
-        named = _table(folder / layout.TASKS).to_pylist()
-        tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in named}
+        names = _table(folder / layout.TASKS).to_pylist()
+        tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in names}
         return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
 
     @property
@@ -83,12 +86,12 @@ class Source:
             return [f"{prefix}_{i}" for i in range(count)]
         return [str(name) for name in names]
 
-    def path(self, episode: Mapping[str, Any], columns: str, form: str) -> Path:
+    def path(self, episode: Row, columns: str, form: str) -> Path:
         """The file of an episode, whose chunk and number stand in the columns that begin with `columns`."""
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
 
-    def table(self, episode: Mapping[str, Any]) -> pa.Table:
+    def table(self, episode: Row) -> pa.Table:
         """The rows of one episode, in order."""
         path = self.path(episode, "data", self.info.get("data_path") or layout.DATA)
         table = _table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
@@ -96,7 +99,7 @@ class Source:
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
 
-    def frames(self, episode: Mapping[str, Any], table: pa.Table) -> np.ndarray:
+    def frames(self, episode: Row, table: pa.Table) -> np.ndarray:
         """(T, h, w, 3) uint8 of one episode."""
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
@@ -147,7 +150,7 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     return manifest
 
 
-def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], tail: int) -> DemoEpisode:
+def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> DemoEpisode:
     table = source.table(row)
     number = int(row["episode_index"])
     columns = {
@@ -260,7 +263,7 @@ def _table(path: Path, **options: Any) -> pa.Table:
         raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
 
 
-def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
+def _picture(cell: Row, folder: Path) -> np.ndarray:
     data = cell.get("bytes")
     try:
         with Image.open(io.BytesIO(data) if data else regular(folder / str(cell.get("path")))) as image:
