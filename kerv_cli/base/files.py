@@ -85,7 +85,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
     is discarded. When `fill` raises, everything stays as it was.
 
     Raises:
-        StorageError: as `atomic_path`.
+        StorageError: the disk is full or read-only, or the folder may not be written to.
     """
     temporary = temporary_beside(folder)
     try:
@@ -171,7 +171,7 @@ def write_json(path: Path, value: Any) -> None:
     """Writes `value` as indented JSON, atomically; refuses NaN and infinity, which JSON lacks.
 
     Raises:
-        StorageError: as in `atomic_path`. ValueError: NaN or infinity.
+        StorageError: the disk is full or read-only, or the folder may not be written to. ValueError: NaN or infinity.
     """
     text = json.dumps(value, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:

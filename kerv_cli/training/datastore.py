@@ -43,6 +43,7 @@ from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 128  # observations encoded at once
+TESTED = 200  # entries per task
 KEYS = ("vision", "scene", "proprioception")
 """Parts of the prompt that can be part of a key. The instruction is none: it is the same for all entries of a task."""
 
@@ -134,7 +135,8 @@ class DatastoreBuild:
         """Writes the datastore atomically, replacing an older one.
 
         Raises:
-            CheckpointError: as `entries_of`. StorageError: writing failed.
+            CheckpointError: too few labels, or frames of another size than the target takes.
+            StorageError: writing failed.
         """
         target: Any = self.artifacts.target
         space = self.dataset.manifest.observation
@@ -200,13 +202,13 @@ class DatastoreBuild:
         write_json(folder / "manifest.json", asdict(manifest))
 
 
-def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
-    """How well the nearest neighbours in other episodes predict the chunks of `per_task` entries of each task: shares
+def leave_one_out(store: Datastore) -> dict[str, float]:
+    """How well the nearest neighbours in other episodes predict the chunks of TESTED entries of each task: shares
     of equal tokens and of those within WITHIN bins, the median similarity, and the median time of a search for five
     neighbours in ms. Empty where no task has two episodes."""
     gaps, similarities, seconds = [], [], []
     for name in store.shards:
-        rows, similarity, chunks = neighbours_elsewhere(store, name, per_task)
+        rows, similarity, chunks = neighbours_elsewhere(store, name, TESTED)
         gaps.append(np.abs(chunks - store.tokens[rows]))
         similarities.append(similarity)
         for row in rows:

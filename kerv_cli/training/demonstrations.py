@@ -115,7 +115,7 @@ def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> No
         raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
 
 
-def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> DemoDataset:
+def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str) -> DemoDataset:
     """The dataset with only the episodes of `tasks` (tasks and suites; none: all), and with starts=half only those that
     begin on one side.
 

@@ -171,7 +171,7 @@ def measure(logits: Tensor, samples: Decodes, strict: Tensor) -> Metrics:
 
 
 class EarlyRun(DrafterRun):
-    """`kerv train drafter drafter=early`; errors as `DrafterRun`."""
+    """`kerv train drafter drafter=early`."""
 
     artifact = EarlyArtifact()
     before: ClassVar[Mapping[str, float]] = {"noise": 0.0, "unroll": 3, "state_weight": 1.0, "token_weight": 0.1}

@@ -70,7 +70,7 @@ class RunProgress:
 class Loop:
     """Optimises a lesson's module. save: writes the best weights, which have these metrics. folder: holds
     `resume.safetensors` and `log.csv`. identity: hash of everything that determines the run; another run is never
-    resumed. ranks: the rank of this process among those that train together. borders: as in `draw_samples`."""
+    resumed. ranks: the rank of this process among those that train together. borders: of `draw_samples`."""
 
     def __init__(
         self,

@@ -190,7 +190,12 @@ S = TypeVar("S", bound=Rows)
 
 def split(samples: S, share: float) -> tuple[S, S]:
     """(training, held out) by whole episodes, of samples with a tensor `episodes`. Every k-th episode is held out, so
-    that each task, plain and perturbed, is in both parts. share and errors: as `held_out_every`."""
+    that each task, plain and perturbed, is in both parts. share: above 0, at most
+    0.5.
+
+    Raises:
+        CheckpointError: a single episode.
+    """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
     every = held_out_every(int(episodes.max()) + 1, share)
     held_out = episodes % every == every - 1

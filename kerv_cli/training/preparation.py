@@ -90,7 +90,7 @@ def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[st
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
-    """See `Step.state`.
+    """Whether the artifact is there, missing, half trained or of other artifacts.
 
     Raises:
         CheckpointError: a trained one is of another target.

@@ -62,7 +62,7 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
 
 class Run(ABC):
     """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
-    `plan` says in one line what would be done. borders: as in `draw_samples`. losses: of every step, once trained."""
+    `plan` says in one line what would be done. borders: of `draw_samples`. losses: of every step, once trained."""
 
     kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
@@ -224,7 +224,7 @@ class TargetRun(Run):
         return success_of(target, self.tasks, seeds, self.world)
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
-        """See `Run.write`."""
+        """Writes the target's folder."""
         assert isinstance(module, CompactTarget)
         environment = self.dataset.manifest.environment
         stored, states = self.settings.train.stored, self.state_range
@@ -232,7 +232,8 @@ class TargetRun(Run):
 
     @functools.cached_property
     def state_range(self) -> list[list[float]]:
-        """See `TargetDescription`; of at most RANGED episodes, evenly chosen."""
+        """[low, high], each (s,): percentiles 0.1 and 99.9 of every number of the state, over at most RANGED episodes,
+        evenly chosen."""
         count = len(self.dataset.episodes)
         chosen = range(0, count, -(-count // RANGED))
         states = np.concatenate([self.dataset.load(index).states for index in chosen])
@@ -288,7 +289,8 @@ class DrafterRun(Run):
         """Loads the target and reads the demonstrations.
 
         Raises:
-            CheckpointError: target or demonstrations are damaged. UsageError: as `begin`.
+            CheckpointError: target or demonstrations are damaged.
+            UsageError: no such device, or a batch that cannot be divided.
         """
         self.begin()
         self.target, self.description = load_target(self.target_folder, self.device)
@@ -302,7 +304,7 @@ class DrafterRun(Run):
         return {"drafter": {**self.before, **asdict(s.drafter)}, "target": self.description.sha256, **covering}
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
-        """See `Run.write`."""
+        """Writes the drafter's folder."""
         made_for, stored = MadeFor.of(self.description), self.settings.train.stored
         self.artifact.save(self.folder, module, made_for, origin, stored, settings=asdict(self.settings.drafter))
 

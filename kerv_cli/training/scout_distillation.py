@@ -90,7 +90,7 @@ class ScoutDistillation(EarlyDistillation):
 
 
 class ScoutRun(DrafterRun):
-    """`kerv train drafter drafter=scout`; errors as `DrafterRun`, and a target that does not see."""
+    """`kerv train drafter drafter=scout`, for a target that sees."""
 
     artifact = ScoutArtifact()
 

@@ -114,7 +114,7 @@ def load_mujoco() -> None:
 class Camera:
     """Draws one view of one model. Drawing reads the physics and never changes it."""
 
-    def __init__(self, model: mujoco.MjModel, config: CameraSettings, upside_down: bool = False) -> None:
+    def __init__(self, model: mujoco.MjModel, config: CameraSettings, upside_down: bool) -> None:
         """Opens an offscreen context for `model`. upside_down: the view's raw images are rotated by 180 degrees.
 
         Raises:

@@ -199,11 +199,11 @@ class EnvironmentSpec:
         full = self.full_name(name)
         return suite or ((full,) if full else ())
 
-    def camera_name(self, name: str = "") -> str:
+    def camera_name(self, name: str) -> str:
         """`name`, or the environment's first camera where it is empty. Several views are joined, see `views_of`.
 
         Raises:
-            UnknownName: the environment has no such camera. UsageError: as `views_of`.
+            UnknownName: the environment has no such camera. UsageError: an impossible view.
         """
         for view in views_of(name) if name else ():
             if view.camera not in self.cameras:
@@ -211,13 +211,16 @@ class EnvironmentSpec:
         return name or self.cameras[0]
 
     def camera(self, settings: CameraSettings | None = None) -> CameraSettings:
-        """A copy of the settings with the name of `camera_name`; errors as there, and UsageError: a number out of
-        range."""
+        """A copy of the settings with the name of a camera of this environment, by default its first.
+
+        Raises:
+            UnknownName: the environment has no such camera. UsageError: an impossible view, or a number out of range.
+        """
         settings = settings or CameraSettings()
         check_settings(settings, "camera")
         return replace(settings, name=self.camera_name(settings.name))
 
-    def control_steps(self, horizon: int = 0) -> int:
+    def control_steps(self, horizon: int) -> int:
         """Control steps of an episode; 0: the environment's own horizon.
 
         Raises:

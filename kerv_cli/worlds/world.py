@@ -31,7 +31,8 @@ class EpisodeWorld(ABC):
     def __init__(
         self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
     ) -> None:
-        """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
+        """Checks names and numbers only. camera: None for the environment's first. horizon: control steps of
+        an episode; 0: the environment's.
 
         Raises:
             UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
@@ -97,7 +98,12 @@ class EpisodeWorld(ABC):
         return self._observe_state(state)
 
     def step(self, action: ArrayLike) -> Observation:
-        """Executes one control step of an action (D,), changed by the stress; errors as `World.step`."""
+        """Executes one control step of an action (D,) in environment units, which is clipped to the limits and changed
+        by the stress.
+
+        Raises:
+            KervError: past the horizon, before the first reset, or an action that is not D finite numbers.
+        """
         executed = np.asarray(action, dtype=np.float64)
         space = self.spec.actions
         if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
@@ -119,7 +125,12 @@ class EpisodeWorld(ABC):
         return self._observation
 
     def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
-        """A frame of the current state for a recording, without stress; shape and errors as `World.frame`."""
+        """(size, size x views, 3) uint8 RGB of the current state for a recording, without the stress of images.
+        camera: None for the world's own.
+
+        Raises:
+            RenderingUnavailable: nothing can be drawn here.
+        """
         self.observation  # noqa: B018 - raises before the first reset
         return self._picture(self.camera if camera is None else self.spec.camera(camera), observed=False)
 

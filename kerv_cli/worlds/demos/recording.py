@@ -131,18 +131,18 @@ class NoisyExpert:
         self.perturb: Perturbation | None = None
 
     def reset(self, world: World, seed: int) -> None:
-        """See `Actor.reset`."""
+        """Begins an episode: draws its noise, or none."""
         config, noise = self.config, (self.config.noise_low, self.config.noise_high)
         noisy = is_perturbed(seed, config.perturbed)
         arguments = (world.task, seed, world.spec.actions, noise, config.burst_probability)
         self.perturb = Perturbation(*arguments) if noisy else None
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Actor.act`."""
+        """The expert's action, with noise in a perturbed episode."""
         return self.perturb(label) if self.perturb else label
 
 
-def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None = None) -> DemoEpisode | None:
+def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
     """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
     late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
     expert = world.spec.expert(world.task)

@@ -108,9 +108,7 @@ class Source:
         return np.stack(list(_video_frames(path, start, rate, len(table))))
 
 
-def import_lerobot(
-    settings: DemosImportSettings, folder: Path, progress: OnProgress = lambda done, total: None
-) -> dict[str, Any]:
+def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> dict[str, Any]:
     """Writes the dataset's episodes as demonstrations -> the manifest.
 
     Raises:
