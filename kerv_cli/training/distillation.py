@@ -31,9 +31,6 @@ from kerv_cli.training.observations import Rows, held_out_every, observations_of
 from kerv_cli.training.runs import DrafterRun
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
-VALIDATED = 60
-"""Least number of held-out observations, and the number of those that a validation decodes."""
-
 
 @dataclass(frozen=True)
 class TeacherStates(Rows):
@@ -89,7 +86,7 @@ def teach(
         steps = steps_of(dataset.load(index), bool(target.cameras))
         sides[index % every == every - 1].extend((index, int(t)) for t in steps)
     states = _decodes(target, dataset, sides[0], limit, on_progress)
-    return states, _decodes(target, dataset, sides[1], max(VALIDATED, limit // 50), lambda done, total: None)
+    return states, _decodes(target, dataset, sides[1], max(60, limit // 50), lambda done, total: None)
 
 
 def _decodes(
@@ -184,10 +181,10 @@ class Distillation:
         return F.smooth_l1_loss(guess, truth), cross_entropy
 
     @torch.no_grad()
-    def validate(self, module: nn.Module) -> Metrics:
+    def validate(self, module: nn.Module, observations: int = 60) -> Metrics:
         """Real decodes of held-out observations: tokens committed per verification, strict and at r = 9."""
         assert isinstance(module, Drafter)
-        prompts = [prompt.to(self.device).float() for prompt in self.held_out.prompts(VALIDATED)]
+        prompts = [prompt.to(self.device).float() for prompt in self.held_out.prompts(observations)]
         strict = acceptance_length(self.target, module, prompts, 0)
         relaxed = acceptance_length(self.target, module, prompts, 9)
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}

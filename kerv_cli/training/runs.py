@@ -20,6 +20,8 @@ from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.lab.run import success_of
 from kerv_cli.methods.artifacts import MadeFor, Weights
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
@@ -218,8 +220,6 @@ class TargetRun(Run):
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
-        from kerv_cli.lab.run import success_of
-
         seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
         return success_of(target, self.tasks, seeds, self.world)
 
@@ -255,7 +255,7 @@ class DrafterRun(Run):
     artifact: Weights[Any]
     before: ClassVar[Mapping[str, float]] = {}
     settings: TrainDrafterSettings
-    target: Any  # a ReadableTarget
+    target: ReadableTarget
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
         if settings.train.init is not None:

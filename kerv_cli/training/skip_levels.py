@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -93,19 +93,19 @@ def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLeve
     """
     good, wrong = matches.good(epsilon), 1 - confidence
     s_min = lowest_level(matches.similarity, good, confidence)
-    row: dict[str, Any] = {"s_min": NEVER, "low": NEVER, "high": NEVER, "share": 0.0, "within": None, "error": None}
-    if s_min is not None:
-        low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
-        skipped = matches.similarity >= s_min
-        row = {
-            "s_min": s_min,
-            "low": s_min if low is None else min(low, s_min),
-            "high": float(matches.similarity.max()) if high is None else max(high, s_min),
-            "share": float(skipped.mean()),
-            "within": float(good[skipped].mean()),
-            "error": float(matches.error[skipped].mean()),
-        }
-    return SkipLevel(**row, entries=len(matches.similarity))
+    if s_min is None:
+        return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(matches.similarity))
+    low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
+    skipped = matches.similarity >= s_min
+    return SkipLevel(
+        s_min,
+        low=s_min if low is None else min(low, s_min),
+        high=float(matches.similarity.max()) if high is None else max(high, s_min),
+        share=float(skipped.mean()),
+        entries=len(matches.similarity),
+        within=float(good[skipped].mean()),
+        error=float(matches.error[skipped].mean()),
+    )
 
 
 def skip_section(
