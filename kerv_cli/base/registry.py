@@ -87,11 +87,6 @@ class NoSettings:
     kind: str = "none"
 
 
-def nothing(settings: Any) -> tuple[str, ...]:
-    """A part that needs no artifact."""
-    return ()
-
-
 @dataclass(frozen=True)
 class Part:
     """One choice among the parts of a kind.
@@ -109,7 +104,7 @@ class Part:
     name: str
     build: str = ""
     settings: type = NoSettings
-    needs: Callable[[Any], tuple[str, ...]] = nothing
+    needs: Callable[[Any], tuple[str, ...]] = lambda settings: ()
     check: Callable[[Any], None] | None = None
     colour: int | None = None
     traits: Mapping[str, Any] = field(default_factory=dict)

@@ -117,7 +117,7 @@ def import_demos(settings: DemosImportSettings) -> None:
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
     with progress_bar("import") as advance:
-        manifest = import_lerobot(settings, folder, advance)
-    rows = ((name, len(row["episodes"]), f"{row['mean_steps']:.0f}") for name, row in manifest["tasks"].items())
-    title = f"demonstrations in {folder}, suite {manifest['environment'].upper()}"
+        manifest = import_lerobot(settings, folder, advance).manifest
+    rows = ((name, len(row.episodes), f"{row.mean_steps:.0f}") for name, row in manifest.tasks.items())
+    title = f"demonstrations in {folder}, suite {manifest.environment.upper()}"
     print_table(("task", "episodes", "mean steps"), rows, title)

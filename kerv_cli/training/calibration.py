@@ -46,7 +46,7 @@ from kerv_cli.worlds.demos.episode_file import DemoEpisode
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
 
 
-def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
+def levels_of(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
     """K of up to `decodes` decodes, spread evenly over the observations of a demonstration; errors as
     `observations_of`.
 
@@ -166,7 +166,7 @@ class CalibrationRun:
             levels: list[float] = []
             for index in (i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name):
                 budget = min(share, self.settings.decodes - len(levels))
-                levels += presample(decoder, self.dataset.load(index), space, budget)
+                levels += levels_of(decoder, self.dataset.load(index), space, budget)
                 if len(levels) >= self.settings.decodes:
                     break
             if not levels:

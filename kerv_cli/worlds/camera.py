@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +133,7 @@ class Camera:
         model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)
         model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
         try:
-            self._renderer: Any = _open_renderer(model, pixels)
+            self._renderer: mujoco.Renderer | None = _open_renderer(model, pixels)
         except Exception as error:  # each backend raises types of its own
             raise RenderingUnavailable(
                 f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
@@ -172,7 +172,7 @@ class Camera:
             renderer.close()
 
 
-def _open_renderer(model: mujoco.MjModel, pixels: int) -> Any:
+def _open_renderer(model: mujoco.MjModel, pixels: int) -> mujoco.Renderer:
     import mujoco
 
     class Renderer(mujoco.Renderer):

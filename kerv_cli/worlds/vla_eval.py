@@ -15,6 +15,7 @@ from vla_eval.render import configure_mujoco_render
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, DimSpec
 
 from kerv_cli.base.settings import EVALUATION_SEED, CameraSettings, StressSettings
+from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import build as build_stress
@@ -80,7 +81,7 @@ class MetaWorld(StepBenchmark):
         tasks = (self.spec.tasks[name] for name in self.tasks)
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 
-    def reset(self, task: dict[str, Any]) -> Any:
+    def reset(self, task: dict[str, Any]) -> Observation:
         """Starts the episode `episode_idx` of a task."""
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
@@ -102,7 +103,7 @@ class MetaWorld(StepBenchmark):
         self._recorder.record_step(success=success, action=numbers, state=observation.proprioception)
         return StepResult(observation, float(self.world.success), done, {})
 
-    def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
+    def make_obs(self, raw_obs: Observation, task: dict[str, Any]) -> dict[str, Any]:
         """The message to the model server."""
         assert self.world is not None
         images = self.world.observe([self.camera.name]).images if self.send_images else {}

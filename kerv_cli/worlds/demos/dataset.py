@@ -16,7 +16,7 @@ from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
 from kerv_cli.worlds.recorded import register_recorded
 
 OnProgress = Callable[[int, int], object]
-"""Told how many of how many are done."""
+"""Called with (done, total) after every episode or batch of a long work."""
 
 FORMAT = 2
 """Format of manifests. Format 1 did not name the environment, because Meta-World was the only one."""

@@ -12,6 +12,7 @@ import functools
 import itertools
 import pickle
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
 
 
 @contextlib.contextmanager
-def _quiet_simulator() -> Any:
+def _quiet_simulator() -> Iterator[None]:
     # The experts warn in every second step about a range that the world clips anyway.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")

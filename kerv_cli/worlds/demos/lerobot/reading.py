@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, limits_of
-from kerv_cli.worlds.demos.dataset import FORMAT, EpisodeEntry, OnProgress, entry_of, episode_path, totals
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
 
@@ -108,8 +107,8 @@ class Source:
         return np.stack(list(_video_frames(path, start, rate, len(table))))
 
 
-def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> dict[str, Any]:
-    """Writes the dataset's episodes as demonstrations -> the manifest.
+def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
+    """Writes the dataset's episodes as demonstrations in `folder` and opens them.
 
     Raises:
         UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
@@ -117,18 +116,18 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
     """
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
-    path, manifests = as_path(settings.source), list[dict[str, Any]]()
+    path = as_path(settings.source)
     try:
         source = Source.open(path, settings.camera)
-        write_folder(folder, lambda new: manifests.append(_import(source, settings, new, progress)))
-        return manifests[0]
+        write_folder(folder, lambda new: _import(source, settings, new, progress))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         why = " ".join(f"{type(error).__name__} {error}".split())[:120]
         raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
+    return DemoDataset.open(folder)
 
 
-def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> dict[str, Any]:
-    """Fills a new folder -> the manifest."""
+def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
+    """Fills a new folder."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
     entries: dict[str, list[EpisodeEntry]] = {}
@@ -145,7 +144,6 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     manifest = _manifest(source, settings, entries, names, np.concatenate(actions), state)
     write_json(folder / "recording.json", {k: manifest[k] for k in ("format", "environment", "config")})
     write_json(folder / "manifest.json", manifest)
-    return manifest
 
 
 def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> DemoEpisode:
@@ -191,7 +189,7 @@ def _manifest(
         "tail": settings.tail,
         "tasks": list(entries),
     }
-    manifest = {
+    return {
         "format": FORMAT,
         "environment": _identifier(settings.name or source.folder.name),
         "actions": action_space(source, settings, actions).as_dict(),
@@ -201,7 +199,6 @@ def _manifest(
         **totals(entries, {}, missing=0),
         "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
     }
-    return json.loads(json.dumps(manifest))
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
