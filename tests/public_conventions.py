@@ -24,8 +24,7 @@ from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import MASKS, POSITIONS, Convention, PublicDrafter, PublicShape
 from kerv_cli.targets.openvla.target import OpenVLATarget
-from kerv_cli.training.distillation import Distillation, acceptance_length
-from kerv_cli.training.recorded import StatesByLength, TeacherStates
+from kerv_cli.training.distillation import Distillation, StatesByLength, TeacherStates, acceptance_length
 
 OBSERVATIONS, STEPS = 64, 600
 

@@ -237,7 +237,7 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, po
     alone = {
         (task, record.seed): record
         for task in tasks
-        for record in run.run_task(settings(policies, *words), task, seeds)
+        for record in map(run.Runner(settings(policies, *words), task).episode, seeds)
     }
     requests = [Request(None, task, seed) for task in tasks for seed in seeds]
     together = [ended.result for ended in run.run_batch(settings(policies, *words, "rollout.batch=3"), requests)]

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.settings import TargetSettings, TrainDrafterSettings, TrainSettings
+from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainDrafterSettings, TrainSettings
 from kerv_cli.cli.app import app
 from kerv_cli.methods.artifacts import MadeFor, Request
 from kerv_cli.methods.early import EarlySettings
@@ -40,10 +40,8 @@ from kerv_cli.training.early_distillation import (
     teach_early,
 )
 from kerv_cli.training.imitation import load_samples
-from kerv_cli.training.observations import split
-from kerv_cli.training.recorded import observations_of
+from kerv_cli.training.observations import observations_of, split
 from kerv_cli.training.runs import drafter_run
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -237,7 +235,7 @@ def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
 
     folder = tmp_path_factory.mktemp("early")
     shutil.copytree(policies, folder, dirs_exist_ok=True)
-    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraConfig(), frame_stride=8, workers=1)
+    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraSettings(), frame_stride=8, workers=1)
     record(config, folder / "artifacts/demos/few")
     return folder
 

@@ -23,7 +23,8 @@ def settings(results: Path, *overrides: str) -> RolloutSettings:
 
 
 def episodes(chosen: RolloutSettings, count: int = 2) -> list[EpisodeRecord]:
-    return list(run.run_task(chosen, "drawer-open-v3", range(EVALUATION_SEED, EVALUATION_SEED + count)))
+    runner, seeds = run.Runner(chosen, "drawer-open-v3"), range(EVALUATION_SEED, EVALUATION_SEED + count)
+    return [runner.episode(seed, run.is_recorded(chosen, seed)) for seed in seeds]
 
 
 @pytest.mark.bits

@@ -14,12 +14,12 @@ import pytest
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.report.viewing.rerun_log import save_episode
 from kerv_cli.report.viewing.viewer import read_back
 from kerv_cli.worlds import resolve_tasks, spec_of, task_names
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 TESTS = Path(__file__).parent
@@ -45,7 +45,7 @@ def test_it_is_found_beside_the_others(spec: EnvironmentSpec) -> None:
 
 def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) -> None:
     with spec.open_world("push-point") as world:
-        record = run_episode(world, ExpertDecoder(), 100_000, CameraConfig(size=24))
+        record = run_episode(world, ExpertDecoder(), 100_000, CameraSettings(size=24))
         world.reset(100_000)
         assert record.initial_state.tolist() == world.initial_state.tolist()
         with pytest.raises(KervError, match="2 finite numbers"):

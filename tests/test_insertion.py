@@ -10,18 +10,18 @@ import pytest
 from examples.insertion import SPEC
 
 from kerv_cli.base.errors import KervError
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.report.viewing.rerun_log import save_episode
 from kerv_cli.report.viewing.viewer import read_back
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.spec import World
 
 TASKS = tuple(SPEC.tasks)
 ROTATION = slice(3, 6)
-SMALL = CameraConfig(size=48, supersample=1)
+SMALL = CameraSettings(size=48, supersample=1)
 
 
 def outcome(world: World, seed: int, turn: bool = True) -> tuple[bool, np.ndarray]:
@@ -106,7 +106,7 @@ def test_a_control_step_is_cheap() -> None:
 
 
 def test_frames_are_upright_and_show_peg_and_slot() -> None:
-    with SPEC.open_world("fetch-peg", CameraConfig(size=96)) as world:
+    with SPEC.open_world("fetch-peg", CameraSettings(size=96)) as world:
         world.reset(3)
         seen = world.observe(SPEC.cameras).images
         red, green, blue = np.moveaxis(seen["front"].astype(int), 2, 0)

@@ -15,8 +15,8 @@ from examples.tiny_openvla import write_checkpoint
 from test_openvla import imported, kerv
 from typer.testing import CliRunner
 
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.cli.app import app
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.lerobot.reading import _groups
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -28,7 +28,7 @@ SIZE = 56
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Demonstrations of insertion, the same as a LeRobot dataset, and read back under the name `back`."""
     results = tmp_path_factory.mktemp("lerobot")
-    config = DemoConfig(("insert-peg", "fetch-peg"), 2, camera=CameraConfig(size=SIZE), workers=1)
+    config = DemoConfig(("insert-peg", "fetch-peg"), 2, camera=CameraSettings(size=SIZE), workers=1)
     record(config, results / "artifacts/demos/pegs")
     assert kerv("demos", "export", "format=lerobot", "demos=pegs", f"results={results}")[0] == 0
     read = ["demos", "import", f"source={results}/lerobot/pegs", "name=back", "dofs=openvla", "tail=3"]

@@ -104,8 +104,7 @@ def episode_of(results: Path, *overrides: str) -> EpisodeRecord:
     words = ["world.horizon=12", "record=0", f"results={results}", "policy.target=nano-state", *overrides]
     chosen = compose("rollout", words, RolloutSettings)
     policies_of.check(chosen)
-    (record,) = run.run_task(chosen, TASK, [EVALUATION_SEED])
-    return record
+    return run.Runner(chosen, TASK).episode(EVALUATION_SEED, run.is_recorded(chosen, EVALUATION_SEED))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4])

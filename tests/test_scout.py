@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.registry import NoSettings
-from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.base.settings import CameraSettings, RolloutSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder
@@ -31,7 +31,6 @@ from kerv_cli.report.certificate import _needed, _values
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 
 SMALL = ScoutSettings(width=24, rank=4, keypoints=4, cell_width=8, cell_features=2, word_width=4)
@@ -45,7 +44,7 @@ def results(tmp_path_factory: pytest.TempPathFactory, policies: Path) -> Path:
 
     folder = tmp_path_factory.mktemp("scout")
     shutil.copytree(policies, folder, dirs_exist_ok=True)
-    record(DemoConfig((TASK,), 4, camera=CameraConfig(), frame_stride=8, workers=1), folder / "artifacts/demos/few")
+    record(DemoConfig((TASK,), 4, camera=CameraSettings(), frame_stride=8, workers=1), folder / "artifacts/demos/few")
     return folder
 
 

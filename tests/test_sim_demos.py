@@ -11,14 +11,14 @@ import pytest
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.manifests import read_file
-from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 CONFIG = DemoConfig(
-    tasks=("reach",), episodes=6, frame_stride=10, camera=CameraConfig(size=24, supersample=1), workers=1, tail=5
+    tasks=("reach",), episodes=6, frame_stride=10, camera=CameraSettings(size=24, supersample=1), workers=1, tail=5
 )
 
 GOLDEN_NOISE = "da22e466a3c803b9b3d044c2cfe817eb4241429e2422b91622f51c340dc4a442"
@@ -125,7 +125,7 @@ def test_a_killed_recording_goes_on(copied):
     (copied / "manifest.json").unlink()
     with pytest.raises(CheckpointError, match="unfinished"):
         DemoDataset.open(copied)
-    assert record(CONFIG, copied, None).sha256 == before.sha256
+    assert record(CONFIG, copied).sha256 == before.sha256
     again = files_of(copied / "episodes")
     assert {path.name for path in again if again[path] != kept[path]} == {missing.name, damaged.name}
 
@@ -141,7 +141,7 @@ def test_another_configuration_is_refused_and_nothing_touched(copied):
     with pytest.raises(UsageError, match="episodes=6, not 7: choose another folder"):
         record(replace(CONFIG, episodes=7), copied)
     with pytest.raises(UsageError, match="camera="):
-        record(replace(CONFIG, camera=CameraConfig(size=32)), copied)
+        record(replace(CONFIG, camera=CameraSettings(size=32)), copied)
     assert files_of(copied) == before
 
 
@@ -175,7 +175,7 @@ def test_an_expert_that_never_succeeds_ends_the_recording(tmp_path):
         ({"first_seed": 100_000}, "seed 100000 is for evaluation"),
         ({"first_seed": -1}, "seed -1"),
         ({"tasks": ("reach", "insert-peg")}, "cannot be mixed"),
-        ({"camera": CameraConfig("front")}, "unknown camera"),
+        ({"camera": CameraSettings("front")}, "unknown camera"),
         ({"tasks": ()}, "at least one task"),
         ({"episodes": 0}, "episodes"),
         ({"perturbed": 1.5}, "perturbed"),

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from kerv_cli.base.errors import KervError, RenderingUnavailable, UnknownName, UsageError
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds import camera as camera_module
-from kerv_cli.worlds.camera import CameraConfig, box_average, choose_backend
+from kerv_cli.worlds.camera import box_average, choose_backend
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 # One task for nearly all: a benchmark's 50 placements cost up to a second per seed block. Its poses are stale at reset.
@@ -157,8 +158,8 @@ def test_the_first_frame_shows_the_poses_of_this_episode(world):
 def test_other_views_get_their_own_camera(world):
     world.reset(0)
     usual = world.frame()
-    hand = world.frame(CameraConfig("gripperPOV", size=40, supersample=1))
-    wide = world.frame(CameraConfig(fovy=60.0))
+    hand = world.frame(CameraSettings("gripperPOV", size=40, supersample=1))
+    wide = world.frame(CameraSettings(fovy=60.0))
     assert hand.shape == (40, 40, 3)
     assert np.abs(wide.astype(int) - usual).mean() > 5
     assert world.frame().tobytes() == usual.tobytes()
@@ -177,12 +178,12 @@ def test_images_are_drawn_only_for_the_cameras_asked_for(world):
 
 
 def test_impossible_views_are_refused():
-    wrong_name = CameraConfig("corner44")
+    wrong_name = CameraSettings("corner44")
     with pytest.raises(UnknownName, match="corner4"):
         SPEC.open_world(TASK, wrong_name)
     for wrong in ({"fovy": 0.0}, {"fovy": 180.0}, {"size": 0}, {"supersample": 17}):
         with pytest.raises(UsageError, match="camera"):
-            CameraConfig(**wrong)
+            SPEC.open_world(TASK, CameraSettings(**wrong))
 
 
 def test_every_model_has_the_cameras(world):
@@ -198,7 +199,7 @@ def test_supersampling_is_a_rounded_box_mean(world):
         expected = np.floor(blocks.mean(axis=(1, 3)) + 0.5)
         np.testing.assert_array_equal(box_average(pixels, factor), expected)
     world.reset(0)
-    fine = world.frame(CameraConfig(size=192, supersample=1))
+    fine = world.frame(CameraSettings(size=192, supersample=1))
     np.testing.assert_array_equal(world.frame(), box_average(fine, 2))
 
 

@@ -18,13 +18,12 @@ from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import Part, parts
-from kerv_cli.base.settings import MOST_STRESS, RolloutSettings, StressSettings, as_plain, settings_from
+from kerv_cli.base.settings import MOST_STRESS, CameraSettings, RolloutSettings, StressSettings, as_plain, settings_from
 from kerv_cli.cli.app import app
 from kerv_cli.lab.identity import stress_of, work_of
 from kerv_cli.lab.policy import check
 from kerv_cli.lab.run import Runner, close_worlds
 from kerv_cli.worlds import stress as stressing
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.recorded import register_recorded
 from kerv_cli.worlds.spec import EnvironmentSpec
@@ -40,14 +39,14 @@ SEEN, FELT = ("sensor", "light", "colour", "camera"), ("push", "actuation", "obj
 
 @pytest.fixture(scope="module")
 def insertion() -> Iterator[MujocoWorld]:
-    with INSERTION.open_world("fetch-peg", CameraConfig(size=SIZE)) as world:
+    with INSERTION.open_world("fetch-peg", CameraSettings(size=SIZE)) as world:
         assert isinstance(world, MujocoWorld)
         yield world
 
 
 @pytest.fixture(scope="module")
 def metaworld() -> Iterator[MujocoWorld]:
-    with METAWORLD.open_world("push", CameraConfig(size=SIZE)) as world:
+    with METAWORLD.open_world("push", CameraSettings(size=SIZE)) as world:
         assert isinstance(world, MujocoWorld)
         yield world
 

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
-from kerv_cli.base.settings import TargetSettings, TrainSettings
+from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainSettings
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.eagle import DrafterSettings
@@ -31,7 +31,6 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -44,7 +43,7 @@ TINY = TrainSettings(steps=12, batch=4, lr=0.01, warmup=2, validate_every=4, ema
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with a few real demonstrations of one task."""
     folder = tmp_path_factory.mktemp("training")
-    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraConfig(), frame_stride=8, workers=1)
+    config = DemoConfig(("drawer-close-v3",), 6, camera=CameraSettings(), frame_stride=8, workers=1)
     record(config, folder / "artifacts/demos/few")
     return folder
 

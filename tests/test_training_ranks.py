@@ -15,7 +15,14 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import DemosSettings, PolicySettings, RolloutSettings, TrainSettings, WorldSettings
+from kerv_cli.base.settings import (
+    CameraSettings,
+    DemosSettings,
+    PolicySettings,
+    RolloutSettings,
+    TrainSettings,
+    WorldSettings,
+)
 from kerv_cli.cli.app import app
 from kerv_cli.lab.policy import decoder_for
 from kerv_cli.training.dagger import PolicyActs
@@ -25,13 +32,12 @@ from kerv_cli.training.loop import draw_samples
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds import spec_of
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record, run_expert
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.spec import EnvironmentSpec
 
-SHORT = CameraConfig()
+SHORT = CameraSettings()
 SIZES = ("target.width=16", "target.layers=1", "target.heads=2", "target.feed_forward=16")
 
 
@@ -102,7 +108,7 @@ def test_datasets_add_up(results: Path) -> None:
 
 
 def test_datasets_of_other_cameras_do_not_add_up(results: Path, tmp_path: Path) -> None:
-    other = DemoConfig(("reach-v3",), 1, camera=CameraConfig(size=48), frame_stride=50, workers=1)
+    other = DemoConfig(("reach-v3",), 1, camera=CameraSettings(size=48), frame_stride=50, workers=1)
     record(other, tmp_path / "other")
     with pytest.raises(CheckpointError, match="another camera"):
         DemoDataset.joined([open_demos(str(results), "few"), DemoDataset.open(tmp_path / "other")])

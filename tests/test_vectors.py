@@ -16,16 +16,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kerv_cli.base.registry import parts
-from kerv_cli.base.settings import StressSettings
+from kerv_cli.base.settings import CameraSettings, StressSettings
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds import stress as stressing
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.vectors import length
 
 pytestmark = pytest.mark.bits
 
-SMALL = CameraConfig(size=24, supersample=1)
+SMALL = CameraSettings(size=24, supersample=1)
 
 
 @given(st.lists(st.floats(1e-100, 1e100).flatmap(lambda x: st.sampled_from([x, -x])), max_size=9))

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.settings import TargetSettings, TrainTargetSettings
+from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainTargetSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import View, frame_shape, views_of
 from kerv_cli.cli.app import app
@@ -21,7 +21,6 @@ from kerv_cli.targets.compact.kernels import has_blocked_layouts
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.world import MetaWorld
@@ -34,7 +33,7 @@ PAST = "corner4+corner4@4"
 
 @pytest.fixture(scope="module")
 def world() -> Iterator[MetaWorld]:
-    made = SPEC.open_world("drawer-close", CameraConfig(HAND, size=SIZE, supersample=1))
+    made = SPEC.open_world("drawer-close", CameraSettings(HAND, size=SIZE, supersample=1))
     assert isinstance(made, MetaWorld)
     with made:
         yield made
@@ -56,8 +55,8 @@ def test_a_name_that_says_none_of_them_is_refused(name: str) -> None:
 def test_views_lie_side_by_side_as_their_cameras_draw_them(world: MetaWorld) -> None:
     world.reset(0)
     left, right = np.split(world.frame(), 2, axis=1)
-    assert left.tobytes() == world.frame(CameraConfig("corner4", size=SIZE, supersample=1)).tobytes()
-    assert right.tobytes() == world.frame(CameraConfig("gripperPOV", 75.0, SIZE, 1)).tobytes()
+    assert left.tobytes() == world.frame(CameraSettings("corner4", size=SIZE, supersample=1)).tobytes()
+    assert right.tobytes() == world.frame(CameraSettings("gripperPOV", 75.0, SIZE, 1)).tobytes()
     assert world.observe([HAND]).images[HAND].tobytes() == world.frame().tobytes()
     with pytest.raises(UnknownName, match="gripperPOW"):
         world.observe(["corner4+gripperPOW"])
@@ -87,7 +86,7 @@ def test_recorded_frames_do_not_move_what_a_policy_sees_of_the_past(world: MetaW
         world.reset(1)
         for step in range(13):
             if recorded:
-                world.frame(CameraConfig(PAST, size=SIZE, supersample=1))
+                world.frame(CameraSettings(PAST, size=SIZE, supersample=1))
             if step in (0, 5, 12):
                 seen.append(world.observe([PAST]).images[PAST].tobytes())
             world.step([1.0, 1.0, 0.3, 0.0])

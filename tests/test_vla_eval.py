@@ -46,7 +46,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.settings import RolloutSettings, ServeSettings
 from kerv_cli.cli.app import app
 from kerv_cli.lab.imported import read_evaluations, sides_of
-from kerv_cli.lab.run import run_task
+from kerv_cli.lab.run import Runner
 from kerv_cli.lab.served import read_served
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.vla_eval import specs
@@ -114,7 +114,7 @@ def test_a_benchmark_run_by_vla_eval_has_the_episodes_of_a_rollout(
         episode = read_served(path)
         assert episode is not None
         served[episode.episode["task"], episode.episode["seed"]] = episode
-    for record in run_task(settings, "reach-v3", (100_000, 100_001)):
+    for record in map(Runner(settings, "reach-v3").episode, (100_000, 100_001)):
         episode = served.pop(("reach-v3", record.seed))
         row, decodes = episode.episode, episode.decodes.to_pylist()
         assert (row["success"], row["steps"], row["forwards"]) == (record.success, record.steps, record.forwards)

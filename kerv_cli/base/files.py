@@ -85,7 +85,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
     is discarded. When `fill` raises, everything stays as it was.
 
     Raises:
-        StorageError: as `atomic_path`.
+        StorageError: the disk is full or read-only, or the folder may not be written to.
     """
     temporary = temporary_beside(folder)
     try:
@@ -97,11 +97,11 @@ def write_folder(folder: Path, fill: Callable[[Path], object], replace: bool = F
             fill(temporary)
             for path in (*temporary.rglob("*"), temporary):
                 sync(path)
-            placed = _rename_once(temporary, folder)
-            if not placed and replace:
+            is_new = _rename_once(temporary, folder)
+            if not is_new and replace:
                 _exchange(temporary, folder)
             sync(folder.parent)
-            return placed or replace
+            return is_new or replace
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -171,7 +171,7 @@ def write_json(path: Path, value: Any) -> None:
     """Writes `value` as indented JSON, atomically; refuses NaN and infinity, which JSON lacks.
 
     Raises:
-        StorageError: as in `atomic_path`. ValueError: NaN or infinity.
+        StorageError: the disk is full or read-only, or the folder may not be written to. ValueError: NaN or infinity.
     """
     text = json.dumps(value, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
@@ -296,12 +296,12 @@ def check_shape(value: Any, depth: int = 64, most: int = 5_000_000) -> None:
     for _ in range(depth):
         if not level:
             return
-        count += sum(times * len(found) for found, times in level.values())
+        count += sum(times * len(container) for container, times in level.values())
         if count > most:
             raise ValueError(f"it holds more than {most} values")
         below: dict[int, tuple[Any, int]] = {}
-        for found, times in level.values():
-            for inner in found.values() if isinstance(found, dict) else found:
+        for container, times in level.values():
+            for inner in container.values() if isinstance(container, dict) else container:
                 if isinstance(inner, dict | list):
                     below[id(inner)] = inner, times + below.get(id(inner), (inner, 0))[1]
         level = below

@@ -41,11 +41,11 @@ def older_beside(path: Path) -> Path:
 
 def is_left_over(path: Path) -> bool:
     """Whether `path` is a temporary file or folder whose process has ended."""
-    named = _NAME.fullmatch(path.name)
-    if named is None:
+    match = _NAME.fullmatch(path.name)
+    if match is None:
         return False
-    if named["host"] == socket.gethostname().replace(".", "-"):
-        return not is_alive(int(named["pid"]))
+    if match["host"] == socket.gethostname().replace(".", "-"):
+        return not is_alive(int(match["pid"]))
     try:
         return time.time() - path.stat().st_mtime > 3600 * OTHER_HOSTS_STALE_HOURS
     except OSError:  # its owner was faster

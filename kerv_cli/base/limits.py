@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import Field, field, fields, is_dataclass
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -103,11 +102,12 @@ def check_settings(settings: Any, what: str = "") -> None:
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]
         name, value = f"{prefix}{at.name}", getattr(settings, at.name)
+        values = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else [value]
         if element is not None and not isinstance(value, list | dict):
             raise UsageError(f"{name}={value}: a list or a mapping is wanted")
-        if element is not None and not all(isinstance(x, element) for x in _elements(value)):
+        if element is not None and not all(isinstance(x, element) for x in values):
             raise UsageError(f"{name}={value}: every element must be of type {element.__name__}")
-        for x in value if isinstance(value, list) else [value]:
+        for x in values:
             _check_value(name, x, at.metadata)
         if is_dataclass(value):
             check_settings(value, name)
@@ -126,10 +126,6 @@ def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
         return inner if inner in (str, int, float, bool) else None
 
     return tuple((at, element(at.name)) for at in fields(kind))
-
-
-def _elements(value: Any) -> Iterator[Any]:
-    return iter(value.values() if isinstance(value, dict) else value)
 
 
 def _check_value(name: str, value: Any, metadata: Any) -> None:

@@ -80,7 +80,11 @@ _hints = functools.cache(get_type_hints)
 
 
 def read_file(kind: type[T], path: Path) -> T:
-    """The JSON file at `path` as an instance of `kind`; errors as `read`, and a missing or unreadable file."""
+    """The JSON file at `path` as an instance of `kind`; unknown fields are left out.
+
+    Raises:
+        CheckpointError: the file is missing, no JSON, or not of this kind.
+    """
     return read(kind, read_mapping(path), str(path), tolerant=True)
 
 

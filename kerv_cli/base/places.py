@@ -40,7 +40,7 @@ def check_writable(results: str) -> Path:
         StorageError: the disk is full or read-only, or permission is missing.
     """
     folder = results_dir(results)
-    parent = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    parent = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not parent.is_dir():
         raise UsageError(f"results={results}: {parent} is a file, name a folder")
     try:
@@ -85,13 +85,13 @@ def find_target(results: str, name: str) -> Path:
         UsageError: nothing of that name; the line lists what there is.
     """
     if "/" in name:
-        places = [as_path(name)]
+        folders = [as_path(name)]
     else:
-        shipped = (folder / name / "target" for folder in (results_dir(results) / "pretrained", shipped_dir()))
-        places = [artifact(results, "target", name), *shipped]
-    for place in places:
-        if (place / "target.json").is_file():
-            return place
+        policies = results_dir(results) / "pretrained" / name, shipped_dir() / name
+        folders = [artifact(results, "target", name), *(policy / "target" for policy in policies)]
+    for folder in folders:
+        if (folder / "target.json").is_file():
+            return folder
     if name in RELEASED:
         raise UsageError(
             f"policy '{name}' is not in this wheel: fetch {name}.tar.gz of the release, then 'kerv build policy "
@@ -99,7 +99,7 @@ def find_target(results: str, name: str) -> Path:
         )
     names = target_names(results)
     raise UsageError(
-        f"no target '{name}' in {', '.join(map(str, places))}: train it with 'kerv train target name={name}'"
+        f"no target '{name}' in {', '.join(map(str, folders))}: train it with 'kerv train target name={name}'"
         + (f", or take one of {', '.join(names)}" if names else "")
     )
 

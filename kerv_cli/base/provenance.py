@@ -7,6 +7,7 @@ import platform
 import shutil
 import socket
 import subprocess
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,14 @@ PACKAGES = ("kerv", "torch", "metaworld", "mujoco", "numpy")
 _HERE = Path(__file__).resolve().parent
 
 
-def provenance(device: str = "cpu") -> dict[str, Any]:
+def provenance(device: str) -> dict[str, Any]:
     """For a checkpoint or a calibration: versions, commit, device."""
     return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
+
+
+def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> dict[str, Any]:
+    """`provenance`, behind the command that makes the artifact, its settings and figures of it."""
+    return {"command": command, "settings": asdict(settings), **figures, **provenance(device)}
 
 
 def stamp(device: str) -> dict[str, str]:

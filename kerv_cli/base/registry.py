@@ -24,7 +24,7 @@ from kerv_cli.base.limits import check_settings
 
 PLUGINS = "KERV_PLUGINS"
 
-OWN = (
+MODULES = (
     "kerv_cli.worlds.registration",
     "kerv_cli.targets.registration",
     "kerv_cli.methods.ar",
@@ -86,11 +86,6 @@ class NoSettings:
     kind: str = "none"
 
 
-def nothing(settings: Any) -> tuple[str, ...]:
-    """A part that needs no artifact."""
-    return ()
-
-
 @dataclass(frozen=True)
 class Part:
     """One choice among the parts of a kind.
@@ -108,7 +103,7 @@ class Part:
     name: str
     build: str = ""
     settings: type = NoSettings
-    needs: Callable[[Any], tuple[str, ...]] = nothing
+    needs: Callable[[Any], tuple[str, ...]] = lambda settings: ()
     check: Callable[[Any], None] | None = None
     colour: int | None = None
     traits: Mapping[str, Any] = field(default_factory=dict)
@@ -240,10 +235,10 @@ def load_plugins() -> None:
     Raises:
         UsageError: a plugin that cannot be imported.
     """
-    for name in OWN:
+    for name in MODULES:
         importlib.import_module(name)
-    named = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
-    for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *named]:
+    files = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
+    for name in [*(entry.value for entry in entry_points(group="kerv.parts")), *files]:
         try:
             importlib.import_module(name)
         except ImportError as error:

@@ -34,9 +34,9 @@ def part(kind: str, name: str = "none", help: str = "") -> Any:
     return setting(chosen(kind, name), help, group=name)
 
 
-@dataclass
+@dataclass(unsafe_hash=True)  # worlds keep cameras by it; Hydra could not override a frozen one
 class CameraSettings:
-    """The policy's view: a camera of the environment."""
+    """The policy's view: a camera of the environment, or several side by side (`views.views_of`)."""
 
     name: str = setting("", "empty: the environment's first camera; joined names are several views side by side")
     fovy: float = number(45.0, above=0, most=179, help="vertical field of view, degrees")
@@ -591,13 +591,13 @@ def as_plain(settings: Any) -> dict[str, Any]:
 
 
 def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSettings:
-    """The inverse of `as_plain` for a rollout; arguments and errors as `read_settings`."""
+    """The settings of a rollout from nested dicts and lists: `read_settings` with its class."""
     return read_settings(RolloutSettings, plain, tolerant)
 
 
 def read_settings(schema: type[S], plain: Mapping[str, Any], tolerant: bool = False) -> S:
-    """The inverse of `as_plain` for settings of the class `schema`; every part's settings become their own class.
-    tolerant: as `manifests.read`.
+    """Settings of the class `schema` from nested dicts and lists, the inverse of `as_plain`. The settings of a part get
+    the class that its registration names. tolerant: keys that this kerv does not know are left out instead of refused.
 
     Raises:
         CheckpointError: not such settings. UnknownName: a part that is not registered here.

@@ -95,6 +95,16 @@ class ActionSpace:
         return np.append(inner, inner[-1]) if self.end_token else inner
 
     @cached_property
+    def middle(self) -> np.ndarray:
+        """(D,) environment units, the middle of every DoF's limits."""
+        return (np.asarray(self.high) + np.asarray(self.low)) / 2
+
+    @cached_property
+    def half(self) -> np.ndarray:
+        """(D,) environment units, half of every DoF's range."""
+        return (np.asarray(self.high) - np.asarray(self.low)) / 2
+
+    @cached_property
     def is_strict(self) -> np.ndarray:
         """(D,) bool."""
         return np.array([name in self.strict for name in self.names])
@@ -163,12 +173,9 @@ class ActionSpace:
         return self.unnormalise(self.values_of(tokens))
 
     def fitted(self, actions: np.ndarray) -> ActionSpace:
-        """This space, normalised by the 1st and 99th percentile of actions (n, D) in environment units. A DoF that
-        never moves gets a unit range around its value."""
-        low, high = np.percentile(actions, [1, 99], axis=0)
-        still = high - low < 1e-6
-        low, high = np.where(still, low - 1.0, low), np.where(still, high + 1.0, high)
-        return replace(self, low=tuple(low.tolist()), high=tuple(high.tolist()))
+        """This space, normalised by the 1st and 99th percentile of actions (n, D) in environment units, `limits_of`."""
+        low, high = limits_of(*np.percentile(actions, [1, 99], axis=0))
+        return replace(self, low=low, high=high)
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
         """Refuses another action space: names, groups, strict DoFs, bins and control rate; with `statistics` the
@@ -178,15 +185,8 @@ class ActionSpace:
         Raises:
             CheckpointError: they differ; the message names the first difference.
         """
-        fields = [
-            "names",
-            "groups",
-            "strict",
-            "bins",
-            "control_hz",
-            *(("low", "high", "end_token") if statistics else ()),
-        ]
-        for name in fields:
+        normalisation = ("low", "high", "end_token") if statistics else ()
+        for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
             mine, theirs = getattr(self, name), getattr(other, name)
             if mine != theirs:
                 if name == "groups":
@@ -195,6 +195,14 @@ class ActionSpace:
                     f"{here} has an action space with {name} {_text(mine)}, {there} one with {_text(theirs)}: "
                     "they were made for different actions and cannot be used together"
                 )
+
+
+def limits_of(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The limits of an ActionSpace from `low` and `high` (D,) of its actions: a DoF that never moves gets a unit to
+    either side of its value."""
+    still = high - low < 1e-6
+    low, high = np.where(still, low - 1.0, low), np.where(still, high + 1.0, high)
+    return tuple(low.tolist()), tuple(high.tolist())
 
 
 def _text(value: Any) -> str:

@@ -25,8 +25,8 @@ class View:
     delay: int = 0
 
     @property
-    def shown(self) -> str:
-        """The camera, with its field of view where it has one of its own."""
+    def name(self) -> str:
+        """The camera, with the field of view where the view states one."""
         return self.camera if self.fovy is None else f"{self.camera}:{self.fovy:g}"
 
 

@@ -13,7 +13,6 @@ from kerv_cli.base.settings import (
     DemosImportSettings,
     DemosSettings,
     PolicySettings,
-    as_plain,
 )
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, print_figures, print_plan, print_table, progress_bar
@@ -40,7 +39,6 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
         minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
         print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
-    from kerv_cli.worlds.camera import CameraConfig
     from kerv_cli.worlds.demos.recording import DemoConfig, record
 
     actor = _actor(settings, tasks[0])
@@ -49,7 +47,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         episodes=settings.episodes,
         first_seed=settings.seed,
         perturbed=settings.perturbed,
-        camera=CameraConfig(**as_plain(settings.world.camera)),
+        camera=settings.world.camera,
         frame_stride=settings.frame_stride,
         workers=settings.runtime.workers,
         horizon=settings.world.horizon,
@@ -119,7 +117,7 @@ def import_demos(settings: DemosImportSettings) -> None:
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
     with progress_bar("import") as advance:
-        manifest = import_lerobot(settings, folder, advance)
-    rows = ((name, len(row["episodes"]), f"{row['mean_steps']:.0f}") for name, row in manifest["tasks"].items())
-    title = f"demonstrations in {folder}, suite {manifest['environment'].upper()}"
+        manifest = import_lerobot(settings, folder, advance).manifest
+    rows = ((name, len(row.episodes), f"{row.mean_steps:.0f}") for name, row in manifest.tasks.items())
+    title = f"demonstrations in {folder}, suite {manifest.environment.upper()}"
     print_table(("task", "episodes", "mean steps"), rows, title)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -112,13 +112,12 @@ def _drawn(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
     import time
 
     from kerv_cli.base.errors import KervError
-    from kerv_cli.base.settings import as_plain
-    from kerv_cli.worlds.camera import CameraConfig, choose_backend
+    from kerv_cli.worlds.camera import choose_backend
 
     what, first = f"rendering {spec.name}", next(iter(spec.suites.values()), tuple(spec.tasks))[0]
     try:
         backend = choose_backend()
-        with spec.open_world(first, CameraConfig(**{**as_plain(settings.world.camera), "name": ""})) as world:
+        with spec.open_world(first, replace(settings.world.camera, name="")) as world:
             world.reset(settings.seed)
             world.frame()
             began = time.perf_counter()

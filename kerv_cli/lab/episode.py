@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord, Look
 from kerv_cli.lab.clock import RealClock
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import World
 
 OnStep = Callable[[int], object]
@@ -59,7 +59,7 @@ class _Execution:
     the first one the robot stands still. Collects actions, end-effector positions, gripper openings, frames and
     places, step by step."""
 
-    def __init__(self, world: World, follower: Follower, camera: CameraConfig | None, on_step: OnStep | None) -> None:
+    def __init__(self, world: World, follower: Follower, camera: CameraSettings | None, on_step: OnStep | None) -> None:
         self.world, self.follower, self.camera, self.on_step = world, follower, camera, on_step
         self.in_hand: deque[np.ndarray] = deque()
         self.last = world.spec.standstill(world.gripper)
@@ -130,7 +130,7 @@ def run_episode(
     world: World,
     decoder: ActionDecoder,
     seed: int,
-    camera: CameraConfig | None = None,
+    camera: CameraSettings | None = None,
     clock: RealClock | None = None,
     on_step: OnStep | None = None,
 ) -> EpisodeRecord:
@@ -156,7 +156,7 @@ def episode(
     world: World,
     follower: Follower,
     seed: int,
-    camera: CameraConfig | None = None,
+    camera: CameraSettings | None = None,
     clock: RealClock | None = None,
     on_step: OnStep | None = None,
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:

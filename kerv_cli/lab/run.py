@@ -30,7 +30,6 @@ from kerv_cli.lab.policy import artifacts_of, batch_decoder_for, clock_for, deco
 from kerv_cli.lab.together import EpisodeEnd, Request, run_together
 from kerv_cli.methods.compose import native_decoder
 from kerv_cli.worlds import spec_of
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import NO_STRESS, Stress
 from kerv_cli.worlds.stress import build as build_stress
@@ -38,25 +37,20 @@ from kerv_cli.worlds.world import EpisodeWorld
 
 K = TypeVar("K")
 
-
-def camera_config(settings: CameraSettings) -> CameraConfig:
-    """The camera of these settings. Raises UsageError for impossible numbers."""
-    return CameraConfig(**dataclasses.asdict(settings))
-
-
 TOGETHER = 16
 """Episodes that a training's validation decodes together. Their worlds take 1.5 GB where they are drawn."""
 
 _WORLDS = 4  # kept open per process: one that is drawn takes about 90 MB
-_opened: OrderedDict[tuple[str, CameraConfig, int], World] = OrderedDict()  # the most recently used one is last
+_opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # the most recently used one is last
 
 
 def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
     """This process's world for a task, camera and horizon, shared by all settings that agree in them. The worlds used
     last stay open. stress: the shift of its next episodes."""
-    key = task, camera_config(settings.camera), settings.horizon
+    spec = spec_of(task)
+    key = task, spec.camera(settings.camera), settings.horizon
     if key not in _opened:
-        _opened[key] = spec_of(task).open_world(*key)
+        _opened[key] = spec.open_world(*key)
     _opened.move_to_end(key)
     while len(_opened) > _WORLDS:
         _opened.popitem(last=False)[1].close()
@@ -65,7 +59,7 @@ def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -
 
 def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
     """A new world for a task, which the caller closes; see `open_world`."""
-    return _stressed(spec_of(task).open_world(task, camera_config(settings.camera), settings.horizon), stress)
+    return _stressed(spec_of(task).open_world(task, settings.camera, settings.horizon), stress)
 
 
 def _stressed(world: World, stress: Stress) -> World:
@@ -93,8 +87,7 @@ class Runner:
         self.decoder = decoder_for(settings, task)
         self.stress = build_stress(settings.world.stress)
         self.clock = clock_for(settings, task)
-        camera = camera_config(settings.world.camera)
-        self._recording = dataclasses.replace(camera, size=settings.record_size, supersample=1)
+        self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False, on_step: OnStep | None = None) -> EpisodeRecord:
         """Runs the episode of a seed; its record has frames where it is recorded. on_step: see `run_episode`."""
@@ -113,13 +106,6 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
         return new_world(task, settings.world, build_stress(settings.world.stress))
 
     return run_together(batch_decoder_for(settings), requests, settings.rollout.batch, opened)
-
-
-def run_task(settings: RolloutSettings, task: str, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
-    """Runs one setting on one task, seed by seed; `is_recorded` says which episodes keep frames."""
-    runner = Runner(settings, task)
-    for seed in seeds:
-        yield runner.episode(seed, is_recorded(settings, seed))
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:

@@ -5,7 +5,7 @@ of the hybrid boundary and the similarities from which on a verification is skip
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -14,8 +14,8 @@ import numpy as np
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.places import artifact
-from kerv_cli.base.provenance import provenance
-from kerv_cli.base.settings import CalibrateSettings, RolloutSettings, as_plain
+from kerv_cli.base.provenance import provenance_of
+from kerv_cli.base.settings import CalibrateSettings, RolloutSettings
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -30,7 +30,7 @@ from kerv_cli.methods.calibration import (
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.rules import BoundaryRanges
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.observations import check_shown
+from kerv_cli.training.observations import observations_of
 from kerv_cli.training.predictor_fit import (
     Windows,
     choose_episodes,
@@ -38,16 +38,15 @@ from kerv_cli.training.predictor_fit import (
     prediction_errors,
     read_windows,
 )
-from kerv_cli.training.recorded import observations_of
 from kerv_cli.training.skip_levels import skip_section
 from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
-Progress = Callable[[int, int], None]
 PRESAMPLED = 6  # largest number of episodes per task that pre-sampling spreads its decodes over
 
 
-def presample(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
+def levels_of(decoder: Decoder, episode: DemoEpisode, space: ObservationSpace, decodes: int) -> list[float]:
     """K of up to `decodes` decodes, spread evenly over the observations of a demonstration; errors as
     `observations_of`.
 
@@ -98,7 +97,6 @@ class CalibrationRun:
         self.path = self.artifacts.path("calibration")
         if settings.name is not None:
             self.path = artifact(settings.results, "calibration", settings.name) / self.path.name
-        check_shown(self.dataset, self.description)
         self.chosen = choose_episodes(self.dataset, self.tasks, settings.episodes, settings.held_out)
         self.datastore = self.artifacts.path("datastore")
         self.stored = (self.datastore / "manifest.json").is_file()
@@ -117,14 +115,14 @@ class CalibrationRun:
             f"over {', '.join(map(str, self.settings.boundary_windows))} positions; {skip}"
         )
 
-    def load(self, progress: Progress) -> None:
+    def load(self, progress: OnProgress) -> None:
         """Reads the actions and paths of the chosen episodes."""
         s = self.settings
         self.windows = read_windows(
             self.dataset, self.chosen, self.description.actions, s.history, s.window, self.description.chunk, progress
         )
 
-    def boundary(self, progress: Progress) -> BoundarySection:
+    def boundary(self, progress: OnProgress) -> BoundarySection:
         """Ranges of R and D over every window of every training episode, in metres; none is left out.
 
         Raises:
@@ -142,14 +140,14 @@ class CalibrationRun:
             ranges[str(window)] = BoundaryRanges.fit(counted(number * len(paths)), window)
         return BoundarySection(len(paths), ranges)
 
-    def skip(self, progress: Progress) -> SkipSection | None:
+    def skip(self, progress: OnProgress) -> SkipSection | None:
         """Skip levels of the tasks, from the target's datastore; None without a datastore."""
         if not self.stored:
             return None
         store = self.artifacts.load("datastore")
         return skip_section(store, self.tasks, self.settings.epsilon, self.settings.confidence, progress)
 
-    def presample(self, progress: Progress) -> dict[str, Variability]:
+    def presample(self, progress: OnProgress) -> dict[str, Variability]:
         """Task -> K_S and quartiles of K, from decodes of training observations with the settings' method; empty for
         decodes=0.
 
@@ -168,7 +166,7 @@ class CalibrationRun:
             levels: list[float] = []
             for index in (i for i, held in self.chosen.items() if not held and self.dataset.episodes[i].task == name):
                 budget = min(share, self.settings.decodes - len(levels))
-                levels += presample(decoder, self.dataset.load(index), space, budget)
+                levels += levels_of(decoder, self.dataset.load(index), space, budget)
                 if len(levels) >= self.settings.decodes:
                     break
             if not levels:
@@ -195,11 +193,7 @@ class CalibrationRun:
         assert self.windows is not None
         space, chunk = self.description.actions, self.description.chunk
         noise = fit_filters(self.windows, self.settings.fit_steps or chunk, space.is_strict)
-        origin = {
-            "command": "kerv calibrate",
-            "settings": as_plain(self.settings),
-            **provenance(self.settings.runtime.device),
-        }
+        provenance = provenance_of("kerv calibrate", self.settings, self.settings.runtime.device)
         sections, earlier = self._fill_empty({"variability": variability, "boundary": boundary, "skip": skip})
         calibration = Calibration(
             target=MadeFor.of(self.description),
@@ -208,7 +202,7 @@ class CalibrationRun:
             noise=noise,
             errors=prediction_errors(self.windows, noise, space),
             **sections,
-            provenance={**origin, "kept": earlier} if earlier else origin,
+            provenance={**provenance, "kept": earlier} if earlier else provenance,
         )
         write_json(self.path, asdict(calibration))
         return calibration

@@ -37,7 +37,7 @@ class PolicyActor:
         self.executed: NDArray[np.float32] | None = None
 
     def reset(self, world: World, seed: int) -> None:
-        """See `Actor.reset`."""
+        """Begins an episode in a world that was reset."""
         self.world = world
         self.random = np.random.default_rng([seed, *world.task.encode()])
         self.actions.clear()
@@ -46,7 +46,7 @@ class PolicyActor:
         self.decoder.reset(world.task, seed, world.end_effector)
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Actor.act`."""
+        """The action (D,) to execute now, of the policy or, in the expert's chunks, the expert's `label`."""
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)
         if not self.actions and not self.expert_steps:
@@ -80,8 +80,8 @@ class PolicyActs:
         the target sees, for a target that will see them.
 
         Raises:
-            UsageError: no such target, frames of another camera, a method that does not fit, or as `check_world`.
-            CheckpointError: an artifact is missing or damaged, or as `check_world`.
+            UsageError: no such target, frames of another camera, a method that does not fit.
+            CheckpointError: an artifact is missing or damaged, or the policy is of another environment.
         """
         name, world = settings.policy.target, settings.world
         description = _artifacts(settings).description

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
 from kerv_cli.base.places import artifact
-from kerv_cli.base.provenance import provenance
+from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDatastoreSettings
 from kerv_cli.base.spaces import ObservationSpace
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.heisd.datastore import (
     PAYLOAD,
@@ -33,13 +36,14 @@ from kerv_cli.methods.heisd.datastore import (
 )
 from kerv_cli.training.demonstrations import demos_for, subset
 from kerv_cli.training.imitation import WITHIN
-from kerv_cli.training.observations import check_shown, read_chunks
-from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
+from kerv_cli.training.observations import observations_of, prompts_of, read_chunks, steps_of
 from kerv_cli.training.skip_levels import neighbours_elsewhere
 from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 BATCH = 128  # observations encoded at once
+TESTED = 200  # entries per task
 KEYS = ("vision", "scene", "proprioception")
 """Parts of the prompt that can be part of a key. The instruction is none: it is the same for all entries of a task."""
 
@@ -56,17 +60,17 @@ class Entries:
 
 @torch.inference_mode()
 def entries_of(
-    target: Any, episode: DemoEpisode, segments: Sequence[str], stride: int = 1, space: ObservationSpace | None = None
+    target: ReadableTarget, episode: DemoEpisode, segments: Sequence[str], stride: int, space: ObservationSpace
 ) -> Entries:
     """Every `stride`-th observation of the episode as a key, with the expert's next H clean actions as its tokens.
-    space: of the demonstrations' observations, where it is not the target's.
+    segments: parts of the prompt that make the key. space: of the demonstrations' observations.
 
     Raises:
         CheckpointError: too few labels, or frames of another size than the target takes.
     """
-    steps = steps_of(target, episode)[::stride]
+    steps = steps_of(episode, bool(target.cameras))[::stride]
     tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
-    observations = observations_of(target, episode, steps, space or target.observation)
+    observations = observations_of(target, episode, steps, space)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
     keys = [prompt_key(prompt, target, segments) for prompt in prompts_of(target, observations, size)]
     return Entries(np.concatenate(keys), tokens.astype(np.uint8), steps.astype(np.int64), episode.steps - steps)
@@ -103,8 +107,6 @@ class DatastoreBuild:
         self.folder = self.artifacts.path("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
-        description = self.artifacts.description
-        check_shown(self.dataset, description)
         entries = self.dataset.episodes  # of every task the first ones by seed
         by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)
         most = settings.episodes or None
@@ -129,11 +131,12 @@ class DatastoreBuild:
             f"through {self.artifacts.folder}, keys from {' + '.join(self.settings.key)}"
         )
 
-    def build(self, progress: Callable[[int, int], None] = lambda done, total: None) -> Datastore:
+    def build(self, progress: OnProgress = lambda done, total: None) -> Datastore:
         """Writes the datastore atomically, replacing an older one.
 
         Raises:
-            CheckpointError: as `entries_of`. StorageError: writing failed.
+            CheckpointError: too few labels, or frames of another size than the target takes.
+            StorageError: writing failed.
         """
         target: Any = self.artifacts.target
         space = self.dataset.manifest.observation
@@ -153,8 +156,6 @@ class DatastoreBuild:
 
     def _arrays(self, parts: list[Entries], seeds: np.ndarray, shards: Mapping[str, Shard]) -> dict[str, Any]:
         """File name -> its contents, an array or a table."""
-        import pyarrow as pa
-
         keys, files = np.concatenate([p.keys for p in parts]), {}
         if self.settings.components:
             files[PROJECTION] = directions(keys, self.settings.components)
@@ -175,8 +176,6 @@ class DatastoreBuild:
 
     def _write(self, folder: Path, files: Mapping[str, Any], shards: dict[str, Shard]) -> None:
         """Writes every file, and last the manifest with their hashes."""
-        import pyarrow.parquet as pq
-
         for name, content in files.items():
             # written to memory first: numpy and pyarrow report a full disk without its errno
             buffer = io.BytesIO()
@@ -186,7 +185,6 @@ class DatastoreBuild:
                 np.save(buffer, content)
             (folder / name).write_bytes(buffer.getbuffer())
         target = self.artifacts.description
-        origin = {"command": "kerv build datastore", "settings": asdict(self.settings), **provenance(self.device)}
         manifest = Manifest(
             format=2,
             kind="datastore",
@@ -199,18 +197,18 @@ class DatastoreBuild:
             demos=self.dataset.sha256,
             files={name: sha256_of(folder / name) for name in files},
             tasks=shards,
-            provenance=origin,
+            provenance=provenance_of("kerv build datastore", self.settings, self.device),
         )
         write_json(folder / "manifest.json", asdict(manifest))
 
 
-def leave_one_out(store: Datastore, per_task: int = 200) -> dict[str, float]:
-    """How well the nearest neighbours in other episodes predict the chunks of `per_task` entries of each task: shares
+def leave_one_out(store: Datastore) -> dict[str, float]:
+    """How well the nearest neighbours in other episodes predict the chunks of TESTED entries of each task: shares
     of equal tokens and of those within WITHIN bins, the median similarity, and the median time of a search for five
     neighbours in ms. Empty where no task has two episodes."""
     gaps, similarities, seconds = [], [], []
     for name in store.shards:
-        rows, similarity, chunks = neighbours_elsewhere(store, name, per_task)
+        rows, similarity, chunks = neighbours_elsewhere(store, name, TESTED)
         gaps.append(np.abs(chunks - store.tokens[rows]))
         similarities.append(similarity)
         for row in rows:

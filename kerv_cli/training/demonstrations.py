@@ -13,8 +13,9 @@ import numpy as np
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
+from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import TargetDescription, described
-from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds import resolve_tasks, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 S = TypeVar("S", bound=DemonstrationSettings)
@@ -52,8 +53,8 @@ def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> 
     name = [] if folder.name == name_of(tasks) else [f"name={folder.name}"]
     task = [f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]"] if tasks else []
     words = [*name, *task, *([f"episodes={episodes}"] if episodes else [])]
-    there = sorted(path.parent.name for path in (results_dir(results) / "artifacts/demos").glob("*/manifest.json"))
-    others = f", or name others: demos={' or demos='.join(there)}" if there else ""
+    stored = sorted(path.parent.name for path in (results_dir(results) / "artifacts/demos").glob("*/manifest.json"))
+    others = f", or name others: demos={' or demos='.join(stored)}" if stored else ""
     return f"record them with '{' '.join(['kerv demos', *words])}'{others}"
 
 
@@ -63,30 +64,58 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     does not know, the tasks that it does; no task stands for all.
 
     Raises:
-        UsageError: no such target. CheckpointError: as `open_demos`.
+        UsageError: no such target. CheckpointError: as `open_demos`, or they are of another environment, or for a
+            compact target of other views.
     """
     target = described(find_target(settings.results, settings.policy.target), "target", TargetDescription)
-    recorded = target.provenance.get("demos") if not settings.demos else None
-    config = recorded.get("config") if isinstance(recorded, dict) else None
+    origin = target.provenance.get("demos") if not settings.demos else None
+    config = origin.get("config") if isinstance(origin, dict) else None
     episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     names = resolve_tasks(tasks) if tasks else ()
     dataset = open_demos(settings.results, name, tasks or target.tasks, episodes)
-    there = list(dataset.manifest.tasks)
-    same = dataset.manifest.environment == target.environment  # else the spaces differ, which is said instead
+    check_spaces(dataset, target.actions, target.observation, "the target")
+    if target.family == "compact" and target.cameras:
+        camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])
+        check_camera(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
+    recorded = list(dataset.manifest.tasks)
+    same = dataset.manifest.environment == target.environment
     for task in names if same else ():
-        if task not in there:
+        if task not in recorded:
             raise CheckpointError(
                 f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "
-                f"{', '.join(there)}, or record others with 'kerv demos task={task}' and name them by demos="
+                f"{', '.join(recorded)}, or record others with 'kerv demos task={task}' and name them by demos="
             )
     trained = resolve_tasks(target.tasks) if target.tasks and not tasks else ()
-    if set(there) - set(trained):
-        tasks = tasks or [task for task in there if task in trained]
+    if set(recorded) - set(trained):
+        tasks = tasks or [task for task in recorded if task in trained]
     return replace(settings, demos=name, task=tasks), dataset
 
 
-def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str = ALL) -> DemoDataset:
+def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
+    """Refuses demonstrations of another environment. actions, observation: spaces of `owner`, e.g. "the target".
+
+    Raises:
+        CheckpointError: other actions or observations.
+    """
+    where = f"the demonstrations in {dataset.path}"
+    dataset.manifest.actions.check_same(actions, where, owner)
+    if observation.state and observation != dataset.manifest.observation:  # without a state it reads images alone
+        raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
+
+
+def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> None:
+    """Refuses demonstrations whose frames are of another camera than `camera`. who, remedy: for the message.
+
+    Raises:
+        CheckpointError: they are.
+    """
+    recorded = dataset.manifest.config["camera"]["name"]
+    if recorded != camera:
+        raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
+
+
+def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str) -> DemoDataset:
     """The dataset with only the episodes of `tasks` (tasks and suites; none: all), and with starts=half only those that
     begin on one side.
 

@@ -6,14 +6,20 @@ embeddings and tokens are what the drafter imitates, under the same causal mask 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.protocol import Target
@@ -21,8 +27,90 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import Drafter, DrafterArtifact, DrafterProposer
 from kerv_cli.methods.spec_vla import Relaxed
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.recorded import StatesByLength, TeacherStates, teach
+from kerv_cli.training.observations import Rows, held_out_every, observations_of, prompts_of, steps_of
 from kerv_cli.training.runs import DrafterRun
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+
+
+@dataclass(frozen=True)
+class TeacherStates(Rows):
+    """The target's greedy decodes of n observations whose prompts are equally long."""
+
+    prompt: Tensor  # (n, P, E) float16
+    hidden: Tensor  # (n, P + N − 1, E) float16
+    tokens: Tensor  # (n, N) int64
+
+    def prompts(self, count: int) -> list[Tensor]:
+        """At most `count` prompts (1, P, E), evenly spread."""
+        chosen = torch.linspace(0, len(self) - 1, min(count, len(self))).long().tolist()
+        return [self.prompt[i : i + 1] for i in chosen]
+
+
+@dataclass(frozen=True)
+class StatesByLength:
+    """Teacher states: a group per length of the prompt, rows counted through all groups."""
+
+    groups: tuple[TeacherStates, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.groups))
+
+    def parts(self, indices: Tensor) -> list[TeacherStates]:
+        """The rows at `indices` (B,), in batches of one prompt length."""
+        batches, first = [], 0
+        for group in self.groups:
+            rows = indices[(indices >= first) & (indices < first + len(group))] - first
+            if len(rows):
+                batches.append(group.where(rows))
+            first += len(group)
+        return batches
+
+    def prompts(self, count: int) -> list[Tensor]:
+        """About `count` prompts (1, P, E): from every group in proportion to its rows, evenly spread."""
+        return [x for group in self.groups for x in group.prompts(max(1, round(count * len(group) / len(self))))]
+
+
+@torch.inference_mode()
+def teach(
+    target: Target, dataset: DemoDataset, limit: int, held_out: float, on_progress: OnProgress
+) -> tuple[StatesByLength, StatesByLength]:
+    """The target's greedy decodes of at most `limit` observations, evenly spread -> (training, held out) by whole
+    episodes, as `split` divides them.
+
+    Raises:
+        CheckpointError: a single episode, or a damaged one.
+    """
+    every = held_out_every(len(dataset.episodes), held_out)
+    sides: tuple[list[tuple[int, int]], ...] = ([], [])
+    for index in range(len(dataset.episodes)):
+        steps = steps_of(dataset.load(index), bool(target.cameras))
+        sides[index % every == every - 1].extend((index, int(t)) for t in steps)
+    states = _decodes(target, dataset, sides[0], limit, on_progress)
+    return states, _decodes(target, dataset, sides[1], max(60, limit // 50), lambda done, total: None)
+
+
+def _decodes(
+    target: Target,
+    dataset: DemoDataset,
+    rows: Sequence[tuple[int, int]],
+    limit: int,
+    on_progress: OnProgress,
+) -> StatesByLength:
+    """The decodes of at most `limit` of the rows, (episode, control step), evenly spread."""
+    chosen = [rows[i] for i in torch.linspace(0, len(rows) - 1, min(limit, len(rows))).long().tolist()]
+    groups, done = defaultdict[int, list[TeacherStates]](list), 0
+
+    def observations() -> Iterator[Observation]:
+        for index, group in itertools.groupby(chosen, lambda row: row[0]):
+            steps = np.array([step for _, step in group])
+            yield from observations_of(target, dataset.load(index), steps, dataset.manifest.observation)
+
+    for prompt in prompts_of(target, observations()):
+        tokens, hidden = greedy(target, prompt)
+        groups[prompt.shape[1]].append(TeacherStates(prompt.half().cpu(), hidden.half().cpu(), tokens.cpu()))
+        done += len(prompt)
+        on_progress(done, len(chosen))
+    return StatesByLength(tuple(map(TeacherStates.joined, groups.values())))
 
 
 class Distillation:
@@ -112,13 +200,13 @@ def acceptance_length(target: Target, drafter: Drafter, prompts: list[Tensor], r
 
 
 class EagleRun(DrafterRun):
-    """`kerv train drafter`: the EAGLE-style drafter; errors as `DrafterRun`, and noise on several processes."""
+    """`kerv train drafter`: the EAGLE-style drafter."""
 
     artifact = DrafterArtifact()
     before: ClassVar[Mapping[str, float]] = {"width": 512, "rank": 64, "history": 2}
 
     def begin(self) -> None:
-        """See `Run.begin`."""
+        """Chooses the device, and joins the other processes. UsageError: noise, or a batch, that they cannot share."""
         super().begin()
         noise = self.settings.drafter.noise
         if noise and self.ranks.size > 1:
@@ -126,7 +214,7 @@ class EagleRun(DrafterRun):
                 f"drafter.noise={noise} is drawn for a whole batch: train with one process, or without noise"
             )
 
-    def lesson(self, progress: Callable[[int, int], None]) -> Distillation:
+    def lesson(self, progress: OnProgress) -> Distillation:
         """The target's states of training and validation."""
         settings, share = self.settings.drafter, self.settings.train.held_out
         states, held_out = teach(self.target, self.dataset, settings.samples, share, progress)

@@ -5,7 +5,7 @@ Prompts are pooled to features right after encoding, so that neither frames nor 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,10 +21,9 @@ from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyArtifact, EarlyDrafter, choose
 from kerv_cli.training.imitation import soft_labels, token_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Rows, split
-from kerv_cli.training.recorded import observations_of, prompts_of, steps_of
+from kerv_cli.training.observations import Rows, observations_of, prompts_of, split, steps_of
 from kerv_cli.training.runs import DrafterRun
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 RADII = {"strict": 0, "r3": 3, "r9": 9}
@@ -51,7 +50,7 @@ def teach_early(
     target: ReadableTarget,
     dataset: DemoDataset,
     settings: EarlySettings,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> EarlySamples:
     """The target's decodes of about `settings.samples` observations, spread evenly over all episodes.
 
@@ -63,7 +62,7 @@ def teach_early(
     def observations() -> Iterator[Observation]:
         for index in range(len(dataset.episodes)):
             episode = dataset.load(index)
-            steps = evenly(steps_of(target, episode), share)
+            steps = evenly(steps_of(episode, bool(target.cameras)), share)
             columns.append(columns_of(episode, index, len(steps)))
             yield from observations_of(target, episode, steps, dataset.manifest.observation)
             on_progress(index + 1, len(dataset.episodes))
@@ -164,7 +163,7 @@ def measure(logits: Tensor, samples: Decodes, strict: Tensor) -> Metrics:
 
 
 class EarlyRun(DrafterRun):
-    """`kerv train drafter drafter=early`; errors as `DrafterRun`."""
+    """`kerv train drafter drafter=early`."""
 
     artifact = EarlyArtifact()
     before: ClassVar[Mapping[str, float]] = {
@@ -175,7 +174,7 @@ class EarlyRun(DrafterRun):
         "token_weight": 0.1,
     }
 
-    def lesson(self, progress: Callable[[int, int], None]) -> EarlyDistillation:
+    def lesson(self, progress: OnProgress) -> EarlyDistillation:
         """The target's tokens and pooled prompts."""
         settings, train = self.settings.drafter, self.settings.train
         samples = teach_early(self.target, self.dataset, settings, progress)

@@ -27,7 +27,7 @@ from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.worlds import specs
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 WITHIN = 9
 """Bins; validation reports the share of tokens that are off by at most this many (the relaxed radius of Spec-VLA)."""
@@ -49,9 +49,9 @@ def load_samples(
     settings: TargetSettings,
     words: WordTokenizer,
     task_names: tuple[str, ...],
-    on_episode: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> Samples:
-    """Reads the tasks' episodes into memory; on_episode(done, total) follows each.
+    """Reads the tasks' episodes into memory.
 
     Raises:
         CheckpointError: a task without an episode, too few labels or frames of another size.
@@ -68,7 +68,7 @@ def load_samples(
         episodes = torch.full((len(observations),), number)
         tasks = torch.full_like(episodes, task_names.index(episode.task))
         parts.append(Samples(**vars(observations), chunks=chunks, episodes=episodes, tasks=tasks))
-        on_episode(number + 1, len(chosen))
+        on_progress(number + 1, len(chosen))
     return Samples.joined(parts)
 
 
@@ -206,10 +206,10 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
         UsageError: the first shape that differs.
     """
     for name, value in asdict(settings).items():
-        there = description.settings.get(name)
-        if name not in ("size", "chunk", "parallel") and there != value:
+        stored = description.settings.get(name)
+        if name not in ("size", "chunk", "parallel") and stored != value:
             raise UsageError(
-                f"train.init: the target in {folder} has {name}={there}, the run target.{name}={value}: set both alike"
+                f"train.init: the target in {folder} has {name}={stored}, the run target.{name}={value}: set both alike"
             )
     trained = description.cameras[0] if description.cameras else ""
     if settings.observation == "vision" and not f"{camera}+".startswith(f"{trained}+"):

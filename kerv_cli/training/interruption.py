@@ -14,20 +14,13 @@ SAME_REQUEST = 2.0
 """Seconds after a signal in which another one of its kind is a repetition and no second request."""
 
 
-class Stop:
-    """Whether the user asked to stop."""
-
-    def __init__(self) -> None:
-        self.requested = False
-
-
 @contextmanager
-def until_interrupted() -> Iterator[Stop]:
-    """Yields a Stop that the first SIGINT or SIGTERM sets (schedulers and `timeout` send the latter); a second one of
+def until_interrupted() -> Iterator[threading.Event]:
+    """Yields an event that the first SIGINT or SIGTERM sets (schedulers and `timeout` send the latter); a second one of
     the same kind raises KeyboardInterrupt at once. One that follows within seconds is the same request: torchrun and
     schedulers pass on a signal that the process has received already. Outside the main thread no signal sets it, and a
     signal that is ignored stays ignored."""
-    stop = Stop()
+    stop = threading.Event()
     first_times: dict[int, float] = {}
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -37,9 +30,9 @@ def until_interrupted() -> Iterator[Stop]:
         now = time.monotonic()
         if now - first_times.setdefault(number, now) > SAME_REQUEST:
             raise KeyboardInterrupt
-        if stop.requested:
+        if stop.is_set():
             return
-        stop.requested = True
+        stop.set()
         again = "Ctrl-C again" if number == signal.SIGINT else "a second one"
         print(f"stopping after this step; {again} stops at once and keeps the last saved state", file=sys.stderr)
 

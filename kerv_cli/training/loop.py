@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from kerv_cli.base.files import atomic_path, regular
 from kerv_cli.base.manifests import read
 from kerv_cli.base.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
-from kerv_cli.training.interruption import Stop, until_interrupted
+from kerv_cli.training.interruption import until_interrupted
 from kerv_cli.training.ranks import ALONE, Ranks
 
 Metrics = dict[str, float]
@@ -56,7 +57,7 @@ def draw_samples(samples: int, size: int, generator: torch.Generator, borders: T
 
 
 @dataclass(frozen=True)
-class Progress:
+class RunProgress:
     """The progress of a run. identity: hash of everything that determines it. step: steps done. best: greatest score so
     far, None before the first validation. history: the metrics of every validation."""
 
@@ -69,7 +70,7 @@ class Progress:
 class Loop:
     """Optimises a lesson's module. save: writes the best weights, which have these metrics. folder: holds
     `resume.safetensors` and `log.csv`. identity: hash of everything that determines the run; another run is never
-    resumed. ranks: the rank of this process among those that train together. borders: as in `draw_samples`."""
+    resumed. ranks: the rank of this process among those that train together. borders: of `draw_samples`."""
 
     def __init__(
         self,
@@ -112,7 +113,7 @@ class Loop:
                 if self.ranks.first and (self.step % settings.validate_every == 0 or self.step == settings.steps):
                     self.check(metrics)
                     on_step(self.step, self.history[-1])
-                interrupted = stopping if self.ranks.size > 1 else stop.requested  # ranks agree on it one step later
+                interrupted = stopping if self.ranks.size > 1 else stop.is_set()  # ranks agree on it one step later
                 if interrupted and self.step < settings.steps:
                     if self.ranks.first:
                         self.store()
@@ -127,7 +128,7 @@ class Loop:
             )
         return max(self.history, key=lambda m: m["score"])
 
-    def update(self, stop: Stop) -> tuple[Metrics, bool]:
+    def update(self, stop: threading.Event) -> tuple[Metrics, bool]:
         """One optimiser step -> loss and logged numbers, and whether any rank was asked to stop.
 
         Raises:
@@ -141,7 +142,7 @@ class Loop:
         loss, metrics = self.lesson.loss(indices, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        mean, stopping = self.ranks.averaged(self.module.parameters(), (loss.item(), float(stop.requested)))
+        mean, stopping = self.ranks.averaged(self.module.parameters(), (loss.item(), float(stop.is_set())))
         if not math.isfinite(mean):
             raise KervError(f"training diverged at step {self.step} (loss {mean}): lower train.lr")
         nn.utils.clip_grad_norm_(self.module.parameters(), settings.clip)
@@ -184,7 +185,7 @@ class Loop:
             tensors |= {f"optimiser.{i}.{k}": v for k, v in moments.items()}
         tensors["losses"] = torch.tensor(self.losses, dtype=torch.float64)
         best = self.best if self.history else None
-        progress = Progress(self.identity, self.step, best, self.history)
+        progress = RunProgress(self.identity, self.step, best, self.history)
         write_state(self.folder / "resume.safetensors", tensors, progress)
         self.log()
 
@@ -226,14 +227,14 @@ class Loop:
         self.log()  # the run may have ended before it wrote the log
 
 
-def write_state(path: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
+def write_state(path: Path, tensors: Mapping[str, Tensor], progress: RunProgress) -> None:
     """Writes tensors and progress into one file, so that a kill cannot leave them at different steps."""
     text = json.dumps(asdict(progress), allow_nan=False)
     # one key, because safetensors writes several in random order and equal states shall be equal bytes
     save_tensors(path, tensors, {"state": json.dumps({"progress": text, "sha256": digest(tensors, text)})})
 
 
-def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
+def read_state(path: Path) -> tuple[dict[str, Tensor], RunProgress]:
     """The inverse of `write_state`.
 
     Raises:
@@ -249,7 +250,7 @@ def read_state(path: Path) -> tuple[dict[str, Tensor], Progress]:
         raise CheckpointError(f"training state at {path} is damaged ({error}): {again}") from error
     if not intact:
         raise CheckpointError(f"training state at {path} is damaged, its hash does not fit: {again}")
-    return tensors, read(Progress, value, str(path))
+    return tensors, read(RunProgress, value, str(path))
 
 
 def digest(tensors: Mapping[str, Tensor], text: str) -> str:

@@ -1,9 +1,10 @@
-"""Reads demonstrations as the observations of a policy: the one reader of training, distillation, datastore and
-calibration."""
+"""Reads demonstrations as observations: `read_observations` as the batches of a compact target, which trains on them,
+`observations_of` as any target gets them in an episode. Training, distillation, datastore and calibration read here."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Self, TypeVar
 
@@ -13,20 +14,21 @@ from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.settings import TargetSettings
-from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.protocol import EncodesMany, Target
 from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.worlds import instruction_of, specs
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import EncodedFrames
+
+BATCH = 64
+"""Observations that a target encodes and decodes together."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Base of dataclasses whose tensors have one row per sample. An optional tensor may be None, and frames may stay
-    encoded."""
+    """Base of dataclasses with one row per sample: of tensors, encoded frames, or None for frames that are not seen."""
 
     def __len__(self) -> int:
         return next(len(x) for x in vars(self).values() if x is not None)
@@ -52,7 +54,7 @@ def _joined(column: Sequence[Any]) -> Any:
 class Observations(Rows):
     """n observations, in the order of episodes and control steps."""
 
-    frames: Tensor | EncodedFrames | None  # (n, size, size x views, 3) uint8; None for a state policy
+    frames: EncodedFrames | None  # (n, size, size x views, 3) uint8; None for a state policy
     proprioception: Tensor  # (n, p) float32
     states: Tensor  # (n, s) float32, privileged
     words: Tensor  # (n, L) int64
@@ -62,9 +64,7 @@ class Observations(Rows):
         """The observations at `indices` (B,) as a batch on `device`."""
         images = None
         if self.frames is not None:
-            chosen = self.frames[indices]
-            pixels = torch.from_numpy(chosen.pixels()) if isinstance(chosen, EncodedFrames) else chosen
-            images = pixels.to(device).permute(0, 3, 1, 2)
+            images = torch.from_numpy(self.frames[indices].pixels()).to(device).permute(0, 3, 1, 2)
         return Inputs(images, *(x[indices].to(device) for x in (self.proprioception, self.states, self.words)))
 
 
@@ -75,18 +75,18 @@ def read_observations(
     words: WordTokenizer,
     chosen: slice | np.ndarray = slice(None),
 ) -> Observations:
-    """The observations of an episode that a policy of these settings learns from: those with a frame, for a state
+    """The observations of a stored episode that a policy of these settings learns from: those with a frame, for a state
     policy every step. chosen: which of them, default all.
 
     Raises:
         CheckpointError: frames of another size than the policy takes.
     """
     sees, frames = settings.observation == "vision", None
-    steps = (episode.frame_steps if sees else np.arange(episode.steps))[chosen]
+    steps = steps_of(episode, sees)[chosen]
     if sees:
         check_frames(episode, settings.image_size)
-        pictures = episode.frames[chosen]
-        frames = pictures if isinstance(pictures, EncodedFrames) else torch.from_numpy(pictures)
+        assert isinstance(episode.frames, EncodedFrames)
+        frames = episode.frames[chosen]
     states = torch.from_numpy(episode.states[steps]).float()
     ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
     proprioception = states[:, : len(space.proprioception)]
@@ -102,6 +102,47 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
     return np.stack([episode.labels[t : t + chunk] for t in steps])
+
+
+def steps_of(episode: DemoEpisode, sees: bool) -> np.ndarray:
+    """Control steps (n,) whose observation is recorded: for a policy that sees those with a frame, else all."""
+    return episode.frame_steps if sees else np.arange(episode.steps)
+
+
+def observations_of(
+    target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
+) -> list[Observation]:
+    """The observations at some control steps (n,) of a demonstration, as the target takes them; all its cameras see the
+    recorded frame. space: the demonstrations'.
+
+    Raises:
+        CheckpointError: cameras, but no frame of one of the steps, or frames of another size than `frame_shape`.
+    """
+    pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
+    if target.cameras:
+        if frame_shape := getattr(target, "frame_shape", None):
+            check_frames(episode, frame_shape[0])
+        rows = np.searchsorted(episode.frame_steps, steps).clip(max=len(episode.frame_steps) - 1)
+        missing = steps[episode.frame_steps[rows] != steps]
+        if len(missing):
+            raise CheckpointError(f"step {missing[0]} of {episode.task} {episode.seed} has no frame: record every step")
+        pictures = [dict.fromkeys(target.cameras, frame) for frame in np.asarray(episode.frames[rows])]
+    states, instruction = episode.states[steps].astype(np.float64), instruction_of(episode.task)
+    count = len(space.proprioception)
+    return [
+        Observation(state[:count], state, instruction, images) for state, images in zip(states, pictures, strict=True)
+    ]
+
+
+def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
+    """The prompts (B, P, E) of the observations, in order, at most `size` together and those of one length alone."""
+    remaining = iter(observations)
+    while batch := list(itertools.islice(remaining, size)):
+        if isinstance(target, EncodesMany):
+            yield target.encode_many(batch)
+            continue
+        prompts = (target.encode(observation) for observation in batch)
+        yield from (torch.cat(list(equal)) for _, equal in itertools.groupby(prompts, lambda prompt: prompt.shape[1]))
 
 
 def check_tail(episode: DemoEpisode, steps: int, what: str) -> None:
@@ -133,40 +174,15 @@ def check_frames(episode: DemoEpisode, size: int) -> None:
         )
 
 
-def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
-    """Refuses demonstrations of another environment. actions, observation: spaces of `owner`, e.g. "the target".
+def held_out_every(episodes: int, share: float) -> int:
+    """k, of so many episodes of which every k-th is held out. share: above 0, at most 0.5.
 
     Raises:
-        CheckpointError: other actions or observations.
+        CheckpointError: a single episode.
     """
-    where = f"the demonstrations in {dataset.path}"
-    dataset.manifest.actions.check_same(actions, where, owner)
-    if observation.state and observation != dataset.manifest.observation:  # without a state it reads images alone
-        raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
-
-
-def check_shown(dataset: DemoDataset, description: TargetDescription) -> None:
-    """Refuses demonstrations of another environment than a target's, or, for a compact one that sees, of other views.
-
-    Raises:
-        CheckpointError: other actions, observations or views.
-    """
-    check_spaces(dataset, description.actions, description.observation, "the target")
-    if description.family != "compact" or not description.cameras:
-        return
-    camera = specs()[dataset.manifest.environment].camera_name(description.cameras[0])
-    check_camera(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
-
-
-def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> None:
-    """Refuses demonstrations whose frames are of another camera than `camera`. who, remedy: for the message.
-
-    Raises:
-        CheckpointError: they are.
-    """
-    recorded = dataset.manifest.config["camera"]["name"]
-    if recorded != camera:
-        raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
+    if episodes < 2:
+        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
+    return min(max(2, round(1 / share)), episodes)
 
 
 S = TypeVar("S", bound=Rows)
@@ -174,15 +190,13 @@ S = TypeVar("S", bound=Rows)
 
 def split(samples: S, share: float) -> tuple[S, S]:
     """(training, held out) by whole episodes, of samples with a tensor `episodes`. Every k-th episode is held out, so
-    that each task, plain and perturbed, is in both parts. share: above 0, at most 0.5.
+    that each task, plain and perturbed, is in both parts. share: above 0, at most
+    0.5.
 
     Raises:
         CheckpointError: a single episode.
     """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
-    count = int(episodes.max()) + 1
-    if count < 2:
-        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    every = min(max(2, round(1 / share)), count)
+    every = held_out_every(int(episodes.max()) + 1, share)
     held_out = episodes % every == every - 1
     return samples.where(~held_out), samples.where(held_out)

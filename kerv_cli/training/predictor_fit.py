@@ -4,7 +4,7 @@ episodes, every predictor's error on held-out ones (docs/methods.md §3.1)."""
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.methods.calibration import Errors
 from kerv_cli.methods.kinematics.prediction import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
 from kerv_cli.training.observations import check_tail
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 RATIOS = np.logspace(-3, 3, 49)  # q / r that are tried, r = 1
@@ -71,7 +71,7 @@ def read_windows(
     history: str,
     window: int,
     horizon: int,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> Windows:
     """The windows of the episodes `chosen`: index in the dataset -> whether it is held out.
 

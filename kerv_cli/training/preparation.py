@@ -42,8 +42,8 @@ def plan(settings: PrepareSettings) -> list[Step]:
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
     spec = specs().get(description.environment)
-    played = spec is not None and bool(spec.world_class)
-    kinds = needs(tuple(settings.methods), bool(description.cameras), played)
+    runnable = spec is not None and bool(spec.world_class)
+    kinds = needs(tuple(settings.methods), bool(description.cameras), runnable)
     steps: list[Step] = []
     for kind in kinds:
         command = list(kind_of(kind).command)
@@ -59,9 +59,9 @@ def plan(settings: PrepareSettings) -> list[Step]:
 
 
 @functools.cache
-def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[str, ...]:
+def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[str, ...]:
     """Kinds of artifacts that methods need, in the order in which they are made. methods: none: all that the target can
-    have. sees: whether it has cameras. played: whether its environment can be run, and is not a recording alone.
+    have. sees: whether it has cameras. runnable: whether its environment can be run, and is not a recording alone.
 
     Raises:
         UnknownName: no such method. UsageError: one needs what a target without cameras cannot have.
@@ -78,19 +78,19 @@ def needs(methods: tuple[str, ...], sees: bool, played: bool = True) -> tuple[st
         if methods and not sees and seeing & set(method.needs):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds |= set(method.needs)
-    if "certificate" in kinds and sees and played:  # its candidates run before one of them is certified
+    if "certificate" in kinds and sees and runnable:  # its candidates run before one of them is certified
         candidates = resolve([f"study={CalibrateSuccessSettings.groups['study']}"]).settings.values()
         kinds |= {kind for settings in candidates for kind in Method.of(settings).needs}
     if not sees:
         kinds -= seeing
-    if not played:
+    if not runnable:
         kinds -= {"certificate"}
     order = dict.fromkeys(kind for name, part in artifacts.items() for kind in (*part.needs(None), name))
     return tuple(kind for kind in order if kind in kinds and kind_of(kind).command)
 
 
 def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
-    """See `Step.state`.
+    """Whether the artifact is there, missing, half trained or of other artifacts.
 
     Raises:
         CheckpointError: a trained one is of another target.
@@ -100,8 +100,8 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         return MISSING
     try:
         described = files.checked(path, artifacts.description)
-        made = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
-        artifacts.check(made[: made.index(kind) + 1])
+        present = [one for one in kinds if kind_of(one).json(artifacts.path(one)).is_file()]
+        artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
         if isinstance(files, Weights):
             name = f"{kind}/{path.name}"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.provenance import provenance
+from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDrafterSettings
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -34,14 +34,9 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     drafter = PublicDrafter(shape)
     drafter.load_state_dict(tensors, assign=True)  # stored in their own number format
     parameters = sum(tensor.numel() for tensor in tensors.values())
-    origin = {
-        "command": "kerv build drafter",
-        "settings": asdict(settings),
-        "parameters": parameters,
-        **provenance(device),
-    }
+    provenance = provenance_of("kerv build drafter", settings, device, parameters=parameters)
     made_for = MadeFor.of(artifacts.description)
     shapes = asdict(DrafterSettings(kind="public", layers=shape.language.num_hidden_layers))
-    DrafterArtifact().save(folder, drafter, made_for, origin, settings=shapes, public=asdict(shape))
+    DrafterArtifact().save(folder, drafter, made_for, provenance, settings=shapes, public=asdict(shape))
     figures = {"parameters": parameters, "layers": shape.language.num_hidden_layers, **asdict(convention)}
     return folder, figures

@@ -16,15 +16,24 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import artifact, find_target
-from kerv_cli.base.provenance import provenance
+from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.engine.protocol import ReadableTarget
+from kerv_cli.lab.run import success_of
 from kerv_cli.methods.artifacts import MadeFor, Weights
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.demonstrations import demos_for, name_of, open_demos, subset
+from kerv_cli.training.demonstrations import (
+    check_camera,
+    check_spaces,
+    demos_for,
+    name_of,
+    open_demos,
+    subset,
+)
 from kerv_cli.training.imitation import (
     Imitation,
     check_init,
@@ -35,12 +44,10 @@ from kerv_cli.training.imitation import (
     vocabulary,
 )
 from kerv_cli.training.loop import Lesson, Loop, Metrics
-from kerv_cli.training.observations import check_camera, check_shown, check_spaces
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
-Progress = Callable[[int, int], None]
 RANGED = 200
 """Episodes from which the range of states is taken."""
 
@@ -57,7 +64,7 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
 
 class Run(ABC):
     """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
-    `plan` says in one line what would be done. borders: as in `draw_samples`. losses: of every step, once trained."""
+    `plan` says in one line what would be done. borders: of `draw_samples`. losses: of every step, once trained."""
 
     kind: str  # the word behind `kerv train`
     settings: TrainTargetSettings | TrainDrafterSettings
@@ -103,15 +110,12 @@ class Run(ABC):
 
     def save(self, module: nn.Module, metrics: Metrics) -> None:
         """Writes the weights with their provenance; metrics: of their validation."""
-        origin = {
-            "command": f"kerv train {self.kind}",
-            "settings": asdict(self.settings),
+        figures = {
             "demos": {"sha256": self.dataset.sha256, "config": self.dataset.manifest.config},
             "validation": metrics,
             "parameters": sum(p.numel() for p in module.parameters()),
-            **provenance(self.device),
         }
-        self.write(module, origin)
+        self.write(module, provenance_of(f"kerv train {self.kind}", self.settings, self.device, **figures))
 
 
 def freeze(target: CompactTarget, names: list[str]) -> None:
@@ -187,9 +191,8 @@ class TargetRun(Run):
             + (f", beginning with {self.init}" if self.init else "")
         )
 
-    def load(self, progress: Progress) -> None:
-        """Reads the demonstrations and the weights of `train.init` into memory, and makes the target; progress(done,
-        total).
+    def load(self, progress: OnProgress) -> None:
+        """Reads the demonstrations and the weights of `train.init` into memory, and makes the target.
 
         Raises:
             CheckpointError: one of them is damaged or of another environment.
@@ -217,13 +220,11 @@ class TargetRun(Run):
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
-        from kerv_cli.lab.run import success_of
-
         seeds = self.spec.seeds.selection[: self.settings.train.closed_loop]
         return success_of(target, self.tasks, seeds, self.world)
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
-        """See `Run.write`."""
+        """Writes the target's folder."""
         assert isinstance(module, CompactTarget)
         environment = self.dataset.manifest.environment
         stored, states = self.settings.train.stored, self.state_range
@@ -231,7 +232,8 @@ class TargetRun(Run):
 
     @functools.cached_property
     def state_range(self) -> list[list[float]]:
-        """See `TargetDescription`; of at most RANGED episodes, evenly chosen."""
+        """[low, high], each (s,): percentiles 0.1 and 99.9 of every number of the state, over at most RANGED episodes,
+        evenly chosen."""
         count = len(self.dataset.episodes)
         chosen = range(0, count, -(-count // RANGED))
         states = np.concatenate([self.dataset.load(index).states for index in chosen])
@@ -253,7 +255,7 @@ class DrafterRun(Run):
     artifact: Weights[Any]
     before: ClassVar[Mapping[str, float]] = {}
     settings: TrainDrafterSettings
-    target: Any  # a ReadableTarget
+    target: ReadableTarget
 
     def __init__(self, settings: TrainDrafterSettings) -> None:
         if settings.train.init is not None:
@@ -265,15 +267,13 @@ class DrafterRun(Run):
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task, settings.starts)
-        description = read_target(self.target_folder)
-        check_shown(self.dataset, description)
-        description.check_autoregressive(
+        read_target(self.target_folder).check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
 
     @abstractmethod
-    def lesson(self, progress: Progress) -> Lesson:
-        """Reads the demonstrations through `target`: a fresh module and what it learns; progress(done, total)."""
+    def lesson(self, progress: OnProgress) -> Lesson:
+        """Reads the demonstrations through `target`: a fresh module and what it learns."""
 
     def summary(self) -> str:
         """What is trained and on what, for --plan."""
@@ -285,11 +285,12 @@ class DrafterRun(Run):
         train = self.settings.train
         return f"{self.folder}: {self.summary()}, {train.steps} steps of {train.batch}"
 
-    def load(self, progress: Progress) -> None:
-        """Loads the target and reads the demonstrations; progress(done, total).
+    def load(self, progress: OnProgress) -> None:
+        """Loads the target and reads the demonstrations.
 
         Raises:
-            CheckpointError: target or demonstrations are damaged. UsageError: as `begin`.
+            CheckpointError: target or demonstrations are damaged.
+            UsageError: no such device, or a batch that cannot be divided.
         """
         self.begin()
         self.target, self.description = load_target(self.target_folder, self.device)
@@ -303,7 +304,7 @@ class DrafterRun(Run):
         return {"drafter": {**self.before, **asdict(s.drafter)}, "target": self.description.sha256, **covering}
 
     def write(self, module: nn.Module, origin: dict[str, Any]) -> None:
-        """See `Run.write`."""
+        """Writes the drafter's folder."""
         made_for, stored = MadeFor.of(self.description), self.settings.train.stored
         self.artifact.save(self.folder, module, made_for, origin, stored, settings=asdict(self.settings.drafter))
 

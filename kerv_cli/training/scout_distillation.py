@@ -6,7 +6,7 @@ observation. The first `scene_steps` train the stem and its positions alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -22,10 +22,9 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.early_distillation import Decodes, EarlyDistillation, columns_of, evenly, share_of
 from kerv_cli.training.imitation import position_loss
 from kerv_cli.training.loop import Metrics
-from kerv_cli.training.observations import Observations, read_observations, split
-from kerv_cli.training.recorded import BATCH
-from kerv_cli.training.runs import DrafterRun, Progress
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.training.observations import BATCH, Observations, read_observations, split
+from kerv_cli.training.runs import DrafterRun
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class ScoutSamples(Observations, Decodes):
 
 @torch.inference_mode()
 def teach_scout(
-    target: CompactTarget, dataset: DemoDataset, settings: ScoutSettings, on_progress: Callable[[int, int], None]
+    target: CompactTarget, dataset: DemoDataset, settings: ScoutSettings, on_progress: OnProgress
 ) -> ScoutSamples:
     """The target's decodes and positions for about `settings.samples` observations, spread evenly over all episodes.
 
@@ -56,7 +55,7 @@ def teach_scout(
             prompt, located = target.encode_batch(rows.inputs(indices, target.device))
             tokens.append(greedy(target, prompt)[0].cpu())
             places.append(located.float().cpu())
-        parts.append(ScoutSamples(**vars(rows), **columns, tokens=torch.cat(tokens), places=torch.cat(places)))
+        parts.append(ScoutSamples(**(vars(rows) | columns), tokens=torch.cat(tokens), places=torch.cat(places)))
         on_progress(index + 1, len(dataset.episodes))
     return ScoutSamples.joined(parts)
 
@@ -91,12 +90,12 @@ class ScoutDistillation(EarlyDistillation):
 
 
 class ScoutRun(DrafterRun):
-    """`kerv train drafter drafter=scout`; errors as `DrafterRun`, and a target that does not see."""
+    """`kerv train drafter drafter=scout`, for a target that sees."""
 
     artifact = ScoutArtifact()
     before: ClassVar[Mapping[str, float]] = {"history": 0}
 
-    def lesson(self, progress: Progress) -> ScoutDistillation:
+    def lesson(self, progress: OnProgress) -> ScoutDistillation:
         """The target's tokens and positions."""
         settings, train = self.settings.drafter, self.settings.train
         target = check_sees(self.target)

@@ -6,14 +6,15 @@ entry's own, the expert's next actions. The neighbour's chunk would have been ex
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.methods.calibration import NEVER, SkipLevel, SkipSection
+from kerv_cli.worlds.demos.dataset import OnProgress
 
 if TYPE_CHECKING:
     from kerv_cli.methods.heisd.datastore import Datastore
@@ -92,19 +93,19 @@ def task_levels(matches: Matches, epsilon: float, confidence: float) -> SkipLeve
     """
     good, wrong = matches.good(epsilon), 1 - confidence
     s_min = lowest_level(matches.similarity, good, confidence)
-    row: dict[str, Any] = {"s_min": NEVER, "low": NEVER, "high": NEVER, "share": 0.0, "within": None, "error": None}
-    if s_min is not None:
-        low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
-        skipped = matches.similarity >= s_min
-        row = {
-            "s_min": s_min,
-            "low": s_min if low is None else min(low, s_min),
-            "high": float(matches.similarity.max()) if high is None else max(high, s_min),
-            "share": float(skipped.mean()),
-            "within": float(good[skipped].mean()),
-            "error": float(matches.error[skipped].mean()),
-        }
-    return SkipLevel(**row, entries=len(matches.similarity))
+    if s_min is None:
+        return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(matches.similarity))
+    low, high = (lowest_level(matches.similarity, good, 1 - wrong * factor) for factor in (LOW, HIGH))
+    skipped = matches.similarity >= s_min
+    return SkipLevel(
+        s_min,
+        low=s_min if low is None else min(low, s_min),
+        high=float(matches.similarity.max()) if high is None else max(high, s_min),
+        share=float(skipped.mean()),
+        entries=len(matches.similarity),
+        within=float(good[skipped].mean()),
+        error=float(matches.error[skipped].mean()),
+    )
 
 
 def skip_section(
@@ -112,7 +113,7 @@ def skip_section(
     tasks: Sequence[str],
     epsilon: float,
     confidence: float,
-    on_progress: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> SkipSection | None:
     """The calibration's section `skip`: levels of those `tasks` that the datastore holds, and its hash. None where it
     holds none of them."""

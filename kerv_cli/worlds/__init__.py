@@ -44,7 +44,7 @@ def spec_of(task: str) -> EnvironmentSpec:
 
 
 def instruction_of(task: str) -> str:
-    """The instruction of a task; errors as `spec_of`."""
+    """The instruction of a task of any environment. UnknownName: no environment has it."""
     return spec_of(task).task(task).instruction
 
 

@@ -12,13 +12,13 @@ import os
 import subprocess
 import sys
 import weakref
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.base.errors import RenderingUnavailable, UsageError
+from kerv_cli.base.errors import RenderingUnavailable
+from kerv_cli.base.settings import CameraSettings
 
 if TYPE_CHECKING:
     import mujoco
@@ -39,35 +39,6 @@ _PROBE_SECONDS = 60.0
 
 _chosen: str | RenderingUnavailable | None = None
 _open_cameras: weakref.WeakSet[Camera] = weakref.WeakSet()
-
-
-@dataclass(frozen=True)
-class CameraConfig:
-    """The camera of a frame and its resolution.
-
-    Attributes:
-        name: one of the environment's cameras; empty: its first. `EnvironmentSpec.camera` fills it in and checks it.
-            Joined names, `views.views_of`, are several views side by side, which a world draws one by one.
-        fovy: vertical field of view in degrees; 45 doubles the pixels on hand and object that 60 gives.
-        size: width and height of a view in pixels.
-        supersample: each pixel is the mean of supersample x supersample rendered ones.
-
-    Raises:
-        UsageError: impossible numbers.
-    """
-
-    name: str = ""
-    fovy: float = 45.0
-    size: int = 96
-    supersample: int = 2
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.fovy < 180.0:
-            raise UsageError(f"camera fovy must lie between 0 and 180 degrees, not {self.fovy}")
-        if self.size < 1 or not 1 <= self.supersample <= 16:
-            raise UsageError(
-                f"camera size {self.size} and supersample {self.supersample} must be 1 or more (supersample 16 at most)"
-            )
 
 
 def install_command() -> str:
@@ -143,7 +114,7 @@ def load_mujoco() -> None:
 class Camera:
     """Draws one view of one model. Drawing reads the physics and never changes it."""
 
-    def __init__(self, model: mujoco.MjModel, config: CameraConfig, upside_down: bool = False) -> None:
+    def __init__(self, model: mujoco.MjModel, config: CameraSettings, upside_down: bool) -> None:
         """Opens an offscreen context for `model`. upside_down: the view's raw images are rotated by 180 degrees.
 
         Raises:
@@ -162,7 +133,7 @@ class Camera:
         model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)
         model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
         try:
-            self._renderer: Any = _open_renderer(model, pixels)
+            self._renderer: mujoco.Renderer | None = _open_renderer(model, pixels)
         except Exception as error:  # each backend raises types of its own
             raise RenderingUnavailable(
                 f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
@@ -201,7 +172,7 @@ class Camera:
             renderer.close()
 
 
-def _open_renderer(model: mujoco.MjModel, pixels: int) -> Any:
+def _open_renderer(model: mujoco.MjModel, pixels: int) -> mujoco.Renderer:
     import mujoco
 
     class Renderer(mujoco.Renderer):

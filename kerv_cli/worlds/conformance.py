@@ -9,7 +9,7 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.findings import Failed, Finding, run
-from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 STEPS = 5  # control steps of every check
@@ -41,7 +41,7 @@ class Trial:
 
     def open(self, horizon: int = 0) -> World:
         """A fresh world of the task."""
-        return self.spec.open_world(self.task, CameraConfig(size=SIZE), horizon)
+        return self.spec.open_world(self.task, CameraSettings(size=SIZE), horizon)
 
     def specification(self) -> str:
         """Suites and difficulties name what exists, and the sizes fit."""

@@ -7,12 +7,14 @@ demonstrations finds its tasks. Nothing can be rolled out in it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import SimpleNamespace
 
 from kerv_cli.base.registry import Part, register
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.spec import EnvironmentSpec, Task
 
-_SPECS: dict[str, EnvironmentSpec] = {}
+SPECS = SimpleNamespace()
+"""The specification of every recorded environment, an attribute of its name."""
 
 
 def register_recorded(
@@ -21,12 +23,7 @@ def register_recorded(
     """Registers the environment of a recorded dataset. name: an identifier; instructions: task -> instruction."""
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
     suite = {name.upper(): tuple(tasks)}
-    _SPECS[name] = EnvironmentSpec(name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,))
-    register(Part("environment", name, f"{__name__}:{name}"))
-    return _SPECS[name]
-
-
-def __getattr__(name: str) -> EnvironmentSpec:
-    if name not in _SPECS:
-        raise AttributeError(name)
-    return _SPECS[name]
+    spec = EnvironmentSpec(name, actions, observation, tasks, suite, ("recorded",), 10_000, (camera,))
+    setattr(SPECS, name, spec)
+    register(Part("environment", name, f"{__name__}:SPECS.{name}"))
+    return spec

@@ -11,7 +11,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import load
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.views import views_of
 
 if TYPE_CHECKING:
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
-    from kerv_cli.worlds.camera import CameraConfig
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class World(Protocol):
     spec: EnvironmentSpec
     task: str
     instruction: str
-    camera: CameraConfig
+    camera: CameraSettings
     horizon: int
     steps: int
     success: bool
@@ -99,7 +100,7 @@ class World(Protocol):
             KervError: past the horizon, before the first reset, or an action that is not D finite numbers.
         """
 
-    def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
+    def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
         """(size, size, 3) uint8 RGB, upright, of the current state; several views lie side by side, `frame_shape`.
         camera: another view than the world's own.
 
@@ -198,25 +199,28 @@ class EnvironmentSpec:
         full = self.full_name(name)
         return suite or ((full,) if full else ())
 
-    def camera_name(self, name: str = "") -> str:
+    def camera_name(self, name: str) -> str:
         """`name`, or the environment's first camera where it is empty. Several views are joined, see `views_of`.
 
         Raises:
-            UnknownName: the environment has no such camera. UsageError: as `views_of`.
+            UnknownName: the environment has no such camera. UsageError: an impossible view.
         """
         for view in views_of(name) if name else ():
             if view.camera not in self.cameras:
                 raise UnknownName("camera", view.camera, self.cameras)
         return name or self.cameras[0]
 
-    def camera(self, config: CameraConfig | None = None) -> CameraConfig:
-        """The configuration with the name of `camera_name`; errors as there."""
-        from kerv_cli.worlds.camera import CameraConfig
+    def camera(self, settings: CameraSettings | None = None) -> CameraSettings:
+        """A copy of the settings with the name of a camera of this environment, by default its first.
 
-        config = config or CameraConfig()
-        return replace(config, name=self.camera_name(config.name))
+        Raises:
+            UnknownName: the environment has no such camera. UsageError: an impossible view, or a number out of range.
+        """
+        settings = settings or CameraSettings()
+        check_settings(settings, "camera")
+        return replace(settings, name=self.camera_name(settings.name))
 
-    def control_steps(self, horizon: int = 0) -> int:
+    def control_steps(self, horizon: int) -> int:
         """Control steps of an episode; 0: the environment's own horizon.
 
         Raises:
@@ -229,16 +233,13 @@ class EnvironmentSpec:
     def standstill(self, opening: float) -> NDArray[np.float64]:
         """The action (D,), environment units, that leaves the robot where it is: the middle of every DoF's limits, and
         of the strict ones the present opening of the gripper (0 closed to 1 open)."""
-        import numpy as np
-
-        space = self.actions
-        action = (np.asarray(space.low) + np.asarray(space.high)) / 2
+        action = self.actions.middle.copy()
         if self.grip:
             closed, opened = self.grip
-            action[space.is_strict] = closed + (opened - closed) * opening
+            action[self.actions.is_strict] = closed + (opened - closed) * opening
         return action
 
-    def open_world(self, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> World:
+    def open_world(self, task: str, camera: CameraSettings | None = None, horizon: int = 0) -> World:
         """A world of the task; its simulator is built at the first reset.
 
         Raises:

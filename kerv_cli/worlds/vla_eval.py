@@ -14,7 +14,8 @@ from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.render import configure_mujoco_render
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, DimSpec
 
-from kerv_cli.base.settings import EVALUATION_SEED, StressSettings
+from kerv_cli.base.settings import EVALUATION_SEED, CameraSettings, StressSettings
+from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import build as build_stress
@@ -66,11 +67,9 @@ class MetaWorld(StepBenchmark):
     ) -> None:
         """Raises UnknownName, UsageError: no such task, camera or kind of stress, or an impossible number."""
         super().__init__()
-        from kerv_cli.worlds.camera import CameraConfig
-
         self.tasks = resolve_tasks([tasks] if isinstance(tasks, str) else list(tasks))
         self.spec, self.seed = spec_of(self.tasks[0]), seed
-        self.camera = self.spec.camera(CameraConfig(name=camera, size=image_size))
+        self.camera = self.spec.camera(CameraSettings(camera, size=image_size))
         self.horizon = self.spec.control_steps(horizon)
         settings = StressSettings(stress, stress_level)
         check_stress(settings, self.spec)
@@ -82,7 +81,7 @@ class MetaWorld(StepBenchmark):
         tasks = (self.spec.tasks[name] for name in self.tasks)
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 
-    def reset(self, task: dict[str, Any]) -> Any:
+    def reset(self, task: dict[str, Any]) -> Observation:
         """Starts the episode `episode_idx` of a task."""
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
@@ -104,16 +103,12 @@ class MetaWorld(StepBenchmark):
         self._recorder.record_step(success=success, action=numbers, state=observation.proprioception)
         return StepResult(observation, float(self.world.success), done, {})
 
-    def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
+    def make_obs(self, raw_obs: Observation, task: dict[str, Any]) -> dict[str, Any]:
         """The message to the model server."""
         assert self.world is not None
-        images = {self.camera.name: self._frame()} if self.send_images else {}
+        images = self.world.observe([self.camera.name]).images if self.send_images else {}
         state = raw_obs.state if self.privileged else raw_obs.proprioception
         return {"images": images, "task_description": self.world.instruction, "state": state}
-
-    def _frame(self) -> np.ndarray:
-        assert self.world is not None
-        return self.world.observe([self.camera.name]).images[self.camera.name]
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         """Success at any step, which episode it was, and where the hand is."""

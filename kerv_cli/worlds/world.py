@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import View, views_of
-from kerv_cli.worlds.camera import Camera, CameraConfig
+from kerv_cli.worlds.camera import Camera
 from kerv_cli.worlds.spec import EnvironmentSpec
-from kerv_cli.worlds.stress.base import NO_STRESS, ModelChanges, Stress
+from kerv_cli.worlds.stress.base import NO_STRESS, Model, ModelChanges, Stress
 
 
 class EpisodeWorld(ABC):
@@ -27,8 +28,11 @@ class EpisodeWorld(ABC):
 
     stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})
 
-    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
-        """Checks names and numbers only. camera: the environment's own when None. horizon: as `control_steps`.
+    def __init__(
+        self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
+    ) -> None:
+        """Checks names and numbers only. camera: None for the environment's first. horizon: control steps of
+        an episode; 0: the environment's.
 
         Raises:
             UnknownName: no such task or camera. UsageError: a horizon that the simulator cannot run.
@@ -39,7 +43,8 @@ class EpisodeWorld(ABC):
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
-        self._past: dict[tuple[CameraConfig, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}  # of delayed views
+        # of delayed views: control steps and images
+        self._past: dict[tuple[CameraSettings, View, bool], list[tuple[int, NDArray[np.uint8]]]] = {}
 
     @abstractmethod
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -50,7 +55,7 @@ class EpisodeWorld(ABC):
         """Executes an action (D,) within the limits; returns the privileged state (s,) and the success flag."""
 
     @abstractmethod
-    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+    def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
         """(size, size, 3) uint8 RGB, upright, of one camera."""
 
     @property
@@ -93,7 +98,12 @@ class EpisodeWorld(ABC):
         return self._observe_state(state)
 
     def step(self, action: ArrayLike) -> Observation:
-        """Executes one control step of an action (D,), changed by the stress; errors as `World.step`."""
+        """Executes one control step of an action (D,) in environment units, which is clipped to the limits and changed
+        by the stress.
+
+        Raises:
+            KervError: past the horizon, before the first reset, or an action that is not D finite numbers.
+        """
         executed = np.asarray(action, dtype=np.float64)
         space = self.spec.actions
         if executed.shape != (space.dofs,) or not np.isfinite(executed).all():
@@ -114,8 +124,13 @@ class EpisodeWorld(ABC):
         self._observation = Observation(proprioception, state, self.instruction)
         return self._observation
 
-    def frame(self, camera: CameraConfig | None = None) -> NDArray[np.uint8]:
-        """A frame of the current state for a recording, without stress; shape and errors as `World.frame`."""
+    def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:
+        """(size, size x views, 3) uint8 RGB of the current state for a recording, without the stress of images.
+        camera: None for the world's own.
+
+        Raises:
+            RenderingUnavailable: nothing can be drawn here.
+        """
         self.observation  # noqa: B018 - raises before the first reset
         return self._picture(self.camera if camera is None else self.spec.camera(camera), observed=False)
 
@@ -125,19 +140,19 @@ class EpisodeWorld(ABC):
         images = {name: self._picture(self.spec.camera(replace(self.camera, name=name)), True) for name in cameras}
         return self.observation.with_images(images)
 
-    def _picture(self, config: CameraConfig, observed: bool) -> NDArray[np.uint8]:
+    def _picture(self, config: CameraSettings, observed: bool) -> NDArray[np.uint8]:
         """A frame: its views side by side. observed: for a policy, so that a stress changes the image of each camera.
         Frames for recordings have their own delayed images."""
         views = views_of(config.name)
         images = {
-            view.shown: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
+            view.name: self._draw(replace(config, name=view.camera, fovy=view.fovy or config.fovy)) for view in views
         }
         if observed:
             images = {camera: self.stress.see(camera, image, self.steps) for camera, image in images.items()}
-        parts = [self._at((config, view, observed), images[view.shown]) for view in views]
+        parts = [self._at((config, view, observed), images[view.name]) for view in views]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
-    def _at(self, key: tuple[CameraConfig, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _at(self, key: tuple[CameraSettings, View, bool], now: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image of one view. now: the present image of its camera. A delayed view shows the newest image that is at
         least `delay` control steps old; until there is one, the episode's first."""
         delay = key[1].delay
@@ -168,13 +183,15 @@ class MujocoWorld(EpisodeWorld):
 
     stressable = EpisodeWorld.stressable | {"model"}
 
-    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
+    def __init__(
+        self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
+    ) -> None:
         super().__init__(spec, task, camera, horizon)
-        self._cameras: dict[CameraConfig, Camera] = {}
+        self._cameras: dict[CameraSettings, Camera] = {}
         self._changes = ModelChanges()
 
     @abstractmethod
-    def _drawable(self) -> tuple[Any, Any]:
+    def _drawable(self) -> tuple[Model, Any]:
         """The MjModel, and MjData in which all poses are up to date."""
 
     def reset(self, seed: int) -> Observation:
@@ -185,7 +202,7 @@ class MujocoWorld(EpisodeWorld):
             self.stress.change(self._drawable()[0], self._changes)
         return observation
 
-    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+    def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
         model, data = self._drawable()
         if camera not in self._cameras:
             self._cameras[camera] = Camera(model, camera, camera.name in self.spec.upside_down)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.registry import Part, register
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.base.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
-from kerv_cli.worlds.camera import CameraConfig
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, Task
 from kerv_cli.worlds.world import EpisodeWorld
 
@@ -54,7 +54,7 @@ class PointWorld(EpisodeWorld):
         self._state[:2] += action
         return self._state.copy(), bool(np.linalg.norm(self._state[:3] - self._state[3:]) < NEAR)
 
-    def _draw(self, camera: CameraConfig) -> NDArray[np.uint8]:
+    def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
         frame = np.full((camera.size, camera.size, 3), 255, dtype=np.uint8)
         for (x, y), colour in ((self._state[3:5], (0, 160, 0)), (self._state[:2], (200, 0, 0))):
             row, column = (np.clip([0.5 - y / 1.2, 0.5 + x / 1.2], 0, 0.99) * camera.size).astype(int)

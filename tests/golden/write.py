@@ -10,7 +10,7 @@ from typing import Any
 
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.resolve import resolve
-from kerv_cli.lab.run import close_worlds, run_task
+from kerv_cli.lab.run import Runner, close_worlds
 
 FILE = Path(__file__).with_name("main.json")
 ENGINES = Path(__file__).with_name("engines.json")
@@ -25,7 +25,7 @@ def measure() -> dict[str, Any]:
     settings = resolve(["study=main", f"task=[{','.join(TASKS)}]", "record=0"]).settings
     for task in TASKS:
         for label, setting in settings.items():
-            for record in run_task(setting, task, SEEDS):
+            for record in map(Runner(setting, task).episode, SEEDS):
                 tokens = json.dumps([decode.tokens for decode in record.decodes])
                 found.setdefault(label, {}).setdefault(task, {})[str(record.seed)] = {
                     "success": record.success,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,9 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
 from kerv_cli.worlds.recorded import register_recorded
+
+OnProgress = Callable[[int, int], object]
+"""Called with (done, total) after every episode or batch of a long work."""
 
 FORMAT = 2
 """Format of manifests. Format 1 did not name the environment, because Meta-World was the only one."""
@@ -87,25 +90,23 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def entry_of(path: Path, episode: DemoEpisode) -> dict[str, Any]:
+def entry_of(path: Path, episode: DemoEpisode) -> EpisodeEntry:
     """The manifest's entry of an episode that lies in `path`."""
-    fields = {name: getattr(episode, name) for name in ("seed", "perturbed", "steps")}
-    return {**fields, "bytes": path.stat().st_size, "sha256": sha256_of(path)}
+    return EpisodeEntry(episode.seed, episode.perturbed, episode.steps, path.stat().st_size, sha256_of(path))
 
 
 def totals(
-    entries: Mapping[str, Sequence[Mapping[str, Any]]], failed: Mapping[str, Sequence[int]], missing: int
+    entries: Mapping[str, Sequence[EpisodeEntry]], failed: Mapping[str, Sequence[int]], missing: int
 ) -> dict[str, Any]:
-    """The manifest's fields that sum up its episodes. entries: task -> `entry_of`; failed: task -> seeds."""
+    """The manifest's fields that sum up its episodes, as JSON. entries: of each task; failed: task -> seeds."""
     tasks = {}
     for task, rows in entries.items():
-        episodes = sorted(rows, key=lambda entry: entry["seed"])
-        mean = round(sum(entry["steps"] for entry in rows) / len(rows), 2)
+        episodes = [asdict(entry) for entry in sorted(rows, key=lambda entry: entry.seed)]
+        mean = round(sum(entry.steps for entry in rows) / len(rows), 2)
         tasks[task] = {"mean_steps": mean, "failed_seeds": sorted(failed.get(task, ())), "episodes": episodes}
-    seeds = [entry["seed"] for rows in entries.values() for entry in rows]
-    ends = {"first": min(seeds), "last": max(seeds)}
+    seeds = [entry.seed for rows in entries.values() for entry in rows]
     return {
-        "seeds": ends,
+        "seeds": {"first": min(seeds), "last": max(seeds)},
         "episodes": len(seeds),
         "missing": missing,
         "sha256": dataset_hash(tasks),

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import atomic_path, regular
@@ -59,8 +61,6 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
     Raises:
         StorageError: writing failed.
     """
-    from safetensors.numpy import save
-
     pictures = [encode_png(frame) for frame in episode.frames]
     tensors = {
         "png": np.frombuffer(b"".join(pictures), dtype=np.uint8),
@@ -104,8 +104,6 @@ def load_episode(path: Path, actions: ActionSpace, observation: ObservationSpace
     Raises:
         CheckpointError: the file is missing, damaged, of another format or of other spaces.
     """
-    from safetensors import SafetensorError, safe_open
-
     try:
         with safe_open(regular(path), framework="numpy") as file:
             metadata = file.metadata() or {}

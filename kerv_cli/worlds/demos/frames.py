@@ -14,6 +14,7 @@ from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError
 
@@ -22,7 +23,7 @@ LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's leng
 
 class EncodedFrames:
     """n frames (size, width, 3) uint8. sources: the files; sources[source[i]] holds the PNG of frame i at start[i] …
-    end[i]. width: default `size`."""
+    end[i]."""
 
     def __init__(
         self,
@@ -31,10 +32,10 @@ class EncodedFrames:
         start: NDArray[np.int64],
         end: NDArray[np.int64],
         size: int,
-        width: int = 0,
+        width: int,
     ) -> None:
         self.sources, self.source, self.start, self.end = sources, source, start, end
-        self.size, self.width = size, width or size
+        self.size, self.width = size, width
 
     @classmethod
     def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int, width: int = 0) -> EncodedFrames:
@@ -53,7 +54,7 @@ class EncodedFrames:
         positions = offsets + begin + first
         if len(offsets) < 1 or (np.diff(offsets) <= 0).any() or offsets[0] < 0 or offsets[-1] > last - first:
             raise CheckpointError(f"{path} is damaged: its frames lie outside their tensor")
-        return cls([path], np.zeros(len(offsets) - 1, np.int64), positions[:-1], positions[1:], size, width)
+        return cls([path], np.zeros(len(offsets) - 1, np.int64), positions[:-1], positions[1:], size, width or size)
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
@@ -106,8 +107,6 @@ class EncodedFrames:
             return np.stack(list(pool.map(self._decode, range(len(self)))))
 
     def _decode(self, i: int) -> NDArray[np.uint8]:
-        from PIL import Image
-
         path, start = self.sources[self.source[i]], int(self.start[i])
         try:
             with path.open("rb") as file:
@@ -131,8 +130,6 @@ def header_of(data: bytes) -> tuple[dict[str, Any], int]:
 
 def encode_png(frame: NDArray[np.uint8]) -> bytes:
     """frame (h, w, 3) uint8 -> PNG."""
-    from PIL import Image
-
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()

@@ -41,7 +41,7 @@ class Perturbation:
         self._burst_left = 0
         self._noisy = ~space.is_strict
         self._low, self._high = np.array(space.low)[self._noisy], np.array(space.high)[self._noisy]
-        self._half, self._middle = (self._high - self._low) / 2, (self._high + self._low) / 2
+        self._half, self._middle = space.half[self._noisy], space.middle[self._noisy]
         self._direction = np.zeros(len(self._half))  # normalised
 
     def __call__(self, action: NDArray[np.float64]) -> NDArray[np.float64]:

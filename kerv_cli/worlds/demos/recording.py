@@ -28,9 +28,19 @@ from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.processes import begin_worker, check_workers
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds import resolve_tasks, spec_of
-from kerv_cli.worlds.camera import CameraConfig, choose_backend
-from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, entry_of, episode_path, totals, with_environment
+from kerv_cli.worlds.camera import choose_backend
+from kerv_cli.worlds.demos.dataset import (
+    FORMAT,
+    DemoManifest,
+    EpisodeEntry,
+    OnProgress,
+    entry_of,
+    episode_path,
+    totals,
+    with_environment,
+)
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode, save_episode
 from kerv_cli.worlds.demos.perturbation import Perturbation, is_perturbed
 from kerv_cli.worlds.spec import EnvironmentSpec, World
@@ -68,7 +78,7 @@ class DemoConfig:
     noise_low: float = number(0.2, 0)
     noise_high: float = number(0.6, 0)
     burst_probability: float = number(0.02, 0, 1)
-    camera: CameraConfig = field(default_factory=CameraConfig)
+    camera: CameraSettings = field(default_factory=CameraSettings)
     frame_stride: int = number(1, 1)
     tail: int = number(8, 0)
     workers: int = number(2, 1)
@@ -121,18 +131,18 @@ class NoisyExpert:
         self.perturb: Perturbation | None = None
 
     def reset(self, world: World, seed: int) -> None:
-        """See `Actor.reset`."""
+        """Begins an episode: draws its noise, or none."""
         config, noise = self.config, (self.config.noise_low, self.config.noise_high)
         noisy = is_perturbed(seed, config.perturbed)
         arguments = (world.task, seed, world.spec.actions, noise, config.burst_probability)
         self.perturb = Perturbation(*arguments) if noisy else None
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Actor.act`."""
+        """The expert's action, with noise in a perturbed episode."""
         return self.perturb(label) if self.perturb else label
 
 
-def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None = None) -> DemoEpisode | None:
+def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
     """Runs one episode, moved by the expert or an actor. None when the expert did not succeed within the horizon, or so
     late that the simulator's own horizon leaves no room for the tail; an actor's episode ends there and is kept."""
     expert = world.spec.expert(world.task)
@@ -175,7 +185,7 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None 
 def record(
     config: DemoConfig,
     out: Path,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: OnProgress = lambda done, total: None,
     make_actor: MakeActor | None = None,
 ) -> DemoManifest:
     """Records demonstrations into the folder `out`; an interrupted recording resumes.
@@ -186,7 +196,7 @@ def record(
     Args:
         config: of the recording.
         out: the dataset's folder.
-        on_progress: called with (episodes done, episodes in all).
+        on_progress: of episodes.
         make_actor: makes the actor that moves the robot in the expert's place.
 
     Returns:
@@ -216,25 +226,18 @@ def record(
     return read(DemoManifest, manifest, str(out / "manifest.json"))
 
 
-_Entries = dict[str, list[dict[str, Any]]]  # task -> the manifest's entries
-_Failures = dict[str, list[int]]  # task -> seeds
-
-
 def _collect(
-    config: DemoConfig,
-    out: Path,
-    on_progress: Callable[[int, int], None] | None,
-    make_actor: MakeActor | None,
-) -> tuple[_Entries, _Failures]:
-    entries: _Entries = {task: [] for task in config.tasks}
-    failed: _Failures = {task: [] for task in config.tasks}
+    config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
+) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
+    """Records the episodes -> task -> the manifest's entries, and task -> seeds whose expert failed."""
+    entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
+    failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = {task: range(config.first_seed, config.first_seed + config.episodes) for task in config.tasks}
     while any(seeds.values()):
         for task, outcomes in _run_jobs(config, out, _jobs(seeds), make_actor):
             entries[task] += [entry for entry in outcomes.values() if entry is not None]
             failed[task] += [seed for seed, entry in outcomes.items() if entry is None]
-            if on_progress is not None:
-                on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
+            on_progress(sum(map(len, entries.values())), config.episodes * len(config.tasks))
         # one new seed per failure, in order: the outcome does not depend on how the work is divided
         stops = {task: block.stop + config.episodes - len(entries[task]) for task, block in seeds.items()}
         seeds = {task: range(block.stop, min(stops[task], config.seed_limit)) for task, block in seeds.items()}
@@ -297,7 +300,7 @@ def _comparable(identity: Mapping[str, Any], packages: Sequence[str]) -> dict[st
     return {**{key: identity[key] for key in keys}, **identity["config"], **versions}
 
 
-_Outcomes = dict[int, dict[str, Any] | None]  # seed -> the manifest's entry, None where the expert failed
+_Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None where the expert failed
 
 
 def _run_jobs(
@@ -331,7 +334,7 @@ def _record_seeds(
     return task, {seed: _record_seed(config, out, task, seed, actor) for seed in seeds}
 
 
-def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Actor | None) -> dict[str, Any] | None:
+def _record_seed(config: DemoConfig, out: Path, task: str, seed: int, actor: Actor | None) -> EpisodeEntry | None:
     path, failure = episode_path(out, task, seed), out / "failed" / task / f"{seed:06d}.json"
     if failure.exists():
         return None

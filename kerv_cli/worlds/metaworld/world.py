@@ -12,13 +12,14 @@ import functools
 import itertools
 import pickle
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.worlds.camera import CameraConfig, load_mujoco
+from kerv_cli.worlds.camera import load_mujoco
 from kerv_cli.worlds.metaworld.experts import OURS
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.world import MujocoWorld
@@ -37,7 +38,7 @@ def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
 
 
 @contextlib.contextmanager
-def _quiet_simulator() -> Any:
+def _quiet_simulator() -> Iterator[None]:
     # The experts warn in every second step about a range that the world clips anyway.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
@@ -49,9 +50,7 @@ class MetaWorld(MujocoWorld):
 
     stressable = MujocoWorld.stressable | {"range"}
 
-    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
-        super().__init__(spec, task, camera, horizon)
-        self._env: Any = None
+    _env: Any = None
 
     @property
     def initial_state(self) -> NDArray[np.float64]:

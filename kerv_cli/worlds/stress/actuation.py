@@ -37,7 +37,7 @@ class Actuation(Stress):
         self._random = self.draws.random()
         self._loose = ~space.is_strict
         self._low, self._high = np.array(space.low)[self._loose], np.array(space.high)[self._loose]
-        self._half, self._middle = (self._high - self._low) / 2, (self._high + self._low) / 2
+        self._half, self._middle = space.half[self._loose], space.middle[self._loose]
         self._noise = level.noise
         self._gain = 1.0 + self._random.uniform(-level.gain, level.gain, len(self._half))
         self._spells = Spells.per_second(level.stuck, STUCK_SECONDS, space.control_hz)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from kerv_cli.base.settings import MOST_STRESS
 
 if TYPE_CHECKING:
+    import mujoco
+
     from kerv_cli.base.spaces import ActionSpace
 
 Array = NDArray[np.float64]
+Model: TypeAlias = "mujoco.MjModel"
 L = TypeVar("L")
 
 
@@ -69,7 +72,7 @@ class Stress:
         """Fixes the episode's random numbers, before its reset. space: of the actions that `act` gets."""
         self.draws = Draws(task, seed, self.kind, self.level)
 
-    def change(self, model: Any, changes: ModelChanges) -> None:
+    def change(self, model: Model, changes: ModelChanges) -> None:
         """Changes the MjModel of an episode that was just reset; `changes.keep` comes before each change."""
 
     def act(self, action: Array, step: int) -> Array:
@@ -115,7 +118,7 @@ def either(random: np.random.Generator, factor: float) -> float:
     return factor if random.random() < 0.5 else 1.0 / factor
 
 
-def robot_roots(model: Any) -> set[int]:
+def robot_roots(model: Model) -> set[int]:
     """Ids of the root bodies that an actuator moves."""
     import mujoco
 
@@ -127,7 +130,7 @@ def robot_roots(model: Any) -> set[int]:
     return roots
 
 
-def objects(model: Any) -> list[int]:
+def objects(model: Model) -> list[int]:
     """Ids of the bodies that move on joints of their own and are no part of a robot."""
     robots = robot_roots(model)
     return [b for b in range(1, model.nbody) if model.body_dofnum[b] > 0 and model.body_rootid[b] not in robots]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kerv_cli.worlds.stress.base import ModelChanges, Stress, level_of
+from kerv_cli.worlds.stress.base import Model, ModelChanges, Stress, level_of
 from kerv_cli.worlds.vectors import unit_vector
 
 
@@ -29,7 +28,7 @@ class CameraJitter(Stress):
     kind = "camera"
     changes_model = True
 
-    def change(self, model: Any, changes: ModelChanges) -> None:
+    def change(self, model: Model, changes: ModelChanges) -> None:
         """Moves and turns every camera."""
         level = level_of(LEVELS, self.level)
         random = self.draws.random()

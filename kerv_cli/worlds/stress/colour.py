@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from kerv_cli.worlds.stress.base import ModelChanges, Stress, level_of, robot_roots
+from kerv_cli.worlds.stress.base import Model, ModelChanges, Stress, level_of, robot_roots
 
 LEVELS = (0.1, 0.2, 0.3, 0.45)
 """Share of a random colour in the colour that multiplies a surface's texture."""
@@ -22,7 +20,7 @@ class Colour(Stress):
     kind = "colour"
     changes_model = True
 
-    def change(self, model: Any, changes: ModelChanges) -> None:
+    def change(self, model: Model, changes: ModelChanges) -> None:
         """Mixes the colours of background and table with random ones."""
         share, random = level_of(LEVELS, self.level), self.draws.random()
         changes.keep(model.geom_rgba)
@@ -37,7 +35,7 @@ class Colour(Stress):
             model.geom_rgba[geom] = rgba
 
 
-def scenery_of(model: Any) -> list[int]:
+def scenery_of(model: Model) -> list[int]:
     """Ids of the geoms that are background or table."""
     import mujoco
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from kerv_cli.worlds.stress.base import ModelChanges, Stress, either, level_of
+from kerv_cli.worlds.stress.base import Model, ModelChanges, Stress, either, level_of
 from kerv_cli.worlds.vectors import unit_vector
 
 
@@ -30,7 +29,7 @@ class Light(Stress):
     kind = "light"
     changes_model = True
 
-    def change(self, model: Any, changes: ModelChanges) -> None:
+    def change(self, model: Model, changes: ModelChanges) -> None:
         """Scales all light, and turns and moves the lamps."""
         level = level_of(LEVELS, self.level)
         random, head = self.draws.random(), model.vis.headlight

@@ -4,11 +4,10 @@ range of the training."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from kerv_cli.worlds.stress.base import ModelChanges, Stress, either, level_of, objects
+from kerv_cli.worlds.stress.base import Model, ModelChanges, Stress, either, level_of, objects
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Objects(Stress):
         super().__init__(level)
         self.spread = level_of(LEVELS, level).spread
 
-    def change(self, model: Any, changes: ModelChanges) -> None:
+    def change(self, model: Model, changes: ModelChanges) -> None:
         """Scales the objects' size, mass and friction."""
         level = level_of(LEVELS, self.level)
         random = self.draws.random()
@@ -56,13 +55,13 @@ class Objects(Stress):
         _sum_masses(model)
 
 
-def _slow(model: Any, body: int, friction: float) -> None:
+def _slow(model: Model, body: int, friction: float) -> None:
     dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
     model.dof_damping[dofs] *= friction
     model.dof_frictionloss[dofs] *= friction
 
 
-def _is_free_and_primitive(model: Any, body: int) -> bool:
+def _is_free_and_primitive(model: Model, body: int) -> bool:
     import mujoco
 
     free = model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
@@ -71,7 +70,7 @@ def _is_free_and_primitive(model: Any, body: int) -> bool:
     return bool(free and not np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)).any())
 
 
-def _scale(model: Any, body: int, factor: float, moved: bool) -> None:
+def _scale(model: Model, body: int, factor: float, moved: bool) -> None:
     """Scales a body's geoms and sites around its origin; a part that is fixed to an object is moved along."""
     if moved:
         model.body_pos[body] *= factor
@@ -83,7 +82,7 @@ def _scale(model: Any, body: int, factor: float, moved: bool) -> None:
     model.bvh_aabb[model.body_bvhadr[body] : model.body_bvhadr[body] + model.body_bvhnum[body]] *= factor
 
 
-def _weigh(model: Any, body: int, mass: float, size: float) -> None:
+def _weigh(model: Model, body: int, mass: float, size: float) -> None:
     """Multiplies a body's mass, and what MuJoCo derived from it when the model was compiled."""
     model.body_mass[body] *= mass
     model.body_inertia[body] *= mass * size**2
@@ -92,7 +91,7 @@ def _weigh(model: Any, body: int, mass: float, size: float) -> None:
     model.dof_invweight0[dofs] /= mass
 
 
-def _sum_masses(model: Any) -> None:
+def _sum_masses(model: Model) -> None:
     model.body_subtreemass[:] = model.body_mass
     for body in range(model.nbody - 1, 0, -1):
         model.body_subtreemass[model.body_parentid[body]] += model.body_subtreemass[body]

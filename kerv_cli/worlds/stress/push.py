@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds.stress.base import Array, Spells, Stress, level_of
 from kerv_cli.worlds.vectors import unit_vector
@@ -22,13 +20,11 @@ class Push(Stress):
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         """Fixes the episode's random numbers and its rate of bursts."""
-        group = space.dofs_of("position")
+        self._group = space.dofs_of("position")
         super().begin(task, seed, space)
         self._random = self.draws.random()
         self._spells = Spells.per_second(level_of(LEVELS, self.level), SECONDS, space.control_hz)
-        self._at = group
-        low, high = np.array(space.low)[group], np.array(space.high)[group]
-        self._half, self._middle = (high - low) / 2, (high + low) / 2
+        self._half, self._middle = space.half[self._group], space.middle[self._group]
         self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
@@ -39,5 +35,5 @@ class Push(Stress):
         if not lasts:
             return action
         executed = action.copy()
-        executed[self._at] = self._push
+        executed[self._group] = self._push
         return executed

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kerv_cli.worlds.camera import CameraConfig
+from kerv_cli.base.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.vectors import length
 from kerv_cli.worlds.world import MujocoWorld
@@ -46,7 +46,9 @@ class InsertionWorld(MujocoWorld):
 
     stressable = MujocoWorld.stressable | {"range"}
 
-    def __init__(self, spec: EnvironmentSpec, task: str, camera: CameraConfig | None = None, horizon: int = 0) -> None:
+    def __init__(
+        self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
+    ) -> None:
         super().__init__(spec, task, camera, horizon)
         self._model: Any = None
         self._data: Any = None

@@ -8,7 +8,6 @@ between them are left out and the rate is lower.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path, visible, write_folder, write_json
 from kerv_cli.base.views import VIEWS
 from kerv_cli.worlds import instruction_of
-from kerv_cli.worlds.demos.dataset import DemoDataset
+from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.frames import encode_png
 from kerv_cli.worlds.demos.lerobot import layout
@@ -35,10 +34,10 @@ class Moments:
     """Running statistics of one feature: min, max, mean, standard deviation, count."""
 
     shape: tuple[int, ...] = ()
-    low: Any = np.inf
-    high: Any = -np.inf
-    total: Any = 0.0
-    squares: Any = 0.0
+    low: np.ndarray | float = np.inf
+    high: np.ndarray | float = -np.inf
+    total: np.ndarray | float = 0.0
+    squares: np.ndarray | float = 0.0
     count: int = 0
 
     def add(self, values: np.ndarray) -> None:
@@ -59,10 +58,9 @@ class Moments:
 
 @dataclass
 class Export:
-    """The state of an export of `dataset` to `folder`."""
+    """The state of an export of `dataset`: what was written so far."""
 
     dataset: DemoDataset
-    folder: Path
     camera: str
     rate: float
     tasks: dict[str, int]
@@ -130,11 +128,11 @@ class Export:
         order = [*keys, *(name for name in arrays if name not in (*layout.COUNTERS, *keys)), *layout.COUNTERS]
         return pa.table({name: arrays[name] for name in order})
 
-    def write_data(self, progress: Callable[[int, int], None]) -> None:
+    def write_data(self, folder: Path, progress: OnProgress) -> None:
         """All rows, a row group per episode, in files of at most about FILE_MB."""
         total, index, file = len(self.dataset.episodes), 0, 0
         while index < total:
-            path = self.folder / layout.DATA.format(chunk_index=0, file_index=file)
+            path = folder / layout.DATA.format(chunk_index=0, file_index=file)
             with atomic_path(path) as temporary, contextlib.ExitStack() as stack:
                 writer, size = None, 0
                 while index < total and size <= layout.FILE_MB * 2**20:
@@ -184,18 +182,18 @@ class Export:
             "features": features,
         }
 
-    def write_meta(self) -> None:
+    def write_meta(self, folder: Path) -> None:
         """Tasks, episodes, statistics and, last, the description: without it there is no dataset."""
         names = pd.Index([instruction_of(task) for task in self.tasks], name="task")
-        with atomic_path(self.folder / layout.TASKS) as temporary:
+        with atomic_path(folder / layout.TASKS) as temporary:
             pd.DataFrame({"task_index": list(self.tasks.values())}, index=names).to_parquet(temporary)
-        with atomic_path(self.folder / layout.EPISODES.format(chunk_index=0, file_index=0)) as temporary:
+        with atomic_path(folder / layout.EPISODES.format(chunk_index=0, file_index=0)) as temporary:
             pq.write_table(pa.Table.from_pylist(self.episodes), temporary)
-        write_json(self.folder / layout.STATS, {name: moments.plain() for name, moments in self.moments.items()})
-        write_json(self.folder / layout.INFO, self.info())
+        write_json(folder / layout.STATS, {name: moments.plain() for name, moments in self.moments.items()})
+        write_json(folder / layout.INFO, self.info())
 
 
-def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], None]) -> Export:
+def export(dataset: DemoDataset, folder: Path, progress: OnProgress) -> Export:
     """Writes `dataset` as a LeRobot dataset to `folder`.
 
     Raises:
@@ -209,12 +207,11 @@ def export(dataset: DemoDataset, folder: Path, progress: Callable[[int, int], No
     if len({instruction_of(name) for name in names}) < len(names):
         raise UsageError("two tasks have the same instruction, which LeRobot tells tasks apart by: export them apart")
     tasks = {name: number for number, name in enumerate(names)}
-    results: list[Export] = []
+    result = Export(dataset, config["camera"]["name"], rate, tasks)
 
     def fill(new: Path) -> None:
-        results.append(Export(dataset, new, config["camera"]["name"], rate, tasks))
-        results[0].write_data(progress)
-        results[0].write_meta()
+        result.write_data(new, progress)
+        result.write_meta(new)
 
     write_folder(folder, fill, replace=True)
-    return results[0]
+    return result

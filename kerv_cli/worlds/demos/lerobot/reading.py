@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -19,10 +18,13 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
-from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
-from kerv_cli.worlds.demos.dataset import FORMAT, entry_of, episode_path, totals
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, limits_of
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
+
+Row: TypeAlias = Mapping[str, Any]
+"""A row of a table, or an object of a JSON file."""
 
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
@@ -32,8 +34,8 @@ class Source:
     """A LeRobot folder. info: meta/info.json; episodes: rows of meta/episodes; tasks: instruction by task_index."""
 
     folder: Path
-    info: Mapping[str, Any]
-    episodes: Sequence[Mapping[str, Any]]
+    info: Row
+    episodes: Sequence[Row]
     tasks: Mapping[int, str]
     camera: str
 
@@ -61,8 +63,8 @@ class Source:
         ]
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
-        named = _table(folder / layout.TASKS).to_pylist()
-        tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in named}
+        names = _table(folder / layout.TASKS).to_pylist()
+        tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in names}
         return cls(folder, info, sorted(rows, key=lambda row: row["episode_index"]), tasks, camera or cameras[0])
 
     @property
@@ -83,12 +85,12 @@ class Source:
             return [f"{prefix}_{i}" for i in range(count)]
         return [str(name) for name in names]
 
-    def path(self, episode: Mapping[str, Any], columns: str, form: str) -> Path:
+    def path(self, episode: Row, columns: str, form: str) -> Path:
         """The file of an episode, whose chunk and number stand in the columns that begin with `columns`."""
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
 
-    def table(self, episode: Mapping[str, Any]) -> pa.Table:
+    def table(self, episode: Row) -> pa.Table:
         """The rows of one episode, in order."""
         path = self.path(episode, "data", self.info.get("data_path") or layout.DATA)
         table = _table(path, filters=[("episode_index", "==", int(episode["episode_index"]))])
@@ -96,7 +98,7 @@ class Source:
             raise CheckpointError(f"{path} has {len(table)} rows of episode {episode['episode_index']}, not its length")
         return table
 
-    def frames(self, episode: Mapping[str, Any], table: pa.Table) -> np.ndarray:
+    def frames(self, episode: Row, table: pa.Table) -> np.ndarray:
         """(T, h, w, 3) uint8 of one episode."""
         if self.info["features"][self.key]["dtype"] == "image":
             return np.stack([_picture(cell, self.folder) for cell in table[self.key].to_pylist()])
@@ -105,10 +107,8 @@ class Source:
         return np.stack(list(_video_frames(path, start, rate, len(table))))
 
 
-def import_lerobot(
-    settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None] = lambda done, total: None
-) -> dict[str, Any]:
-    """Writes the dataset's episodes as demonstrations -> the manifest.
+def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
+    """Writes the dataset's episodes as demonstrations in `folder` and opens them.
 
     Raises:
         UsageError: no source, or the folder holds other demonstrations. CheckpointError: as `Source.open`, or an
@@ -116,23 +116,21 @@ def import_lerobot(
     """
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
-    path, manifests = as_path(settings.source), list[dict[str, Any]]()
+    path = as_path(settings.source)
     try:
         source = Source.open(path, settings.camera)
-        write_folder(folder, lambda new: manifests.append(_import(source, settings, new, progress)))
-        return manifests[0]
+        write_folder(folder, lambda new: _import(source, settings, new, progress))
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         why = " ".join(f"{type(error).__name__} {error}".split())[:120]
         raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
+    return DemoDataset.open(folder)
 
 
-def _import(
-    source: Source, settings: DemosImportSettings, folder: Path, progress: Callable[[int, int], None]
-) -> dict[str, Any]:
-    """Fills a new folder -> the manifest."""
+def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
+    """Fills a new folder."""
     chosen = source.episodes[: settings.episodes or None]
     names = _task_names(source.tasks)
-    entries: dict[str, list[dict[str, Any]]] = {}
+    entries: dict[str, list[EpisodeEntry]] = {}
     actions: list[np.ndarray] = []
     state = 0
     for done, row in enumerate(chosen):
@@ -146,10 +144,9 @@ def _import(
     manifest = _manifest(source, settings, entries, names, np.concatenate(actions), state)
     write_json(folder / "recording.json", {k: manifest[k] for k in ("format", "environment", "config")})
     write_json(folder / "manifest.json", manifest)
-    return manifest
 
 
-def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], tail: int) -> DemoEpisode:
+def _episode(source: Source, row: Row, names: Mapping[int, str], tail: int) -> DemoEpisode:
     table = source.table(row)
     number = int(row["episode_index"])
     columns = {
@@ -178,7 +175,7 @@ def _episode(source: Source, row: Mapping[str, Any], names: Mapping[int, str], t
 def _manifest(
     source: Source,
     settings: DemosImportSettings,
-    entries: Mapping[str, list[dict[str, Any]]],
+    entries: Mapping[str, list[EpisodeEntry]],
     names: Mapping[int, str],
     actions: np.ndarray,
     state: int,
@@ -192,7 +189,7 @@ def _manifest(
         "tail": settings.tail,
         "tasks": list(entries),
     }
-    manifest = {
+    return {
         "format": FORMAT,
         "environment": _identifier(settings.name or source.folder.name),
         "actions": action_space(source, settings, actions).as_dict(),
@@ -202,7 +199,6 @@ def _manifest(
         **totals(entries, {}, missing=0),
         "instructions": {names[i]: text for i, text in source.tasks.items() if names[i] in entries},
     }
-    return json.loads(json.dumps(manifest))
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
@@ -223,11 +219,8 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
     unknown = [name for name in strict if name not in names]
     if unknown:
         raise UnknownName("strict DoF", unknown[0], names)
-    low, high = actions.min(0).astype(float), actions.max(0).astype(float)
-    still = high - low < 1e-6
-    low, high = np.where(still, low - 1, low), np.where(still, high + 1, high)
-    rate = float(source.info["fps"])
-    return ActionSpace(names, _groups(names, strict), strict, rate, tuple(low.tolist()), tuple(high.tolist()))
+    low, high = limits_of(actions.min(0).astype(float), actions.max(0).astype(float))
+    return ActionSpace(names, _groups(names, strict), strict, float(source.info["fps"]), low, high)
 
 
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
@@ -265,7 +258,7 @@ def _table(path: Path, **options: Any) -> pa.Table:
         raise CheckpointError(f"{path} is missing or damaged: {str(error)[:120]}") from error
 
 
-def _picture(cell: Mapping[str, Any], folder: Path) -> np.ndarray:
+def _picture(cell: Row, folder: Path) -> np.ndarray:
     data = cell.get("bytes")
     try:
         with Image.open(io.BytesIO(data) if data else regular(folder / str(cell.get("path")))) as image:
