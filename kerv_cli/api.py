@@ -27,10 +27,10 @@ from kerv_cli.cli.sweep import covered_cells, run_covered
 from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.store import STUDIES, StudyStore
-from kerv_cli.report.measures import MICRO
+from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.report import report as write_report
 from kerv_cli.report.tables import load_study as load_data
-from kerv_cli.report.tables import per_task_table, rows_of, study_table
+from kerv_cli.report.tables import rows_of
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
 
@@ -69,11 +69,10 @@ class Study:
         if table == "episodes":
             return data.episodes
         if table == "tasks":
-            return per_task_table(data)
-        whole = study_table(data)
-        return whole[whole["averaging"] == MICRO].reset_index(drop=True)
+            return data.per_task
+        return data.table[data.table["averaging"] == MICRO].reset_index(drop=True)
 
-    def episodes(self) -> list[dict[str, Any]]:
+    def episodes(self) -> list[Row]:
         """The rows of the table of episodes; errors as `to_pandas`."""
         return rows_of(self.to_pandas("episodes"))
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,12 +23,12 @@ from kerv_cli.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
+    from kerv_cli.lab.identity import Plain
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.tables import Row, StudyData
+    from kerv_cli.report.measures import Row
+    from kerv_cli.report.tables import StudyData
 
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
@@ -45,8 +46,6 @@ def rollout(
     words: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
-    from dataclasses import asdict
-
     from kerv_cli.base.config import to_yaml
     from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
@@ -73,7 +72,7 @@ def rollout(
     _tell(store, cells, as_json, in_same(words))
 
 
-def _stressed(settings: Mapping[str, Any]) -> str:
+def _stressed(settings: Plain) -> str:
     """The stress in plain RolloutSettings, as text behind a setting's label; empty without one."""
     from kerv_cli.lab.identity import stress_of
 
@@ -140,18 +139,17 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) 
 
 def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
     from kerv_cli.report.measures import MICRO
-    from kerv_cli.report.summary import summary_table
-    from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
+    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.tables import load_study, rows_of
 
     data = load_study(store)
-    table, per_task = study_table(data), rows_of(per_task_table(data))
-    whole = rows_of(table, MICRO)
+    whole, per_task = rows_of(data.table, MICRO), rows_of(data.per_task)
     if as_json:
         print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
                     "recordings": store.recordings})  # fmt: skip
         return
     if len(data.plan.labels) > 1:
-        console().print(summary_table(table))
+        console().print(SummaryTable(data.table))
     else:
         _single(data, per_task, whole[0])
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")

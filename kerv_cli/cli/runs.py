@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kerv_cli.base.errors import Interrupted, UsageError
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings, ImportSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
@@ -86,9 +88,7 @@ def _headline(run: RunEntry) -> str:
     return ""
 
 
-def _plain(run: RunEntry) -> dict[str, Any]:
-    from dataclasses import asdict
-
+def _plain(run: RunEntry) -> dict[str, object]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
@@ -97,13 +97,13 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
     from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
-    from kerv_cli.report.summary import summary_table
-    from kerv_cli.report.tables import load_study, rows_of, study_table
+    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.tables import load_study, rows_of
 
     results, (name,) = settings.results, _runs(names)
     chosen = sides(results, name)
     run = chosen[0].run
-    table = study_table(load_study(store_of(run))) if run.has_episodes and run.episodes else None
+    table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
     if table is not None:
         table = table[table["label"].isin([side.label for side in chosen])]
     size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
@@ -117,7 +117,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": line} | parts).items():
         typer.echo(f"{name:<9} {value}")
     if table is not None:
-        console().print(summary_table(table))
+        console().print(SummaryTable(table))
     elif run.figures:
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
@@ -130,7 +130,7 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
     runs = _runs(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
     if as_json:
-        print_json([comparing.as_plain(comparison) for comparison in comparisons])
+        print_json([asdict(comparison) for comparison in comparisons])
         return
     for comparison in comparisons:
         typer.echo(f"\n{comparison.first}  →  {comparison.second}")
@@ -141,8 +141,6 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
 @_of_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
 def diff(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show what differs between two runs in settings, weights, machine and versions."""
-    from dataclasses import asdict
-
     from kerv_cli.report import compare as comparing
 
     pairs = comparing.pairs_to_compare(settings.results, *_runs(names, 2, 2, "two runs, ID or ID:SETTING"))
@@ -241,7 +239,6 @@ def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
     """Hand a run to a tracker, or write its episodes or its curves as CSV."""
-    from kerv_cli.base.places import results_dir
     from kerv_cli.lab.catalogue import find_run
     from kerv_cli.report.export import export as hand_over
 
@@ -269,22 +266,21 @@ def export(
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Read evaluations of vla-eval as a study, whose episodes are paired as those of a sweep are."""
-    from kerv_cli.base.places import results_dir
     from kerv_cli.lab import imported
     from kerv_cli.lab.store import IMPORT, StudyStore
-    from kerv_cli.report.summary import summary_table
-    from kerv_cli.report.tables import load_study, rows_of, study_table
+    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.tables import load_study, rows_of
 
     if not names:
         raise UsageError("name a recording of vla-eval: kerv runs import recording-ID.sqlite")
     sides = imported.sides_of([imported.read_evaluations(Path(name)) for name in names], settings.labels)
     results, name = results_dir(settings.results), settings.name or imported.study_name(sides)
     notes = imported.write_study(results, name, sides, settings.baseline, [*IMPORT, *names])
-    table = study_table(load_study(StudyStore(results, name)))
+    table = load_study(StudyStore(results, name)).table
     if as_json:
         print_json({"study": name, "notes": notes, "settings": rows_of(table)})
         return
     for line in notes:
         typer.echo(line)
-    console().print(summary_table(table))
+    console().print(SummaryTable(table))
     typer.echo(f"study {name}: {called()} report study={name}, {called()} report --choose study={name}")

@@ -199,10 +199,10 @@ def _until_decided(
 def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
     """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
     command, for the one that is named."""
-    from kerv_cli.report.summary import not_in_turn, summary_table
+    from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
-    console().print(summary_table(table))
+    console().print(SummaryTable(table))
     codes, commits = values_of(table, "code"), values_of(table, "git_commit")
     if len(codes) > 1:
         names = ", ".join(sorted(commit[:12] for commit in commits))
@@ -230,28 +230,30 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
 def _tell(
     outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
 ) -> None:
-    from kerv_cli.report.tables import load_study, rows_of, study_table
+    from kerv_cli.report.tables import load_study, rows_of
 
     complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
-    table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
+    data = load_study(store, [cell for cell in cells if cell.id in complete]) if complete else None
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
-        rows = [] if table is None else rows_of(table)
+        rows = [] if data is None else rows_of(data.table)
         print_json({"study": store.name, "folder": store.root, "cells": counts, "settings": rows,
                     "recordings": store.recordings})  # fmt: skip
     else:
-        if table is not None:
-            tell_table(table, store, words)
+        if data is not None:
+            tell_table(data.table, store, words)
         episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
         if episodes and minutes:
             typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
         typer.echo(f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed")
-        if table is not None and not outcome.failed:
+        if data is not None and not outcome.failed:
             with at_work("writing the page"):
-                from kerv_cli.report.report import report
+                from kerv_cli.report.report import write_study
 
-                report(store.root.parent.parent, store.name, loss=resolved.sweep.loss)
-            tell_end(table, store, resolved.sweep.loss)
+                # the study may hold tasks of other sweeps
+                is_whole = [cell.id for cell in data.plan.cells] == [cell.id for cell in store.read_plan().cells]
+                write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
+            tell_end(data.table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

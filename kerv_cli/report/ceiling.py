@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import astuple, dataclass
-from typing import Any
 
 import pandas as pd
 
 from kerv_cli.base.settings import MODEL
+from kerv_cli.lab.identity import Plain
 
 
 @dataclass(frozen=True)
@@ -96,23 +95,23 @@ def _seconds(episodes: pd.DataFrame, phase: str) -> float:
     return float(episodes[f"seconds.{phase}"].sum(skipna=False))  # NaN where an episode was not timed
 
 
-def is_autoregressive(settings: Mapping[str, Any]) -> bool:
+def is_autoregressive(settings: Plain) -> bool:
     """Whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
     drafts = any(kind_of(settings, part) != "none" for part in ("prefill_draft", "proposer", "skip"))
     return not drafts and settings["policy"].get("kind", MODEL) == MODEL
 
 
-def verifies_in_prefill(settings: Mapping[str, Any]) -> bool:
+def verifies_in_prefill(settings: Plain) -> bool:
     """Whether a setting drafts before the prefill."""
     return kind_of(settings, "prefill_draft") != "none"
 
 
-def kind_of(settings: Mapping[str, Any], part: str) -> str:
+def kind_of(settings: Plain, part: str) -> str:
     """Kind of a setting's part; `none` for stored settings that are older than that part."""
     return str(settings.get(part, {"kind": "none"})["kind"])
 
 
-def chunk_ratio(settings: Mapping[str, Any], baseline: Mapping[str, Any]) -> float:
+def chunk_ratio(settings: Plain, baseline: Plain) -> float:
     """H over the baseline's H; NaN if only one of them is the target's default."""
     steps, baseline_steps = settings.get("chunk") or 0, baseline.get("chunk") or 0
     if steps == baseline_steps:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 
@@ -14,7 +12,7 @@ from kerv_cli.base.files import read_table
 from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
 from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import Cell, seeds_text
-from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.measures import MICRO, Row, measure
 from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
 
@@ -36,8 +34,8 @@ class Difference:
     """A setting, weight, machine or version in which the two sides differ. `None`: that side lacks it."""
 
     key: str
-    first: Any
-    second: Any
+    first: object
+    second: object
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class Comparison:
     first: str
     second: str
     settings: list[Difference]
-    results: list[dict[str, Any]]
+    results: list[Row]
 
 
 def sides(results: str, name: str) -> list[Side]:
@@ -109,10 +107,10 @@ def differences(first: Side, second: Side) -> list[Difference]:
     return [Difference(k, ours.get(k), theirs.get(k)) for k in keys if ours.get(k) != theirs.get(k)]
 
 
-def _settings_of(side: Side) -> dict[str, Any]:
+def _settings_of(side: Side) -> Row:
     if not side.run.has_episodes:
         description = description_of(side.run)
-        settings: dict[str, Any] = dict(description.get("settings", {}))
+        settings: Row = dict(description.get("settings", {}))
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
     store = store_of(side.run)
@@ -123,19 +121,19 @@ def _settings_of(side: Side) -> dict[str, Any]:
     return {**settings, **weights, **_tasks_and_seeds(cells), **_circumstances(side, cells)}
 
 
-def _tasks_and_seeds(cells: list[Cell]) -> dict[str, Any]:
+def _tasks_and_seeds(cells: list[Cell]) -> Row:
     tasks = ";".join(sorted({cell.task for cell in cells}))
     return {"tasks": tasks, "seeds": seeds_text(seed for cell in cells for seed in cell.seeds)}
 
 
-def _circumstances(side: Side, cells: list[Cell]) -> dict[str, Any]:
+def _circumstances(side: Side, cells: list[Cell]) -> Row:
     store = store_of(side.run)
     stored, _ = store.read_cells(cells)
     statuses = [cell.status for cell in stored.values()]
     return {key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS}
 
 
-def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[dict[str, Any]]:
+def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[Row]:
     baseline, episodes = _episodes(first, ours), _episodes(second, theirs)
     if baseline.empty or episodes.empty:
         raise UsageError("one of the two settings has no complete cell: run it to the end first")
@@ -159,7 +157,7 @@ def _episodes(data: StudyData, label: str) -> pd.DataFrame:
     return data.episodes[data.episodes["label"] == label]
 
 
-def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> Iterator[dict[str, Any]]:
+def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> Iterator[Row]:
     """The speedups of both settings against the baselines of their runs, and how far they differ: of two runs of one
     study, how far these agree."""
     a, b = (
@@ -173,13 +171,13 @@ def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> It
                    "change": b[column] / a[column], "what": "ratio of the speedups"}  # fmt: skip
 
 
-def _row(name: str, first: float, second: float, measured: dict[str, Any], column: str, what: str) -> dict[str, Any]:
+def _row(name: str, first: float, second: float, measured: Row, column: str, what: str) -> Row:
     low, high = measured[f"{column}_low"], measured[f"{column}_high"]
     return {"measure": name, "first": first, "second": second, "change": measured[column], "low": low, "high": high,
             "what": what}  # fmt: skip
 
 
-def _training_results(first: RunEntry, second: RunEntry) -> list[dict[str, Any]]:
+def _training_results(first: RunEntry, second: RunEntry) -> list[Row]:
     names = [name for name in first.figures if name in second.figures]
     return [
         {"measure": name, "first": first.figures[name], "second": second.figures[name],
@@ -209,8 +207,3 @@ def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
         for seed, group in decodes.groupby("seed"):
             tokens[cell.label, cell.task, int(str(seed)), cell.repeat] = [list(row) for row in group["tokens"]]
     return tokens
-
-
-def as_plain(comparison: Comparison) -> dict[str, Any]:
-    """A comparison for JSON."""
-    return dataclasses.asdict(comparison)

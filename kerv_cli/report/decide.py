@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any
 
 import pandas as pd
 
@@ -24,8 +23,8 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_json, write_json
 from kerv_cli.lab.plan import Cell
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import MICRO, pair_counts, paired
-from kerv_cli.report.tables import Row, StudyData, is_baseline, is_number, rows_of
+from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
+from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 from kerv_cli.report.text import interval
 
 POINTS = 100.0
@@ -52,7 +51,7 @@ class Choice:
     episode_speedup_low: float
     episode_speedup_high: float
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Row:
         """For JSON."""
         return {**asdict(self), "front": ";".join(self.front)}
 
@@ -61,7 +60,7 @@ def choices(study: pd.DataFrame, per_task: pd.DataFrame | None, loss: float) -> 
     """The suite's choice, then each task's.
 
     Args:
-        study, per_task: the tables of `tables.study_table` and `tables.per_task_table`; None: the suite alone.
+        study, per_task: a study's table, and that by task; None: the suite alone.
         loss: bound on the loss of success, points.
     """
     suite = rows_of(study, MICRO)

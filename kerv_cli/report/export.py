@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -16,7 +15,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.lab.catalogue import RunEntry, description_of, store_of
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.tables import flatten, load_study, rows_of, study_table, write_csv
+from kerv_cli.report.tables import flatten, load_study, rows_of, write_csv
 
 PROJECT = "kerv"
 
@@ -28,7 +27,7 @@ class Tracked:
 
     name: str
     group: str
-    config: dict[str, Any]
+    config: Mapping[str, object]
     history: list[tuple[int, dict[str, float]]]
     summary: dict[str, float] = field(default_factory=dict)
 
@@ -54,7 +53,7 @@ def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
         yield _training(run)
         return
     data = load_study(store_of(run))
-    for row in rows_of(study_table(data), MICRO):
+    for row in rows_of(data.table, MICRO):
         episodes = data.episodes[data.episodes["label"] == row["label"]]
         history = []
         for number, episode in enumerate(rows_of(episodes)):
@@ -77,7 +76,7 @@ def _training(run: RunEntry) -> Tracked:
     return Tracked(run.id, run.kind, {"kind": run.kind, **flatten(settings)}, history, dict(run.figures))
 
 
-def _is_measure(value: Any) -> bool:
+def _is_measure(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -14,6 +14,9 @@ from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
 
+Row = dict[str, Any]
+"""One row of a table by column."""
+
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 MARGIN = 0.03  # of success: a method is non-inferior where the difference's lower bound lies above -MARGIN
@@ -41,7 +44,7 @@ _RATIOS = {
 """Quotients of sums over episodes; NaN where the denominator is 0."""
 
 
-def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apart: bool = False) -> dict[str, Any]:
+def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apart: bool = False) -> Row:
     """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
 
     success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
@@ -155,7 +158,7 @@ def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
     return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
 
 
-def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = None) -> dict[str, Any]:
+def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = None) -> Row:
     """Columns on the success of paired episodes: their number and counts, McNemar's p (NaN without pairs), the
     difference with its interval, by default that of the counts, and whether the interval lies above minus the
     margin."""
@@ -236,7 +239,7 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
     values |= {name: float(sums[a] / sums[b]) if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
     values |= _alarms(episodes) if "audits" in episodes else {}
-    return values | {name: float(part.built(episodes)) for name, part in own_columns().items()}
+    return values | {name: float(part.built(episodes)) for name, part in registered_columns().items()}
 
 
 def _alarms(episodes: pd.DataFrame) -> dict[str, float]:
@@ -249,8 +252,8 @@ def _alarms(episodes: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def own_columns() -> Mapping[str, Part]:
-    """Columns that are not kerv's, by name: registered functions of a setting's episodes."""
+def registered_columns() -> Mapping[str, Part]:
+    """Columns that a plug-in adds, by name: functions of a setting's episodes."""
     return parts("column")
 
 
