@@ -32,17 +32,17 @@ from kerv_cli.report.viewing.blueprint import (
     SIGNALS,
     STEP,
     TIME,
-    EpisodeMeta,
     blueprint,
 )
 from kerv_cli.report.viewing.facts import facts_of, readable, summary
 from kerv_cli.report.viewing.token_outcomes import (
     OUTCOMES,
-    TokenOutcome,
+    Chunks,
     acceptance,
     chunk_size,
     decode_table,
     outcomes_of,
+    threshold_of,
 )
 
 JPEG_QUALITY = 85
@@ -52,9 +52,6 @@ _DOF_COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86B
 _PLACE_COLORS = (0xE15759FF, 0x59A14FFF, 0xF0E442FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 _CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
-
-Chunks = Sequence[Sequence[TokenOutcome]]
-"""Outcomes of the tokens of each decode's chunk."""
 
 
 @dataclass(frozen=True)
@@ -102,27 +99,8 @@ def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> 
             recording.log(entity.path, archetype, static=True)
         if entity.steps is not None and len(entity.steps):
             recording.send_columns(entity.path, _times(entity.steps, record.space.control_hz), entity.columns)
-    recording.send_blueprint(blueprint(meta_of(record, chunks)))
+    recording.send_blueprint(blueprint(record, chunks))
     return bytes(memory.drain_as_bytes())
-
-
-def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
-    """The properties of the episode that decide its layout."""
-    low, high = record.path.min(axis=0), record.path.max(axis=0)
-    x, y, z = ((low + high) / 2).tolist()
-    return EpisodeMeta(
-        chunk_steps=len(chunks[0]) // record.space.dofs if chunks else 1,
-        dofs=record.space.names,
-        frames=bool(record.frames),
-        drafted=any(o.kind not in ("target", "scripted", "dropped") for chunk in chunks for o in chunk),
-        threshold=any(_threshold(d) for d in record.decodes),
-        signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
-        most=max(max(d.forwards, acceptance(d.rounds)[0] if d.verifications else 0) for d in record.decodes),
-        slowest=1000 * max(d.seconds for d in record.decodes),
-        widest=max((max(_threshold(d), default=0) for d in record.decodes), default=0),
-        centre=(x, y, z),
-        extent=float((high - low).max()),
-    )
 
 
 def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
@@ -356,14 +334,9 @@ class Series:
         return Entity(self.path, (style,), starts[rows], _rows(np.array([self.values[i] for i in rows])))
 
 
-def _threshold(decode: DecodeRecord) -> tuple[int, ...]:
-    """r per DoF of a decode, in bins; empty without an acceptance rule that has a threshold."""
-    return next((r.threshold for r in decode.rounds if r.threshold), ())
-
-
 def _thresholds(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> tuple[list[tuple[int, ...]], list[str]]:
     """r of every decode, one number per set of DoFs with equal r in all decodes, and the sets' names. dofs: D names."""
-    limits = [_threshold(d) for d in decodes]
+    limits = [threshold_of(d) for d in decodes]
     groups: dict[tuple[int, ...], list[int]] = {}  # a DoF's r over the episode -> the DoFs that have it
     for dof in range(len(dofs)):
         groups.setdefault(tuple(r[dof % len(r)] for r in limits if r), []).append(dof)

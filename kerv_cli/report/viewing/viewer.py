@@ -60,18 +60,15 @@ def open_recording(paths: Sequence[Path]) -> str:
     """Opens recordings in the Rerun viewer without waiting for it; without a display, names the commands that do.
 
     Args:
-        paths: recordings, the newest first; at most MOST_OPENED are opened.
+        paths: one recording or more, the newest first; at most MOST_OPENED are opened.
 
     Returns:
         A sentence about what was opened, or the commands to type.
 
     Raises:
-        UsageError: no paths.
         KervError: a recording is damaged, or the viewer did not start.
     """
-    if not paths:
-        raise UsageError("no recording to open")
-    chosen = list(paths)[:MOST_OPENED]
+    chosen = paths[:MOST_OPENED]
     for path in chosen:
         _reader(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
@@ -221,7 +218,7 @@ def read_summary(path: Path) -> str:
     return "\n".join(lines)
 
 
-def _figure(value: Any) -> str:
+def _figure(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
