@@ -69,12 +69,12 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     has_times = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
-        **_columns("success", _averaged(once, macro, _success)),
-        **_columns("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
-        **_columns("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
+        **columns_of("success", _averaged(once, macro, _success)),
+        **columns_of("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
+        **columns_of("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
-        **_columns("AL", _averaged(episodes, macro, _acceptance_length)),
-        **(_columns("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
+        **columns_of("AL", _averaged(episodes, macro, _acceptance_length)),
+        **(columns_of("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
         **paired_columns(
             pair_counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(pair_counts(part)))
         ),
@@ -99,7 +99,7 @@ def _motion(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool) -> dict[st
         values = successes[column].astype(float)
         groups = values.groupby(successes["difficulty"]).mean() if macro else values
         columns[name] = math.nan if values.empty or values.isna().any() else float(groups.mean())
-        columns |= _columns(f"{name}_ratio", _motion_ratio(both, column, macro))
+        columns |= columns_of(f"{name}_ratio", _motion_ratio(both, column, macro))
     return columns
 
 
@@ -128,8 +128,7 @@ def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame
 
 
 def _success(episodes: pd.DataFrame) -> Estimate:
-    successes, count = int(episodes["success"].sum()), len(episodes)
-    return Estimate(successes / count, *stats.wilson(successes, count))
+    return stats.wilson(int(episodes["success"].sum()), len(episodes))
 
 
 def _acceptance_length(episodes: pd.DataFrame) -> Estimate:
@@ -167,13 +166,14 @@ def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = Non
         "pairs": sum(counts),
         **counts._asdict(),
         "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
-        **_columns("difference", difference),
+        **columns_of("difference", difference),
         "margin": MARGIN,
         "non_inferior": bool(difference.low > -MARGIN),
     }
 
 
-def _columns(name: str, estimate: Estimate) -> dict[str, float]:
+def columns_of(name: str, estimate: Estimate) -> dict[str, float]:
+    """Columns of an estimate: its value under the name, and its interval with the endings _low and _high."""
     return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import pandas as pd
 
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import MICRO, Row, paired_columns
+from kerv_cli.report.measures import MICRO, Row, columns_of, paired_columns
 from kerv_cli.report.tables import rows_of
 
 BEHIND = 0.10
@@ -73,7 +73,6 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
 def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
     counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
     episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
-    bounds = stats.wilson(successes, episodes)
     return {
         "study": rows[0]["study"],
         "label": f"{method} {name}",
@@ -82,9 +81,7 @@ def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
         "baseline": f"{reference} {name}",
         "episodes": episodes,
         "successes": successes,
-        "success": successes / episodes,
-        "success_low": bounds.low,
-        "success_high": bounds.high,
+        **columns_of("success", stats.wilson(successes, episodes)),
         **paired_columns(counts),
     }
 
