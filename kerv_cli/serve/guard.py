@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.protocol import Target
 
 REFUSE, HOLD = "refuse", "hold"
 """Of `outside`: answer with an error; execute the last action once more."""
@@ -43,7 +44,7 @@ class StateRange:
 class Finite:
     """A target that notices numbers which are not finite in its prompts and logits. All else is the target's own."""
 
-    def __init__(self, target: Any) -> None:
+    def __init__(self, target: Target) -> None:
         self._target = target
         self._fine: list[Tensor] = []  # read once per decode, so that no forward waits for the device
 

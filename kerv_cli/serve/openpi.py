@@ -3,7 +3,6 @@ is answered by a chunk of actions, or by a text frame that says what was wrong w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,12 @@ from kerv_cli.serve.guard import HOLD
 from kerv_cli.serve.policy import Policy
 from kerv_cli.serve.server import Reply
 from kerv_cli.serve.session import Interface, Session, hand_of, keys_of, text_of
-from kerv_cli.serve.wire import packed, unpacked
+from kerv_cli.serve.wire import Message, packed, unpacked
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 
 
-def metadata(interface: Interface, chunk: int) -> dict[str, Any]:
+def metadata(interface: Interface, chunk: int) -> dict[str, object]:
     """The first frame that a client gets. chunk: H."""
     return {
         "server": "kerv",
@@ -38,7 +37,7 @@ def metadata(interface: Interface, chunk: int) -> dict[str, Any]:
     }
 
 
-def observation_of(interface: Interface, message: Mapping[str, Any]) -> Observation:
+def observation_of(interface: Interface, message: Message) -> Observation:
     """The observation in a message.
 
     Raises:
@@ -82,7 +81,7 @@ class OpenPi:
         values = self.act(unpacked(frame))
         return Reply(packed(values), values["policy_timing"]["infer_ms"] / 1000)
 
-    def act(self, message: Mapping[str, Any]) -> dict[str, Any]:
+    def act(self, message: Message) -> dict[str, Any]:
         """The actions (H, D) for the observation in a message, their time and their forwards.
 
         Raises:
@@ -123,7 +122,7 @@ class OpenPi:
         """The frame that says what was wrong."""
         return f"kerv: {line}"
 
-    def _executed(self, message: Mapping[str, Any]) -> np.ndarray:
+    def _executed(self, message: Message) -> np.ndarray:
         """The actions of the last answer that were executed since: all of them, or the first `executed` ones."""
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):

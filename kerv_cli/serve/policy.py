@@ -62,7 +62,7 @@ class Policy:
         first = self._decoder(self._any_task())
         self.chunk = first.steps
         self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
-        self.released(first)
+        self.take_back(first)
 
     def _interface(self) -> Interface:
         description = self.artifacts.description
@@ -97,12 +97,12 @@ class Policy:
         return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get("by_task"))
 
     def _any_task(self) -> str:
-        """The task of the settings; without one, where a client names its tasks, one that the method's levels know."""
-        if self.by_task and self.settings.protocol == VLA_EVAL:
-            for kind in self._task_artifacts():
-                artifact = self.artifacts.load(kind)
-                return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ("",)))
-        return self.settings.task_name
+        """The task of the settings; without one, where a client names its tasks, one for which the method has
+        levels."""
+        if not self.by_task or self.settings.protocol != VLA_EVAL:
+            return self.settings.task_name
+        artifact = self.artifacts.load(self._task_artifacts()[0])
+        return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ()), "")
 
     @contextlib.contextmanager
     def session(self) -> Iterator[Session]:
@@ -112,21 +112,21 @@ class Policy:
             yield session
         finally:
             if isinstance(session.decoder, Alone):
-                self.released(session.decoder.decoder)
+                self.take_back(session.decoder.decoder)
 
     def new_session(self) -> Session:
         """For one more client."""
         holds = self.settings.outside == HOLD
-        return Session(self._follower, self.settings.task_name, self.by_task, self.range, holds)
+        return Session(self._client_decoder, self.settings.task_name, self.by_task, self.range, holds)
 
-    def released(self, decoder: Decoder) -> None:
-        """A decoder that nobody uses any more; those of one task alone are not kept."""
+    def take_back(self, decoder: Decoder) -> None:
+        """Keeps a decoder whose client has left for the next one, unless it is of one task."""
         if not self.by_task:
             self._idle.append(decoder)
 
-    def _follower(self, task: str) -> ActionDecoder:
+    def _client_decoder(self, task: str) -> ActionDecoder:
         if self._together is not None:
-            return self._together.seat()
+            return Seat(self._together)
         return Alone(self._idle.pop() if self._idle else self._decoder(task), self._turn)
 
     def _decoder(self, task: str) -> Decoder:
@@ -137,7 +137,7 @@ class Policy:
             warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
         return decoder
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """What a result must say about it: settings of a rollout, hashes, machine and versions; plain values."""
         shared = {at.name: getattr(self.settings, at.name) for at in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
@@ -189,10 +189,6 @@ class Together:
     _turn: threading.Lock = field(default_factory=threading.Lock)
     _arrived: threading.Condition = field(default_factory=threading.Condition)
     _waiting: list[_Request] = field(default_factory=list)
-
-    def seat(self) -> Seat:
-        """For one more client."""
-        return Seat(self)
 
     def decode(self, lane: Lane, observation: Observation) -> DecodeRecord:
         """The record of one client's observation. Whoever has the turn decodes for all who wait."""
