@@ -54,11 +54,6 @@ def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.
     return seconds
 
 
-def median_seconds(work: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Median of `timed`."""
-    return float(np.median(timed(work, device, repeats)))
-
-
 @torch.inference_mode()
 def measure_machine(device: torch.device, dtype: torch.dtype, repeats: int = 7) -> Machine:
     """The device's rates with this process's threads."""

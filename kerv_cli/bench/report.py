@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from kerv_cli.bench.ceilings import MethodCeiling
 from kerv_cli.bench.phases import Phase
+from kerv_cli.bench.profile import Document
 
 
 def card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
@@ -48,7 +48,7 @@ def ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple
     return [(method, *row) for method, row in by_method.items()]
 
 
-def comparison_rows(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def comparison_rows(a: Document, b: Document) -> list[tuple[str, ...]]:
     """Phases that both documents have: medians in milliseconds and a over b."""
     other = {phase["name"]: phase for phase in b["phases"]}
     rows: list[tuple[str, ...]] = []

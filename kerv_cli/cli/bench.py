@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -34,9 +34,10 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
         _compare(*compare)
         return
     from kerv_cli.bench import report
-    from kerv_cli.bench.run import open_and_card, run, write
+    from kerv_cli.bench.run import card_of, open_timed, run, write
 
-    model, machine, card, opened = open_and_card(settings)
+    model, machine, opened = open_timed(settings)
+    card = card_of(model, machine, max(settings.tokens))
     print_table(("card", ""), report.card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
     done = run(settings, model, machine, opened)
     typer.echo(
@@ -56,11 +57,9 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
 def _compare(a: Path, b: Path) -> None:
     from kerv_cli.bench.report import comparison_rows
 
-    documents: list[dict[str, Any]] = []
-    for path in (a, b):
-        document = read_json(path)
+    documents = {path: read_json(path) for path in (a, b)}
+    for path, document in documents.items():
         if not isinstance(document, dict) or not {"phases", "target", "dtype"} <= set(document):
             raise CheckpointError(f"{path} is no result of 'kerv bench'")
-        documents.append(document)
-    names = [f"{d['target']} {d['dtype']} ms" for d in documents]
-    print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
+    names = [f"{documents[path]['target']} {documents[path]['dtype']} ms" for path in (a, b)]
+    print_table(("phase", *names, "ratio"), comparison_rows(documents[a], documents[b]), f"{a} and {b}")
