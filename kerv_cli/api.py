@@ -33,6 +33,7 @@ from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.tables import rows_of
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
+from kerv_cli.serve.wire import Message
 
 TABLES = ("settings", "tasks", "episodes")
 
@@ -87,7 +88,7 @@ class Study:
         return write_report(self.folder.parent.parent, self.name).files
 
 
-def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
+def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
     """Runs episodes of one method, as `kerv rollout`; goes on with the same rollout where one was interrupted.
 
     Args:
@@ -104,7 +105,7 @@ def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
     return Study(run_cells(resolved, planned_cells(resolved), arguments))
 
 
-def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
+def sweep(study: str | Path, *words: str, **settings: object) -> Study:
     """Runs what a study lacks, as `kerv sweep`: every setting on every task with the same seeds, in turn.
 
     Args:
@@ -167,7 +168,7 @@ class Policy:
         """The next observation begins an episode: histories are forgotten."""
         self._begins = True
 
-    def act(self, observation: Mapping[str, Any], executed: int | None = None) -> np.ndarray:
+    def act(self, observation: Message, executed: int | None = None) -> np.ndarray:
         """The actions (h, D) to execute from here, float64, environment units; h ≤ H.
 
         Args:
@@ -187,7 +188,7 @@ class Policy:
 
 
 def load_policy(
-    target: str = "mt10-vision", *words: str, method: str = "one_pass", task: str = "", **settings: Any
+    target: str = "mt10-vision", *words: str, method: str = "one_pass", task: str = "", **settings: object
 ) -> Policy:
     """A policy that answers observations, warmed up.
 
@@ -205,12 +206,12 @@ def load_policy(
     return Policy(Served(compose("serve", typed, ServeSettings)))
 
 
-def as_words(*words: str, **settings: Any) -> list[str]:
+def as_words(*words: str, **settings: object) -> list[str]:
     """Words and keywords as they are typed behind a command: `episodes=3`, `task=[reach,push]`, `threshold.r=5`."""
     return [*words, *(word for key, value in settings.items() for word in _typed(key, value))]
 
 
-def _typed(key: str, value: Any) -> Iterator[str]:
+def _typed(key: str, value: object) -> Iterator[str]:
     if isinstance(value, Mapping):
         for name, inner in value.items():
             yield from _typed(f"{key}.{name}", inner)
@@ -218,7 +219,7 @@ def _typed(key: str, value: Any) -> Iterator[str]:
         yield f"{key}={_text(value)}"
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{','.join(map(_text, value))}]"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

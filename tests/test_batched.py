@@ -42,7 +42,7 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.plots import study_figures
-from kerv_cli.report.reprice import Machine, repriced_table
+from kerv_cli.report.reprice import NamedProfile, repriced_table
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.compact.packed import pack
@@ -374,7 +374,7 @@ def test_decodes_without_host_times_have_no_price(tmp_path: Path) -> None:
     store.write_plan(threshold_settings(), cells)
     execute(cells, Prepared(), store)
     with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
-        repriced_table(load_study(store), [Machine("there", Profile(31, {}))])
+        repriced_table(load_study(store), [NamedProfile("there", Profile(31, {}))])
 
 
 # --- the command

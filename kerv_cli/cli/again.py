@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.manifests import read
@@ -103,7 +103,7 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     if not isinstance(training, dict):
         command = "target" if run.kind == "target" else "drafter"
         raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
-    value: dict[str, Any] = training | {"results": results}
+    value = training | {"results": results}
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))

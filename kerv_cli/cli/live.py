@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from kerv_cli.base.errors import UsageError
 
@@ -17,7 +16,7 @@ _MODULES = {"trackio": "trackio", "wandb": "wandb", "tensorboard": "torch.utils.
 
 
 @contextmanager
-def live(tracker: str, name: str, folder: Path, steps: int, config: Mapping[str, Any]) -> Iterator[LogStep]:
+def live(tracker: str, name: str, folder: Path, steps: int, config: Mapping[str, object]) -> Iterator[LogStep]:
     """Yields what takes the numbers of a step: of an update, or of a validation, which has a `step` among them.
 
     Args:

@@ -73,7 +73,7 @@ def report(
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
-    for path in output.files if files or not output.tables else ():
+    for path in output.files if files else ():
         typer.echo(str(path))
     for name, table in output.tables.items():
         if settings.only is None:
@@ -84,7 +84,7 @@ def report(
 def _choose(settings: ReportSettings, as_json: bool) -> None:
     """Prints the choice of one study, or of every study that has results."""
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.decide import choices, sentence, short
+    from kerv_cli.report.decide import choices, sentence, short_sentence
     from kerv_cli.report.report import names_to_report
     from kerv_cli.report.tables import load_study
 
@@ -97,6 +97,6 @@ def _choose(settings: ReportSettings, as_json: bool) -> None:
             typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
             typer.echo(f"  {sentence(groups[0], settings.loss, data.plan.baseline)}")
             for choice in groups[1:]:
-                typer.echo(f"  {short(choice)}")
+                typer.echo(f"  {short_sentence(choice)}")
     if as_json:
         print_json(answers)

@@ -14,12 +14,12 @@ from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
     at_work,
-    called,
     console,
-    in_same,
+    kerv_command,
     print_json,
     print_notes,
     print_table,
+    results_word,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def rollout(
         return
     arguments = ["rollout", *(["-m"] if multirun else []), *words]
     store = run_cells(resolved, cells, arguments)
-    _tell(store, cells, as_json, in_same(words))
+    _tell(store, cells, as_json, results_word(words))
 
 
 def _stressed(settings: Plain) -> str:
@@ -152,9 +152,10 @@ def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> No
         console().print(SummaryTable(data.table))
     else:
         _single(data, per_task, whole[0])
-    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
+    show = f"{kerv_command()} runs show {store.name}{where}"
+    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")
     if store.recordings:
-        typer.echo(f"{len(store.recordings)} recordings; open one with: {called()} view {store.recordings[0]}")
+        typer.echo(f"{len(store.recordings)} recordings; open one with: {kerv_command()} view {store.recordings[0]}")
 
 
 def _single(data: StudyData, per_task: list[Row], whole: Row) -> None:

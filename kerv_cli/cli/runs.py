@@ -13,7 +13,7 @@ from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings, ImportSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
+from kerv_cli.cli.common import AsJson, ShowPlan, console, kerv_command, print_json, print_table, results_word
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -202,7 +202,7 @@ def rerun(
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
         return
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
-    typer.echo(f"both side by side: {called()} runs compare {run.id} {entry.id}{in_same(words)}")
+    typer.echo(f"both side by side: {kerv_command()} runs compare {run.id} {entry.id}{results_word(words)}")
 
 
 def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None:
@@ -283,4 +283,4 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     for line in notes:
         typer.echo(line)
     console().print(SummaryTable(table))
-    typer.echo(f"study {name}: {called()} report study={name}, {called()} report --choose study={name}")
+    typer.echo(f"study {name}: {kerv_command()} report study={name}, {kerv_command()} report --choose study={name}")

@@ -13,8 +13,8 @@ from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
     at_work,
-    called,
     console,
+    kerv_command,
     print_json,
     print_notes,
     print_table,
@@ -110,7 +110,7 @@ def _list_studies(as_json: bool) -> None:
         print_json([dict(zip((*columns[:5], "title"), row, strict=True)) for row in rows])
         return
     print_table(columns, rows, "episodes: per task; in all: settings x tasks x episodes")
-    typer.echo(f"run one, e.g.: {called()} sweep study=demo; what it would do: --plan")
+    typer.echo(f"run one, e.g.: {kerv_command()} sweep study=demo; what it would do: --plan")
 
 
 def _warn(lines: Iterable[str]) -> None:
@@ -173,7 +173,7 @@ def _until_decided(
 
     study, margin = resolved.study, resolved.sweep.loss / 100
     blocks = decide.looks_of(cells, study.block)
-    typer.echo(decide.rule(resolved.sweep.loss, len(blocks)), err=True)
+    typer.echo(decide.stopping_rule(resolved.sweep.loss, len(blocks)), err=True)
     latest: dict[str, decide.Verdict] = {}
     planned: list[Cell] = []
     total = Outcome()
@@ -187,7 +187,7 @@ def _until_decided(
         if outcome.failed:
             return total
         verdicts = decide.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
-        typer.echo(f"look {look} of {len(blocks)}: {decide.summary(verdicts)}", err=True)
+        typer.echo(f"look {look} of {len(blocks)}: {decide.progress_line(verdicts)}", err=True)
         latest |= {verdict.label: verdict for verdict in verdicts}
         decide.write_verdicts(store.root, latest, resolved.sweep.loss, len(blocks))
         open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decide.OPEN]
@@ -224,7 +224,7 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     typer.echo(f"page: {store.root / 'report.html'}")
     recordings = store.recordings
     mend = "" if store.is_imported else "; the same sweep with record=1 rerun=all does that"
-    typer.echo(f"watch: {f'{called()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
+    typer.echo(f"watch: {f'{kerv_command()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
 
 
 def _tell(

@@ -25,7 +25,7 @@ class Ceiling:
     prefill: float
     one_token: float  # T_1, a forward over one token
     tokens: float  # N
-    own: float  # the method's prefill with its draft, or its verification
+    forward: float  # the method's prefill with its draft, or its verification
     in_prefill: float = 0.0  # 1: the method has an in-prefill draft
     chunks: float = 1.0  # H of the method / H of the baseline
 
@@ -33,13 +33,13 @@ class Ceiling:
     def value(self) -> float:
         """Ratio of times per control step; NaN where a part is missing."""
         baseline = self.overhead + self.prefill + (self.tokens - 1) * self.one_token
-        least = self.overhead + (0.0 if self.in_prefill else self.prefill) + self.own
+        least = self.overhead + (0.0 if self.in_prefill else self.prefill) + self.forward
         return self.chunks * baseline / least if least > 0 else math.nan
 
     def columns(self) -> dict[str, float]:
         """For a row of a table: the ceiling, and its times in milliseconds per decode."""
-        times = ("overhead", "prefill", "one_token", "own")
-        parts = {f"ceiling_ms.{name}": 1000.0 * getattr(self, name) for name in times}
+        fields = {"overhead": "overhead", "prefill": "prefill", "one_token": "one_token", "own": "forward"}
+        parts = {f"ceiling_ms.{name}": 1000.0 * getattr(self, field) for name, field in fields.items()}
         return {"ceiling": self.value, "ceiling_tokens": self.tokens, **parts}
 
 
@@ -85,7 +85,7 @@ def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, chu
         prefill=_seconds(baseline, "prefill") / decodes,
         one_token=one_token,
         tokens=float(baseline["forwards"].sum()) / decodes,
-        own=verification if verification > 0 else math.nan,
+        forward=verification if verification > 0 else math.nan,
         in_prefill=float(in_prefill),
         chunks=chunks,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pandas as pd
 
@@ -22,11 +22,13 @@ _STATUS_KEYS = ("host", "device_name", "git_commit", "torch_version", "mujoco_ve
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison: a run, and one of its settings unless it is a training."""
+    """One side of a comparison: a run, and one of its settings unless it is a training. data: of the run's episodes,
+    read by `pairs_to_compare`."""
 
     name: str
     run: RunEntry
     label: str = ""
+    data: StudyData | None = None
 
 
 @dataclass(frozen=True)
@@ -74,29 +76,26 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
     second run's.
 
     Raises:
-        UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes.
+        UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes, or a run
+            without complete cells. CheckpointError: a damaged one.
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
         raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: one of them has no episodes")
-    shared = [(a, b) for a in ours for b in theirs if a.label == b.label]
-    if len(shared) > 1 or (shared and len(ours) == len(theirs) == 1):
-        return shared
-    return [(ours[0], side) for side in theirs if side != ours[0]]
+    pairs = [(a, b) for a in ours for b in theirs if a.label == b.label]
+    if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
+        pairs = [(ours[0], side) for side in theirs if side != ours[0]]
+    runs = {side.run.id: side.run for side in (ours[0], theirs[0]) if side.run.has_episodes}
+    data = {name: load_study(store_of(run)) for name, run in runs.items()}
+    return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
 
 
 def compare(first: Side, second: Side) -> Comparison:
-    """The differences between two sides.
-
-    Raises:
-        UsageError: a run without complete cells. CheckpointError: a damaged one.
-    """
-    if not first.run.has_episodes:
+    """The differences between two sides. Raises UsageError: a setting without complete cells."""
+    if first.data is None or second.data is None:
         rows = _training_results(first.run, second.run)
     else:
-        rows = _episode_results(
-            load_study(store_of(first.run)), first.label, load_study(store_of(second.run)), second.label
-        )
+        rows = _episode_results(first.data, first.label, second.data, second.label)
     return Comparison(first.name, second.name, differences(first, second), rows)
 
 
@@ -108,29 +107,24 @@ def differences(first: Side, second: Side) -> list[Difference]:
 
 
 def _settings_of(side: Side) -> Row:
-    if not side.run.has_episodes:
+    if side.data is None:
         description = description_of(side.run)
         settings: Row = dict(description.get("settings", {}))
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
-    store = store_of(side.run)
-    cells = [cell for cell in store.read_plan().cells if cell.label == side.label]
-    cell = cells[0]
-    settings = flatten(without(cell.settings, NOT_DETERMINING - {"policy", "method"}))
-    weights = {name: value[:12] for name, value in cell.identity.items() if name != OBSERVATION}
-    return {**settings, **weights, **_tasks_and_seeds(cells), **_circumstances(side, cells)}
+    cells = [cell for cell in side.data.plan.cells if cell.label == side.label]
+    settings = flatten(without(cells[0].settings, NOT_DETERMINING - {"policy", "method"}))
+    weights = {name: value[:12] for name, value in cells[0].identity.items() if name != OBSERVATION}
+    statuses = [side.data.cells[cell.id].status for cell in side.data.complete.get(side.label, ())]
+    circumstances = {
+        key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS if statuses
+    }
+    return {**settings, **weights, **_tasks_and_seeds(cells), **circumstances}
 
 
 def _tasks_and_seeds(cells: list[Cell]) -> Row:
     tasks = ";".join(sorted({cell.task for cell in cells}))
     return {"tasks": tasks, "seeds": seeds_text(seed for cell in cells for seed in cell.seeds)}
-
-
-def _circumstances(side: Side, cells: list[Cell]) -> Row:
-    store = store_of(side.run)
-    stored, _ = store.read_cells(cells)
-    statuses = [cell.status for cell in stored.values()]
-    return {key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS}
 
 
 def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[Row]:

@@ -144,7 +144,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
     return f"{choice.pairs} pairs do not yet show a setting that is faster and {bound}; {_missing(choice)}"
 
 
-def short(choice: Choice) -> str:
+def short_sentence(choice: Choice) -> str:
     """The choice for one task in a few words."""
     if choice.chosen:
         return f"{choice.where}: {choice.chosen}"
@@ -157,6 +157,8 @@ def _missing(choice: Choice) -> str:
     if not choice.candidate:
         return "more would not show one"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
+    if more > stats.MOST_PAIRS:
+        return f"more than {stats.MOST_PAIRS:,} pairs would be needed to show it for {choice.candidate}"
     return f"about {more} more would show it for {choice.candidate} at the present rates"
 
 
@@ -240,7 +242,7 @@ def read_verdicts(folder: Path) -> pd.DataFrame | None:
     return pd.DataFrame(read_json(path)["settings"]) if path.is_file() else None
 
 
-def rule(loss: float, looks: int) -> str:
+def stopping_rule(loss: float, looks: int) -> str:
     """The stopping rule in one sentence."""
     confidence = 100 * confidence_of_a_look(looks)
     return (
@@ -250,7 +252,7 @@ def rule(loss: float, looks: int) -> str:
     )
 
 
-def summary(answers: Sequence[Verdict]) -> str:
+def progress_line(answers: Sequence[Verdict]) -> str:
     """Verdicts in one line, for progress."""
     clauses = [f"{v.label}: {v.verdict} after {v.pairs} pairs" for v in answers if v.verdict != OPEN]
     waiting = sum(v.verdict == OPEN for v in answers)

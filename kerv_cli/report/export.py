@@ -40,11 +40,10 @@ def export(run: RunEntry, to: str, folder: Path) -> list[str]:
     """
     if to not in TRACKERS:
         raise UnknownName("tracker", to, TRACKERS)
-    package, extra, write = TRACKERS[to]
-    if package and importlib.util.find_spec(package) is None:
-        raise UsageError(f"--to {to} needs the package {package}: pip install 'kerv[{extra}]'")
+    if to != "csv" and importlib.util.find_spec(to) is None:
+        raise UsageError(f"--to {to} needs the package {to}: pip install 'kerv[{to}]'")
     folder.mkdir(parents=True, exist_ok=True)
-    return [write(tracked, folder) for tracked in tracked_runs(run)]
+    return [TRACKERS[to](tracked, folder) for tracked in tracked_runs(run)]
 
 
 def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
@@ -124,11 +123,10 @@ def _to_mlflow(tracked: Tracked, folder: Path) -> str:
     return tracked.name
 
 
-Write = Callable[[Tracked, Path], str]
-TRACKERS: dict[str, tuple[str, str, Write]] = {
-    "csv": ("", "", _to_csv),
-    "trackio": ("trackio", "trackio", _to_trackio),
-    "wandb": ("wandb", "wandb", _to_wandb),
-    "mlflow": ("mlflow", "mlflow", _to_mlflow),
+TRACKERS: dict[str, Callable[[Tracked, Path], str]] = {
+    "csv": _to_csv,
+    "trackio": _to_trackio,
+    "wandb": _to_wandb,
+    "mlflow": _to_mlflow,
 }
-"""Name -> package that it needs, the extra that brings it, and what hands a run over."""
+"""Name, which is also that of its package and of kerv's extra -> what hands a run over."""

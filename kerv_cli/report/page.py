@@ -21,7 +21,7 @@ from kerv_cli.report.summary import SPEEDS, differences, motion_frame, summary_f
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 
 LOSS = 3.0
-"""Points of success that the verdict at the top of the page allows where nobody says otherwise."""
+"""Points of success that the page's verdict allows to lose by default."""
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,6 @@ class Section:
     note: str
     figure: str  # an HTML element
     table: pd.DataFrame | None = None  # of text
-
-
-@dataclass(frozen=True)
-class Link:
-    """A file beside the page. href: relative to it."""
-
-    text: str
-    href: str
 
 
 def render(
@@ -83,8 +75,8 @@ def render(
         figures=figures,
         sections=sections,
         tasks=_by_task(data.per_task),
-        recordings=[Link(path.stem, _href(path, store.root)) for path in store.recordings],
-        files=[Link(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
+        recordings=[(path.stem, _href(path, store.root)) for path in store.recordings],
+        files=[(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
         commands=[(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()],
     )
 
@@ -173,5 +165,6 @@ def _cell(row: Row) -> str:
     return f"{share} · {row['episode_speedup']:.2f}×, {row['speedup']:.2f}×"
 
 
-def _href(path: Path, page: Path) -> str:
-    return quote(Path(os.path.relpath(path, page)).as_posix())
+def _href(path: Path, folder: Path) -> str:
+    """A file's address, relative to the folder of the page."""
+    return quote(Path(os.path.relpath(path, folder)).as_posix())

@@ -18,7 +18,7 @@ from kerv_cli.report.measures import MICRO
 from kerv_cli.report.page import LOSS, Section, render
 from kerv_cli.report.plots import about, has_task_map, latency_figure, study_figures, task_map
 from kerv_cli.report.publish import check_publishable
-from kerv_cli.report.reprice import ASSUMES, open_machines, repriced_summary, repriced_table
+from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
 from kerv_cli.report.tables import StudyData, load_study, write_csv
 
@@ -34,7 +34,7 @@ def names_to_report(results: Path | str, study: str | None) -> list[str]:
 @dataclass
 class Report:
     """Files and tables of a report. files: in the order of writing. tables: study -> its table. priced: the
-    `repriced_table` of the machines in `on`."""
+    `repriced_table` of the profiles in `on`."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
@@ -63,11 +63,11 @@ def report(
     if on and not study:
         raise UsageError(f"on={','.join(on)}: name the study whose decodes are to be priced, study=NAME")
     names = names_to_report(results, study)
-    machines, output = open_machines(results, on), Report([], {})
+    profiles, output = open_profiles(results, on), Report([], {})
     for name in names:
         store = StudyStore(results, name)
         data = load_study(store)
-        output.priced = repriced_table(data, machines) if machines else None
+        output.priced = repriced_table(data, profiles) if profiles else None
         output.files += write_study(store, data, loss, publish, output.priced)
         output.tables[name] = data.table
     return output

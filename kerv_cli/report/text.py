@@ -33,8 +33,15 @@ def text_frame(rows: Iterable[Row], columns: Iterable[Column]) -> pd.DataFrame:
 
 
 def numbers(name: str) -> TextOf:
-    """A column's `number`."""
-    return lambda row: number(row[name])
+    """A column's value with three significant digits and no exponent; `–` where there is none."""
+
+    def text(row: Row) -> str:
+        value = row[name]
+        if not is_number(value):
+            return "–"
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
+
+    return text
 
 
 def shares(name: str) -> TextOf:
@@ -61,13 +68,6 @@ def interval(row: Row, name: str, scale: float = 1.0, digits: int = 2, between: 
     text = f"{value:.{digits}f}" if digits else f"{value:.1f}".removesuffix(".0")
     low, high = row[f"{name}_low"], row[f"{name}_high"]
     return f"{text} ({low * scale:.{digits}f}{between}{high * scale:.{digits}f})" if is_number(low) else text
-
-
-def number(value: float) -> str:
-    """Three significant digits without an exponent; `–` for a missing value."""
-    if not is_number(value):
-        return "–"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
 def p_value(row: Row) -> str:

@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -61,7 +60,7 @@ class Entity:
     path: str
     static: tuple[rr.AsComponents, ...] = ()
     steps: NDArray[np.int64] | None = None  # (rows,) control steps
-    columns: Iterable[Any] = ()  # rerun columns of as many rows
+    columns: Iterable[rr.ComponentColumn] = ()  # of as many rows
 
 
 def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapping[str, float] | None = None) -> Path:
@@ -292,46 +291,30 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
-    series = [
-        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0x8C99A6FF]),
-        Series(
-            "decode/acceptance",
-            ["AL, tokens per verification", "drafts accepted per verification"],
-            [acceptance(d.rounds) if d.verifications else () for d in decodes],
-            [0x56B4E9FF, 0x009E73FF],
-        ),
-        Series("decode/threshold", limit_names, limits, [0xE69F00FF, *_DOF_COLORS]),
-        Series(
-            "decode/phases",
-            ["total", *phases],
-            [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes],
-            [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF],
-        ),
-    ]
+    entities = []
+
+    def add(path: str, names: Sequence[str], values: Sequence[Sequence[float]], colors: Sequence[int] | None) -> None:
+        """A series, each of whose values is held until the next one. values: per decode a number per name, or none."""
+        rows = [i for i, value in enumerate(values) if value]
+        if rows:
+            style = _named(names, colors, held=True)
+            entities.append(Entity(path, (style,), starts[rows], _rows(np.array([values[i] for i in rows]))))
+
+    add("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0x8C99A6FF])
+    lengths = [acceptance(d.rounds) if d.verifications else () for d in decodes]
+    names = ["AL, tokens per verification", "drafts accepted per verification"]
+    add("decode/acceptance", names, lengths, [0x56B4E9FF, 0x009E73FF])
+    add("decode/threshold", limit_names, limits, [0xE69F00FF, *_DOF_COLORS])
+    times = [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes]
+    add("decode/phases", ["total", *phases], times, [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF])
     for signal, name in SIGNALS.items():
         values = [getattr(d, signal) for d in decodes]
         if signal in bounds:
             both = [() if x is None else (x, bounds[signal]) for x in values]
-            series.append(Series(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF]))
+            add(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF])
         else:
-            series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in values]))
-    return [s.entity(starts) for s in series if any(s.values)]
-
-
-@dataclass(frozen=True)
-class Series:
-    """Named numbers per decode, each held until the next one."""
-
-    path: str
-    names: Sequence[str]
-    values: Sequence[Sequence[float]]  # per decode: one number per name, or nothing
-    colors: Sequence[int] | None = None
-
-    def entity(self, starts: NDArray[np.int64]) -> Entity:
-        """The entity, with a row for every decode that has values. starts (decodes,): control steps."""
-        rows = [i for i, value in enumerate(self.values) if value]
-        style = _named(self.names, self.colors, held=True)
-        return Entity(self.path, (style,), starts[rows], _rows(np.array([self.values[i] for i in rows])))
+            add(f"signals/{signal}", [name], [() if x is None else (x,) for x in values], None)
+    return entities
 
 
 def _thresholds(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> tuple[list[tuple[int, ...]], list[str]]:
@@ -351,7 +334,7 @@ def _named(names: Sequence[str], colors: Sequence[int] | None = None, held: bool
     return rr.SeriesLines(names=list(names), colors=colored, interpolation_mode="StepAfter" if held else None)
 
 
-def _rows(values: NDArray[Any]) -> Iterable[Any]:
+def _rows(values: np.ndarray) -> rr.ComponentColumnList:
     """(rows, k) -> a column of k scalars per row."""
     return rr.Scalars.columns(scalars=values.astype(np.float64).ravel()).partition([values.shape[1]] * len(values))
 

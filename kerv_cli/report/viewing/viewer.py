@@ -19,7 +19,7 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import regular
 
 if TYPE_CHECKING:
-    from rerun.chunk import RrdReader
+    from rerun.chunk import Chunk, RrdReader
 
 MOST_OPENED = 16
 """Largest number of recordings that one command opens; more would fill the viewer's memory."""
@@ -162,7 +162,7 @@ def _start(command: list[str]) -> None:
             raise KervError(f"the Rerun viewer ended at once: {_last_line(log.read(), status)}")
 
 
-def read_back(path: Path) -> dict[str, Any]:
+def read_recording(path: Path) -> dict[str, Any]:
     """The contents of a recording, read chunk by chunk.
 
     Returns:
@@ -206,8 +206,8 @@ def read_back(path: Path) -> dict[str, Any]:
 
 
 def read_summary(path: Path) -> str:
-    """`read_back` as text; errors as there."""
-    contents = read_back(path)
+    """`read_recording` as text; errors as there."""
+    contents = read_recording(path)
     lines = [f"{path}: {contents['name'] or contents['recording']}, {contents['bytes'] / 1e6:.2f} MB"]
     if "step" in contents["timelines"]:
         first, last = contents["timelines"]["step"]
@@ -244,12 +244,12 @@ def _reader(path: Path) -> RrdReader:
     return reader
 
 
-def chunks_of(path: Path) -> list[Any]:
+def chunks_of(path: Path) -> list[Chunk]:
     """Every chunk of a recording. KervError: it is missing or damaged."""
     return _chunks(_reader(path), path)
 
 
-def _chunks(reader: RrdReader, path: Path) -> list[Any]:
+def _chunks(reader: RrdReader, path: Path) -> list[Chunk]:
     try:
         return list(reader.stream())
     except (RuntimeError, OSError, ValueError) as error:
