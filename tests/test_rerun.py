@@ -21,17 +21,16 @@ from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, v
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, EpisodeRecord, Round
-from kerv_cli.report.viewing import rerun_log, viewer
+from kerv_cli.report.viewing import rerun_log, save_recording, viewer
 from kerv_cli.report.viewing.facts import readable
 from kerv_cli.report.viewing.film import save_film
-from kerv_cli.report.viewing.rerun_log import save_episode
 from kerv_cli.report.viewing.together import save_together
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of
 from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_recording, read_summary
 
 
 def saved(record: EpisodeRecord, folder: Path, method: str = "spec_vla") -> Path:
-    return save_episode(record, folder / "episode.rrd", method=method)
+    return save_recording(record, folder / "episode.rrd", method=method, limits={})
 
 
 def batches(path: Path, entity: str) -> list[Any]:
@@ -471,7 +470,7 @@ def test_limits_and_places_are_drawn(tmp_path: Path) -> None:
     record = episode("mixed")
     still = np.zeros_like(record.path) + np.float32(0.1)
     record = replace(record, places={"object": still, "goal": still + np.float32(0.1)})
-    path = save_episode(record, tmp_path / "limits.rrd", method="heisd", limits={"metric": 0.3, "similarity": 0.975})
+    path = save_recording(record, tmp_path / "limits.rrd", method="heisd", limits={"metric": 0.3, "similarity": 0.975})
     assert named(path, "/signals/metric") == ["F, boundary metric", "F*"]
     assert {row[1] for row in column(path, "/signals/metric", "scalars")} == {0.3}
     rows = read_recording(path)["entities"]
@@ -479,15 +478,15 @@ def test_limits_and_places_are_drawn(tmp_path: Path) -> None:
 
 
 def test_two_recordings_of_one_seed_stand_side_by_side(tmp_path: Path) -> None:
-    first = save_episode(episode("ar"), tmp_path / "a.rrd", method="ar")
-    second = save_episode(episode("drafter"), tmp_path / "b.rrd", method="spec_vla")
+    first = save_recording(episode("ar"), tmp_path / "a.rrd", method="ar", limits={})
+    second = save_recording(episode("drafter"), tmp_path / "b.rrd", method="spec_vla", limits={})
     both = read_recording(save_together([first, second], tmp_path / "out"))
     assert both["blueprint"]
     assert both["name"] == "drawer-open-v3 · seed 7 · ar and spec_vla"
     for side, alone in (("left", first), ("right", second)):
         rows = {name: count for name, count in read_recording(alone)["entities"].items() if count}
         assert {name: both["entities"][f"/{side}{name}"] for name in rows} == rows
-    other = save_episode(replace(episode("ar"), seed=8), tmp_path / "c.rrd", method="ar")
+    other = save_recording(replace(episode("ar"), seed=8), tmp_path / "c.rrd", method="ar", limits={})
     with pytest.raises(UsageError, match="the same seed on both sides, here 7 and 8"):
         save_together([first, other], tmp_path)
     with pytest.raises(UsageError, match="two recordings, not 1"):

@@ -319,7 +319,7 @@ def test_curves_are_drawn_beside_the_log(results: Path, tmp_path: Path) -> None:
     folder = tmp_path / "target" / "mine"
     folder.mkdir(parents=True)
     shutil.copy(results / "artifacts/target/nano-state/log.csv", folder)
-    assert save_curves(folder).read_bytes().startswith(b"\x89PNG")
+    assert save_curves(folder, ()).read_bytes().startswith(b"\x89PNG")
 
 
 # --- removal ---

@@ -23,7 +23,7 @@ from kerv_cli.base.settings import (
     TrainTargetSettings,
 )
 from kerv_cli.base.spaces import Observation
-from kerv_cli.bench.machine import product_with, timed
+from kerv_cli.bench.machine import REPEATS, product_with, timed
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.lab.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
@@ -226,7 +226,7 @@ def fastest(device: torch.device) -> torch.dtype:
     seconds = {}
     for dtype in (torch.bfloat16, torch.float32):
         product = product_with(torch.ones(8192, 4096), dtype)
-        seconds[dtype] = np.median(timed(functools.partial(product, row.to(dtype)), device, 7))
+        seconds[dtype] = np.median(timed(functools.partial(product, row.to(dtype)), device, REPEATS))
     return min(seconds, key=seconds.__getitem__)
 
 

@@ -6,7 +6,7 @@ import importlib.util
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
@@ -29,7 +29,7 @@ class Tracked:
     group: str
     config: Mapping[str, object]
     history: list[tuple[int, dict[str, float]]]
-    summary: dict[str, float] = field(default_factory=dict)
+    summary: dict[str, float]
 
 
 def export(run: RunEntry, to: str, folder: Path) -> list[str]:

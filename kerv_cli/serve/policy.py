@@ -106,7 +106,7 @@ class Policy:
 
     @contextlib.contextmanager
     def session(self) -> Iterator[Session]:
-        """For one more client, until it leaves: then its decoder serves the next one."""
+        """A session for one more client; when it leaves, its decoder serves the next one."""
         session = self.new_session()
         try:
             yield session
@@ -115,7 +115,7 @@ class Policy:
                 self.take_back(session.decoder.decoder)
 
     def new_session(self) -> Session:
-        """For one more client."""
+        """A session for one more client."""
         holds = self.settings.outside == HOLD
         return Session(self._client_decoder, self.settings.task_name, self.by_task, self.range, holds)
 

@@ -5,6 +5,7 @@ A connection stays open after an error, and the server after any client.
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import http
 import logging
@@ -13,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Reply:
     seconds: float | None = None
 
 
-class Conversation(Protocol):
+class Conversation(abc.ABC):
     """One client, in the words of its protocol. seats, ping_s, idle_s: where the settings leave them to the
     protocol."""
 
@@ -56,19 +57,23 @@ class Conversation(Protocol):
     ping_s: float
     idle_s: float
 
-    def __init__(self, policy: Policy, session: Session) -> None: ...
+    def __init__(self, policy: Policy, session: Session) -> None:
+        self.policy, self.session = policy, session
 
     def greeting(self) -> bytes | None:
-        """What the server says first."""
+        """What the server says first; None: the client speaks first."""
+        return None
 
+    @abc.abstractmethod
     def answer(self, frame: bytes | str) -> Reply | None:
         """The answer to a frame; None: it needs none. Raises KervError: what is wrong with it."""
 
-    def took(self, milliseconds: float) -> None:
-        """The last decode took so long, from the frame's arrival to the answer's end."""
-
+    @abc.abstractmethod
     def fault(self, line: str) -> bytes | str:
         """The frame that tells the client what was wrong with the last one."""
+
+    def note_latency(self, milliseconds: float) -> None:  # noqa: B027 - not every protocol tells it
+        """The last decode took so long, from the frame's arrival to the answer's end."""
 
 
 @dataclass
@@ -237,7 +242,7 @@ class PolicyServer:
         if reply.seconds is None:
             return
         whole = 1000 * (time.perf_counter() - began)
-        conversation.took(whole)
+        conversation.note_latency(whole)
         latencies.add(1000 * reply.seconds, whole)
         if self.settings.log_every and len(latencies.whole) % self.settings.log_every == 0:
             self.log(str(latencies))

@@ -49,10 +49,10 @@ class Interface:
     cameras: tuple[str, ...]
     size: int
     privileged: bool
-    gripper: str = "as_is"
-    grip: tuple[float, ...] = ()
-    task: str = ""
-    images_alone: bool = False
+    gripper: str
+    grip: tuple[float, ...]
+    task: str
+    images_alone: bool
 
     def image(self, image: object, camera: str, key: str) -> np.ndarray:
         """The image (h, w, 3) uint8 of a camera. key: its name in messages.

@@ -26,7 +26,7 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.served import path_of, write_served
 from kerv_cli.serve.policy import Policy
-from kerv_cli.serve.server import Reply
+from kerv_cli.serve.server import Conversation, Reply
 from kerv_cli.serve.session import LARGEST, Interface, Session, hand_of, keys_of, text_of
 from kerv_cli.serve.wire import Message, array_of, packed_as, read_map
 
@@ -98,33 +98,25 @@ class _Episode:
         return cls(str(task.get("name", "")), max(0, seed + index), ids, started)
 
 
-class VlaEval:
+class VlaEval(Conversation):
     """One client, a shard of a benchmark. It is silent while it builds a world, and its pings wait as long: none are
     sent."""
 
     seats, ping_s, idle_s = 64, 0.0, 1800.0
 
     def __init__(self, policy: Policy, session: Session) -> None:
-        self.policy, self.session = policy, session
+        super().__init__(policy, session)
         self.episode: _Episode | None = None
         self.sequence = 0
 
-    def greeting(self) -> None:
-        """The client speaks first."""
-
     def answer(self, frame: bytes | str) -> Reply | None:
         """The answer to a message. Raises KervError: what is wrong with it."""
-        if not isinstance(frame, bytes):
-            raise UsageError("a text frame came, messages are binary (msgpack)")
         message = read_map(frame, _value)
         kind, payload, sequence = str(message.get("type")), message.get("payload"), message.get("seq")
         self.sequence = sequence if isinstance(sequence, int) else 0
         if kind not in _HANDLERS or not isinstance(payload, dict):
             raise UsageError(f"a message of type {kind[:40]}: {', '.join(_HANDLERS)} with a payload are known")
         return _HANDLERS[kind](self, payload)
-
-    def took(self, milliseconds: float) -> None:
-        """The client does not ask."""
 
     def fault(self, line: str) -> bytes:
         """The message that ends the client's episode."""

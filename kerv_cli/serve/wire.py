@@ -25,9 +25,9 @@ def packed(value: object) -> bytes:
     return packed_as(value, _plain)
 
 
-def unpacked(data: bytes) -> Message:
+def unpacked(frame: bytes | str) -> Message:
     """A message of openpi's; errors as `read_map`."""
-    return read_map(data, _array)
+    return read_map(frame, _array)
 
 
 def packed_as(value: object, plain: Callable[[object], object]) -> bytes:
@@ -36,14 +36,16 @@ def packed_as(value: object, plain: Callable[[object], object]) -> bytes:
     return data
 
 
-def read_map(data: bytes, special: Callable[[dict[Any, Any]], object]) -> Message:
+def read_map(frame: bytes | str, special: Callable[[dict[Any, Any]], object]) -> Message:
     """A message that is a map with text keys. special: a map within it -> what it stands for.
 
     Raises:
         UsageError: it is not one, or holds an array that does not fit its bytes.
     """
+    if isinstance(frame, str):
+        raise UsageError("a text frame came, messages are binary (msgpack)")
     try:
-        value = _msgpack().unpackb(data, object_hook=special, strict_map_key=True)
+        value = _msgpack().unpackb(frame, object_hook=special, strict_map_key=True)
     except UsageError:
         raise
     except Exception as error:  # msgpack raises many kinds, which mean the same

@@ -1,4 +1,4 @@
-"""Writes an EpisodeRecord as an .rrd file for the Rerun viewer.
+"""Encodes an EpisodeRecord as an .rrd file for the Rerun viewer.
 
 The recording is encoded in memory and written atomically: Rerun's file sink waits forever on a full disk. Timelines:
 `step` (control steps) and `time` (simulated seconds). A row of an entity belongs to a control step, or to a decode, at
@@ -11,7 +11,6 @@ import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from rerun.error_utils import catch_and_log_exceptions
 
-from kerv_cli.base.files import atomic_path
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord
 from kerv_cli.report.viewing.blueprint import (
@@ -58,32 +56,14 @@ class Entity:
     """The data of one entity of the recording."""
 
     path: str
-    static: tuple[rr.AsComponents, ...] = ()
+    static: tuple[rr.AsComponents, ...]
     steps: NDArray[np.int64] | None = None  # (rows,) control steps
     columns: Iterable[rr.ComponentColumn] = ()  # of as many rows
 
 
-def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapping[str, float] | None = None) -> Path:
-    """Writes an episode as a recording that carries its own layout, atomically -> `path`.
-
-    Args:
-        record: without frames, the recording has no camera.
-        path: the .rrd file; its folder is created.
-        method: name of the method, for the summary; recordings of one method share their layout in the viewer.
-        limits: signal -> the limit that a decision compares it with, drawn as a line: F*, s_min.
-
-    Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to.
-    """
-    with catch_and_log_exceptions(strict=True):  # rerun would turn exceptions into warnings and missing views
-        content = _encode(record, method, limits or {})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-    return path
-
-
-def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:
-    """The .rrd file's bytes."""
+@catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
+def encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:
+    """The .rrd file's bytes of an episode; arguments as `save_recording`."""
     recording = rr.RecordingStream("kerv_" + re.sub(r"\W+", "_", method, flags=re.ASCII))
     memory = recording.memory_recording()
     recording.set_log_time_enabled(False)
