@@ -40,18 +40,18 @@ TABLES = ("settings", "tasks", "episodes")
 
 @dataclass(frozen=True)
 class Study:
-    """The complete episodes of a sweep or a rollout, read from disk whenever they are asked for."""
+    """The complete episodes of a sweep or a rollout. Every call reads them from disk."""
 
     store: StudyStore
 
     @property
     def name(self) -> str:
-        """By which `load_study` and the commands know it."""
+        """The name that `load_study` and the commands take."""
         return self.store.name
 
     @property
     def folder(self) -> Path:
-        """Where it lies."""
+        """The folder with its files."""
         return self.store.root
 
     def to_pandas(self, table: str = "settings") -> pd.DataFrame:

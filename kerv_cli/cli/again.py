@@ -52,7 +52,7 @@ def _again(cell: Cell, results: str) -> Cell:
 
 
 def store_again(run: RunEntry, results: str, cells: list[Cell]) -> StudyStore:
-    """Where a repetition of these cells is stored: a new store, or that of one which was interrupted."""
+    """The store for a repetition of these cells: a new one, or that of a repetition which was interrupted."""
     ids = {cell.id for cell in cells}
     for store in stores(Path(results).expanduser(), run.folder.parent.name):
         with contextlib.suppress(KervError):
@@ -85,7 +85,7 @@ def run_again(run: RunEntry, store: StudyStore, cells: list[Cell]) -> RunEntry:
 
 
 def _free(folder: Path, name: str) -> str:
-    """`name-again`, or with a number behind it, where no folder has that name yet."""
+    """`name-again` or `name-again2`, …: the first that is no folder yet."""
     names = (f"{name}-again{number if number > 1 else ''}" for number in range(1, 1000))
     return next(candidate for candidate in names if not (folder / candidate).exists())
 

@@ -55,7 +55,7 @@ def schemas_of(part: Part) -> list[tuple[str, type]]:
 
 
 def top_keys(part: Part) -> list[str]:
-    """What can stand in front of `=` or a dot: typed words, groups of conf/, settings."""
+    """The names that the command takes in front of `=` or a dot: typed words, groups of conf/, settings."""
     schemas = [schema for _, schema in schemas_of(part)]
     groups = [group for schema in schemas for group in choices_of(schema)]
     names = [at.name for schema in schemas for at in fields(schema)]
@@ -64,7 +64,7 @@ def top_keys(part: Part) -> list[str]:
 
 
 def typer_command(part: Part) -> TyperCommand:
-    """Typer's command of a registered one. Its module is imported now."""
+    """Makes typer's command from a registered one, whose module is imported now."""
     run = load(part.build)
     parameters = inspect.signature(run, eval_str=True).parameters
     more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
@@ -149,7 +149,7 @@ def _values(part: Part, key: str) -> list[str]:
 
 
 def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
-    """Dotted keys of the command with the parts that were chosen in front."""
+    """Dotted keys of the command, given the parts that the words before choose."""
     from kerv_cli.base.config import keys_of
 
     for name, schema in schemas_of(part):
@@ -160,7 +160,7 @@ def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
 
 
 def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[str]]:
-    """(overrides, names). named: the command takes names; else every word has to be an override."""
+    """Splits words into (overrides, names). named: the command takes names; else every word has to be an override."""
     if not named:
         return words, []
     keys = set(top_keys(part)) if part.settings is not NoSettings else set()
@@ -177,7 +177,7 @@ def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[s
 
 
 def _check_bare(part: Part, words: list[str]) -> None:
-    """Refuses settings with spaces in them, and a value without its key: `kerv rollout reach`.
+    """Refuses settings with spaces around `=`, and a value without its key: `kerv rollout reach`.
 
     Raises:
         UsageError: names the setting that is meant.
@@ -242,7 +242,7 @@ class CommandWithSettings(TyperCommand):
     part: Part
 
     def keys(self) -> list[str]:
-        """What can stand in front of `=`."""
+        """Every key that the command takes, dotted ones included."""
         from kerv_cli.base.config import keys_of
 
         if self.part.settings is NoSettings:
@@ -251,7 +251,7 @@ class CommandWithSettings(TyperCommand):
         return [*top_keys(self.part), *(key for keys in below for key in keys)]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Reads options and words; an error says of which command it is, which typer leaves out for some."""
+        """Reads options and words. Some of typer's errors do not say which command they are of: here all do."""
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:
@@ -275,7 +275,7 @@ class CommandWithSettings(TyperCommand):
 
 
 def summary_of(part: Part) -> str:
-    """What stands before the first full stop or semicolon of a command's help."""
+    """A command's help up to the first full stop or semicolon."""
     return re.split(r"[.;]\s", part.traits.get("help", "") + " ")[0]
 
 

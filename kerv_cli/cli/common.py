@@ -51,7 +51,7 @@ def print_notes(idle: Mapping[str, str]) -> None:
 
 
 def print_plan(text: str, as_json: bool = False) -> None:
-    """Prints what would be done, for --plan; the command ends."""
+    """Prints what a command would do, for --plan, and ends it."""
     if as_json:
         print_json({"plan": text})
     else:
@@ -124,8 +124,8 @@ _CARRIED = {
 
 
 def runnable(message: str, words: Sequence[str]) -> str:
-    """The message with every quoted command made complete: how kerv is called here, and those of the present command's
-    settings without which it would work on another folder or another policy."""
+    """The message, in which every quoted command can be copied: it begins as kerv is called here, and has the present
+    command's settings without which it would work on another folder or another policy."""
 
     def completed(match: re.Match[str]) -> str:
         quote, name, rest = match.groups()
@@ -145,7 +145,7 @@ def _carries(word: str, command: str) -> bool:
 
 
 def results_word(words: Iterable[str]) -> str:
-    """` results=DIR` where these words name one, for commands to type next; else nothing."""
+    """` results=DIR` for the end of a command to type next, if these words name a folder; else empty."""
     return "".join(f" {shlex.quote(word)}" for word in words if word.startswith("results="))
 
 

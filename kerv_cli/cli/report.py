@@ -50,7 +50,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
-    from kerv_cli.cli.sweep import tell_end, tell_table
+    from kerv_cli.cli.sweep import print_study, print_verdict
     from kerv_cli.lab.resolve import study_name
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
@@ -59,7 +59,7 @@ def report(
 
     settings.only = settings.only and study_name(settings.only)
     if choose:
-        _choose(settings, as_json)
+        _print_choice(settings, as_json)
         return
     results = results_dir(settings.results)
     output = write_report(results, settings.only, publish, settings.on, settings.loss)
@@ -69,7 +69,7 @@ def report(
         print_json({"files": output.files, "studies": tables, **priced})
         return
     for name, table in output.tables.items():
-        tell_table(table, StudyStore(results, name), words)
+        print_study(table, StudyStore(results, name), words)
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
@@ -78,10 +78,10 @@ def report(
     for name, table in output.tables.items():
         if settings.only is None:
             typer.echo(name)
-        tell_end(table, StudyStore(results, name), settings.loss)
+        print_verdict(table, StudyStore(results, name), settings.loss)
 
 
-def _choose(settings: ReportSettings, as_json: bool) -> None:
+def _print_choice(settings: ReportSettings, as_json: bool) -> None:
     """Prints the choice of one study, or of every study that has results."""
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.decide import choices, sentence, short_sentence

@@ -69,7 +69,7 @@ def rollout(
         return
     arguments = ["rollout", *(["-m"] if multirun else []), *words]
     store = run_cells(resolved, cells, arguments)
-    _tell(store, cells, as_json, results_word(words))
+    _print_rollout(store, cells, as_json, results_word(words))
 
 
 def _stressed(settings: Plain) -> str:
@@ -81,8 +81,8 @@ def _stressed(settings: Plain) -> str:
 
 
 def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
-    """The cells of a study, after everything that can be refused without running was. Says on standard error what it
-    comes to, and which tasks a policy was not trained on."""
+    """The cells of a study. Everything that can be refused before an episode runs is refused here. Prints the number of
+    episodes, and the tasks that a policy was not trained on, to standard error."""
     from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import unseen_tasks
     from kerv_cli.worlds import resolve_tasks
@@ -120,7 +120,7 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
 
 
 def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) -> StudyStore:
-    """Runs a rollout's cells, going on where the same command was interrupted -> where they are stored.
+    """Runs a rollout's cells, or those that the same command left when it was interrupted -> their store.
 
     Raises:
         Interrupted: Ctrl-C. KervError: an episode failed.
@@ -137,7 +137,7 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) 
     return store
 
 
-def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+def _print_rollout(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
     from kerv_cli.report.measures import MICRO
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
@@ -151,14 +151,14 @@ def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> No
     if len(data.plan.labels) > 1:
         console().print(SummaryTable(data.table))
     else:
-        _single(data, per_task, whole[0])
+        _print_setting(data, per_task, whole[0])
     show = f"{kerv_command()} runs show {store.name}{where}"
     typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")
     if store.recordings:
         typer.echo(f"{len(store.recordings)} recordings; open one with: {kerv_command()} view {store.recordings[0]}")
 
 
-def _single(data: StudyData, per_task: list[Row], whole: Row) -> None:
+def _print_setting(data: StudyData, per_task: list[Row], whole: Row) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.engine.record import PHASES
     from kerv_cli.lab.identity import batch_of

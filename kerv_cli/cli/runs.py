@@ -37,12 +37,12 @@ def run_ids() -> list[str]:
     return [run.id for run in find_runs("results")]
 
 
-def _of_runs(name: str, *examples: str) -> Callable[[F], F]:
+def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
     """Declares a command whose names are runs."""
     return command(f"runs {name}", names=RUNS, completes=run_ids, keys="results", examples=examples)
 
 
-def _runs(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
+def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
     """The names as those of runs. Raises UsageError: too few or too many."""
     from kerv_cli.lab.resolve import study_name
 
@@ -63,7 +63,7 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
             raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
     runs = matching(find_runs(settings.results), dict(word.split("=", 1) for word in names))
     if as_json:
-        print_json([_plain(run) for run in runs])
+        print_json([_entry_row(run) for run in runs])
         return
     if not runs:
         typer.echo(f"no runs in {settings.results}" + (" that agree" if names else ""))
@@ -81,18 +81,16 @@ def _few(names: tuple[str, ...]) -> str:
 
 
 def _headline(run: RunEntry) -> str:
-    for name in ("success", "score"):
-        if name in run.figures:
-            value = run.figures[name]
-            return f"success {value:.0%}" if name == "success" else f"score {value:.4g}"
-    return ""
+    if "success" in run.figures:
+        return f"success {run.figures['success']:.0%}"
+    return f"score {run.figures['score']:.4g}" if "score" in run.figures else ""
 
 
-def _plain(run: RunEntry) -> dict[str, object]:
+def _entry_row(run: RunEntry) -> dict[str, object]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
-@_of_runs("show", "kerv runs show last", "kerv runs show main --json")
+@_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
     from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
@@ -100,7 +98,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
-    results, (name,) = settings.results, _runs(names)
+    results, (name,) = settings.results, _run_names(names)
     chosen = sides(results, name)
     run = chosen[0].run
     table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
@@ -109,7 +107,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
     if as_json:
         rows = [] if table is None else rows_of(table)
-        print_json({**_plain(run), "made_from": origin, "bytes": size, "settings": rows})
+        print_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
         return
     line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
@@ -122,12 +120,12 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
-@_of_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
+@_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: what differs in settings beside what differs in results, with intervals."""
     from kerv_cli.report import compare as comparing
 
-    runs = _runs(names, 2, 2, "two runs, ID or ID:SETTING")
+    runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
     if as_json:
         print_json([asdict(comparison) for comparison in comparisons])
@@ -138,12 +136,12 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
         _print_results(comparison)
 
 
-@_of_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
+@_command_on_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
 def diff(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show what differs between two runs in settings, weights, machine and versions."""
     from kerv_cli.report import compare as comparing
 
-    pairs = comparing.pairs_to_compare(settings.results, *_runs(names, 2, 2, "two runs, ID or ID:SETTING"))
+    pairs = comparing.pairs_to_compare(settings.results, *_run_names(names, 2, 2, "two runs, ID or ID:SETTING"))
     by_pair = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
     if as_json:
         print_json({name: [asdict(difference) for difference in rows] for name, rows in by_pair.items()})
@@ -162,15 +160,17 @@ def _print_differences(rows: list[Difference]) -> None:
 
 
 def _print_results(comparison: Comparison) -> None:
+    from kerv_cli.report.tables import is_number
+
     rows = []
     for row in comparison.results:
-        interval = f"{row['low']:.3g} to {row['high']:.3g}" if row.get("low") == row.get("low") and "low" in row else ""
+        interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
         numbers = (f"{row[name]:.4g}" for name in ("first", "second", "change"))
         rows.append((row["measure"], *numbers, interval, row.get("what", "")))
     print_table(("measure", "first", "second", "change", "95 % interval", ""), rows)
 
 
-@_of_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
+@_command_on_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
 def rerun(
     settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
@@ -178,7 +178,7 @@ def rerun(
     from kerv_cli.lab.catalogue import find_run
     from kerv_cli.lab.store import IMPORT
 
-    results, (name,) = settings.results, _runs(names)
+    results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
     if run.is_training:
         _train_again(run, results, plan, as_json)
@@ -212,12 +212,12 @@ def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None
     run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
 
 
-@_of_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
+@_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
     from kerv_cli.lab.catalogue import check_removable, disk_bytes, find_run, remove
 
-    runs = [find_run(settings.results, name, exact=yes) for name in _runs(names, 1, 1000)]
+    runs = [find_run(settings.results, name, exact=yes) for name in _run_names(names, 1, 1000)]
     for run in runs:
         check_removable(run)
     total = sum(disk_bytes(run.folder) for run in runs)
@@ -234,7 +234,7 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@_of_runs("export", "kerv runs export last", "kerv runs export main --to mlflow")
+@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to mlflow")
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
@@ -242,7 +242,7 @@ def export(
     from kerv_cli.lab.catalogue import find_run
     from kerv_cli.report.export import export as hand_over
 
-    (name,) = _runs(names)
+    (name,) = _run_names(names)
     folder = folder or results_dir(settings.results) / "exports" / to
     run_names = hand_over(find_run(settings.results, name), to, folder)
     if as_json:

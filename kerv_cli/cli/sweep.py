@@ -63,7 +63,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
         return
     outcome = run_covered(resolved, covered, store, words)
-    _tell(outcome, resolved, covered.cells, store, words, as_json)
+    _print_outcome(outcome, resolved, covered.cells, store, words, as_json)
     if outcome.failed:
         raise typer.Exit(1)
 
@@ -78,8 +78,9 @@ def print_settings(resolved: ResolvedStudy) -> None:
 
 
 def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore, Covered]:
-    """The study's store, and its cells as those on disk and those to run, after everything that can be refused without
-    running was. Says what has no effect and which cells disagree. words: of the command."""
+    """The study's store, and its cells: those on disk and those to run. Everything that can be refused before an
+    episode runs is refused here. Prints which overrides have no effect and which cells disagree. words: of the
+    command."""
     from kerv_cli.cli.rollout import planned_cells
     from kerv_cli.lab.resolve import idle_overrides
     from kerv_cli.lab.reuse import Stock, cover, disagreements
@@ -145,7 +146,11 @@ def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json:
 
 
 def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
-    """Runs what is not complete yet; says what differs from what it was before. Raises Interrupted: Ctrl-C."""
+    """Runs the cells that are not complete; warns of results that differ from earlier ones.
+
+    Raises:
+        Interrupted: Ctrl-C.
+    """
     from kerv_cli.cli.running import running
     from kerv_cli.lab.reuse import Stock, disagreements, take_over
 
@@ -155,7 +160,7 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, wo
         store.write_plan(resolved.study, cells)
     store.note_command(["sweep", *words])
     with running(store, cells, resolved.first.runtime) as run:
-        outcome = _until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
+        outcome = _run_until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
     if not outcome.failed:
         store.note_finished()
     if resolved.sweep.rerun != "never":
@@ -163,10 +168,11 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, wo
     return outcome
 
 
-def _until_decided(
+def _run_until_decided(
     resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, run: Callable[[list[Cell]], Outcome]
 ) -> Outcome:
-    """Runs block after block of seeds, without the settings whose question is answered; the plan holds what was run."""
+    """Runs block after block of seeds and leaves out the settings that are decided. The plan holds the cells that
+    ran."""
     from kerv_cli.lab.events import Outcome
     from kerv_cli.report import decide
     from kerv_cli.report.tables import load_study
@@ -196,9 +202,9 @@ def _until_decided(
     return total
 
 
-def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
-    """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
-    command, for the one that is named."""
+def print_study(table: DataFrame, store: StudyStore, words: list[str]) -> None:
+    """Prints a study's table, its note, and the command that measures the times which it lacks. words: of the present
+    command."""
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
@@ -216,7 +222,7 @@ def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
         typer.echo(f"\n{note}\n")
 
 
-def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
+def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     """Prints the last three lines of a study: the verdict, the page to open, the recording to watch."""
     from kerv_cli.report.page import verdict
 
@@ -227,7 +233,7 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     typer.echo(f"watch: {f'{kerv_command()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
 
 
-def _tell(
+def _print_outcome(
     outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
 ) -> None:
     from kerv_cli.report.tables import load_study, rows_of
@@ -241,7 +247,7 @@ def _tell(
                     "recordings": store.recordings})  # fmt: skip
     else:
         if data is not None:
-            tell_table(data.table, store, words)
+            print_study(data.table, store, words)
         episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
         if episodes and minutes:
             typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
@@ -253,7 +259,7 @@ def _tell(
                 # the study may hold tasks of other sweeps
                 is_whole = [cell.id for cell in data.plan.cells] == [cell.id for cell in store.read_plan().cells]
                 write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
-            tell_end(data.table, store, resolved.sweep.loss)
+            print_verdict(data.table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

@@ -100,7 +100,8 @@ def _line(metrics: dict[str, float]) -> str:
 def _live(
     tracker: str, name: str, folder: Path, steps: int, config: Mapping[str, object]
 ) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """Yields what takes the numbers of a step: of an update, or of a validation, which has a `step` among them.
+    """Yields the function that logs the numbers of a step: of an update, or of a validation, which has a `step` among
+    them.
 
     Args:
         tracker: trackio, wandb, tensorboard; none: nothing is logged.

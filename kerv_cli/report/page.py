@@ -149,13 +149,9 @@ def _how_to_run(store: StudyStore) -> str:
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
     """A row per task, a column per setting: successes and speeds, per episode and per step. A study of stress has
     many settings: they are the rows there, and the tasks the columns."""
-    texts = {(row["label"], row["task"]): _cell(row) for row in rows_of(per_task)}
-    labels, tasks = list(dict.fromkeys(per_task["label"])), sorted(set(per_task["task"]))
-    if stressed.is_stressed(per_task):
-        return pd.DataFrame(
-            {"setting": label, **{task: texts.get((label, task), "–") for task in tasks}} for label in labels
-        )
-    return pd.DataFrame({"task": task, **{label: texts.get((label, task), "–") for label in labels}} for task in tasks)
+    cells = per_task.assign(text=[_cell(row) for row in rows_of(per_task)])
+    table = cells.pivot(index="task", columns="label", values="text")[per_task["label"].unique()].fillna("–")
+    return (table.T.rename_axis("setting") if stressed.is_stressed(per_task) else table).reset_index()
 
 
 def _cell(row: Row) -> str:

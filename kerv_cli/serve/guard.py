@@ -20,8 +20,8 @@ LEAST_WIDTH = 1.0
 
 
 class StateRange:
-    """The range of the numbers that a policy reads. low, high: what its demonstrations reached (p,). margin: by how
-    many widths it is exceeded on either side."""
+    """The range of the numbers that a policy may act on. low, high: the least and the largest of its demonstrations
+    (p,). margin: widths of that range which are added on either side."""
 
     def __init__(self, low: np.ndarray, high: np.ndarray, names: tuple[str, ...], margin: float) -> None:
         more = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
@@ -42,7 +42,7 @@ class StateRange:
 
 
 class Finite:
-    """A target that notices numbers which are not finite in its prompts and logits. All else is the target's own."""
+    """A target, and a check that its prompts and logits are finite."""
 
     def __init__(self, target: Target) -> None:
         self._target = target

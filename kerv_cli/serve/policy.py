@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -84,7 +85,7 @@ class Policy:
         )
 
     def _range(self) -> StateRange | None:
-        """Of the numbers that the policy reads; None where its target does not say, or it reads none."""
+        """The range of the numbers that the policy reads; None where its target does not say, or it reads none."""
         stored, interface = self.artifacts.description.state_range, self.interface
         if stored is None or interface.images_alone:
             return None
@@ -120,7 +121,7 @@ class Policy:
         return Session(self._client_decoder, self.settings.task_name, self.by_task, self.range, holds)
 
     def take_back(self, decoder: Decoder) -> None:
-        """Keeps a decoder whose client has left for the next one, unless it is of one task."""
+        """Keeps the decoder of a client that has left, for the next client; not one that is for a single task."""
         if not self.by_task:
             self._idle.append(decoder)
 
@@ -138,7 +139,7 @@ class Policy:
         return decoder
 
     def facts(self) -> dict[str, object]:
-        """What a result must say about it: settings of a rollout, hashes, machine and versions; plain values."""
+        """The settings of a rollout, hashes, machine and versions that belong to its results; plain values."""
         shared = {at.name: getattr(self.settings, at.name) for at in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
         settings["runtime"]["device"] = self.artifacts.device
@@ -168,21 +169,16 @@ class Alone(Around):
         return record
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Request:
     lane: Lane
     observation: Observation
-    record: DecodeRecord | None = None
-    error: Exception | None = None
-
-    @property
-    def is_settled(self) -> bool:
-        return self.record is not None or self.error is not None
+    answer: Future[DecodeRecord] = field(default_factory=Future)
 
 
 @dataclass
 class Together:
-    """Decodes together what several clients ask for at nearly the same time. most: clients of a batch."""
+    """Decodes the observations of several clients as one batch. most: clients of a batch."""
 
     decoder: BatchDecoder
     most: int
@@ -197,15 +193,12 @@ class Together:
             self._waiting.append(mine)
             self._arrived.notify_all()
         with self._turn:
-            while not mine.is_settled:
+            while not mine.answer.done():
                 with self._arrived:
                     self._arrived.wait_for(lambda: len(self._waiting) >= self.most, GATHER)
                     batch, self._waiting = self._waiting[: self.most], self._waiting[self.most :]
                 self._settle(batch)
-        if mine.error is not None:
-            raise mine.error
-        assert mine.record is not None
-        return mine.record
+        return mine.answer.result()
 
     def _settle(self, batch: Sequence[_Request]) -> None:
         """Decodes the batch; where that fails, one by one, so that one client's fault is no other's."""
@@ -213,10 +206,10 @@ class Together:
             records = self.decoder.decode([one.lane for one in batch], [one.observation for one in batch])
             check_finite(self.decoder)
             for one, record in zip(batch, records, strict=True):
-                one.record = record
+                one.answer.set_result(record)
         except Exception as error:  # noqa: BLE001 - it is raised in its client's thread
             if len(batch) == 1:
-                batch[0].error = error
+                batch[0].answer.set_exception(error)
                 return
             for one in batch:
                 self._settle([one])

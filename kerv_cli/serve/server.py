@@ -100,7 +100,7 @@ class Latencies:
 
 
 class Seats:
-    """Who is being served. takeover: a newcomer gets the seat of whoever was silent longest."""
+    """The connections that are served. takeover: a newcomer gets the seat of the one that was silent longest."""
 
     def __init__(self, count: int, takeover: bool) -> None:
         self.count, self.takeover = count, takeover
@@ -108,7 +108,7 @@ class Seats:
         self._heard: dict[ServerConnection, float] = {}  # connection -> when it was last heard
 
     def take(self, connection: ServerConnection) -> tuple[bool, ServerConnection | None]:
-        """Whether the connection has a seat now, and the connection that lost its own to it, or None."""
+        """Whether the connection gets a seat, and the connection that loses its own to it, or None."""
         with self._changed:
             lost = None
             if self.takeover and len(self._heard) >= self.count:
@@ -120,13 +120,13 @@ class Seats:
             return True, lost
 
     def heard(self, connection: ServerConnection) -> None:
-        """The client said something."""
+        """Notes that the client sent a frame."""
         with self._changed:
             if connection in self._heard:
                 self._heard[connection] = time.monotonic()
 
     def leave(self, connection: ServerConnection) -> None:
-        """The seat is free, unless somebody else took it."""
+        """Frees the connection's seat, unless another one took it."""
         with self._changed:
             self._heard.pop(connection, None)
             self._changed.notify_all()
@@ -267,7 +267,7 @@ def _address(connection: ServerConnection) -> str:
 
 
 def _lines(log: Log) -> logging.Logger:
-    """Where websockets reports what it cannot handle: a line of the log each, no traceback."""
+    """A logger for websockets, which writes every error as one line of the log, without a traceback."""
 
     class Lines(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:

@@ -73,8 +73,8 @@ class Interface:
         return len(shape) == 3 and shape[2] == 3 and min(shape[:2]) >= 2 and max(shape[:2]) <= LARGEST
 
     def numbers(self, values: object, key: str, message: Message) -> tuple[np.ndarray, np.ndarray]:
-        """Proprioception (p,) and state (s,) from what stands under `key` of a message, None where nothing does;
-        numbers that the policy does not read are zero.
+        """Proprioception (p,) and state (s,) from the values under `key` of a message, None where it lacks them.
+        Numbers that the policy does not read are zero.
 
         Raises:
             UsageError: they are missing, too few, too many or not finite.

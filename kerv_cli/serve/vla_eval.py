@@ -179,8 +179,8 @@ class VlaEval(Conversation):
         return Reply(self._message("action", {"actions": sent}), seconds)
 
     def _look(self, episode: _Episode, observe: Callable[[], Observation]) -> float | None:
-        """Asks a method that looks at the world during a chunk -> seconds that it took; gives the rest of the chunk up
-        where it says so."""
+        """Lets a method that looks at the world during a chunk decide whether the rest of the chunk is executed ->
+        seconds that it took; None where it did not look."""
         watcher = getattr(self.session.decoder, "watcher", None)
         step = len(episode.sent) - episode.decode_steps[-1] if episode.decode_steps else 0
         if watcher is None or not episode.left or not watcher.looks_at(step):
@@ -210,7 +210,7 @@ class VlaEval(Conversation):
         return Observation(*numbers, prompt, frames)
 
     def _end(self, payload: Message) -> None:
-        """Tells the decoder how it ended, and keeps the episode where the harness records it."""
+        """Tells the decoder whether the episode succeeded, and stores the episode if the harness records it."""
         episode, self.episode = self.episode, None
         metrics = payload.get("metrics")
         metrics = metrics if isinstance(metrics, dict) else {}
@@ -267,7 +267,7 @@ def _plain(value: object) -> object:
 
 
 def _value(value: dict[Any, Any]) -> object:
-    """An array of a message, or a function that reads its image: most are never looked at."""
+    """An array of a message, or a function that decodes its image: most images are never used."""
     if value.get("__image__"):
         if value.get("format") == "raw":
             return array_of(value.get("dtype"), value.get("shape"), value.get("data"))

@@ -91,7 +91,7 @@ def _entities(record: EpisodeRecord, method: str, chunks: Chunks, limits: Mappin
     starts = np.asarray(record.decode_steps, dtype=np.int64)
     names = record.space.names
     return [
-        Entity("summary", (_markdown(summary(record, method)),)),
+        Entity("summary", (rr.TextDocument(summary(record, method), media_type="text/markdown"),)),
         *_camera(record),
         *_world(record),
         *_actions(record),
@@ -317,7 +317,3 @@ def _named(names: Sequence[str], colors: Sequence[int] | None = None, held: bool
 def _rows(values: np.ndarray) -> rr.ComponentColumnList:
     """(rows, k) -> a column of k scalars per row."""
     return rr.Scalars.columns(scalars=values.astype(np.float64).ravel()).partition([values.shape[1]] * len(values))
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")
