@@ -86,7 +86,7 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """The target's; caches are float32 on a CPU."""
+        """The target's shape; its caches are float32 on a CPU."""
         size = 4 if self.target.device.type == "cpu" else self.dtype.itemsize
         return Sizes(self.target.settings, self.target.actions.tokens, self.dtype.itemsize, size)
 
@@ -211,7 +211,7 @@ def _drafter(target: ReadableTarget) -> Drafter:
 
 
 def blank(target: Any) -> Observation:
-    """A black image and zeros."""
+    """An observation of the target: black images and zeros."""
     return still_observation(target, target.observation, target.settings.image_size)
 
 

@@ -48,7 +48,7 @@ class Bench:
         return f"{self.model.name}, {self.dtype}, {stamp(str(device))['device_name']}, {torch.get_num_threads()} thread"
 
     def document(self) -> Document:
-        """For JSON."""
+        """The whole result, for JSON."""
         device = self.model.target.device
         return {
             "target": self.model.name,

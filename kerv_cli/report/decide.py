@@ -99,12 +99,12 @@ def safest_first(rows: Sequence[Row]) -> list[Row]:
 
 
 def _unverified(row: Row) -> float:
-    """Share in whole per cent; all where nothing decodes."""
+    """Share of unverified tokens, rounded to a per cent; 1 where nothing decodes."""
     return round(float(row["unverified_share"]), 2) if is_number(row["unverified_share"]) else 1.0
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:
-    """The fastest of settings in the order of their tests; the last where none is timed."""
+    """The fastest of settings, which are in the order of their tests; where none is timed, the last of them."""
     return max(reversed(rows), key=lambda row: row[SPEED] if is_number(row[SPEED]) else -math.inf, default=None)
 
 

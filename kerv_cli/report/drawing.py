@@ -117,7 +117,7 @@ def place_labels(
 
 
 def _offsets(width: float, height: float, pixels: float) -> Iterator[np.ndarray]:
-    """From a point to the centres of a label around it, pixels, from near to far."""
+    """Vectors from a point to the centre of a label beside it, pixels, from near to far."""
     for distance in _DISTANCES:
         for angle in np.radians(_ANGLES):
             way = np.array([math.cos(angle), math.sin(angle)])

@@ -146,14 +146,14 @@ def _realised_risk(episodes: pd.DataFrame) -> Estimate:
 def _per_world(
     episodes: pd.DataFrame, estimate: Callable[..., Estimate], above: pd.Series, below: pd.Series
 ) -> Estimate:
-    """A quotient of sums over episodes, whose interval goes by task and seed; NaN where the sum below is 0."""
+    """The sum of `above` over the sum of `below`, with an interval by task and seed; NaN where the latter is 0."""
     if not below.sum():
         return stats.NO_ESTIMATE
     return estimate(above.to_numpy(), below.to_numpy(), list(episodes["task"]), list(episodes["seed"]))
 
 
 def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
-    """Pairs of `paired` by their two successes."""
+    """Counts of pairs, rows of `paired`, by success of the baseline and of the method."""
     return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
 
 

@@ -74,7 +74,7 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
 
 def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
     """One row per machine and label, pooled over tasks: speeds against the baseline there, per episode and per control
-    step, with paired bootstrap intervals over the study's blocks; times; and the speeds as they were measured.
+    step, with their intervals; times; and the speeds as they were measured.
 
     Raises:
         UsageError: a profile lacks a cost that the study needs, or is of chunks of another length; a setting has no

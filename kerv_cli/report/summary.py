@@ -56,7 +56,7 @@ _LABEL = 16
 
 
 def _speed(name: str) -> TextOf:
-    """A speedup, marked where it is of some of the pairs; 1 for the baseline, where it has a time at all."""
+    """A speedup as text, marked if it is of some of the pairs alone; 1 for a baseline that was timed."""
 
     def text(row: Row) -> str:
         if is_baseline(row):

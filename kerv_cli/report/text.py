@@ -55,7 +55,7 @@ def intervals(name: str, scale: float = 1.0, digits: int = 2, between: str = "â€
 
 
 def compared(text: TextOf, of_baseline: str = "") -> TextOf:
-    """The text, and that of the baseline, which is not compared with itself."""
+    """The text of a setting; `of_baseline` for the baseline, which is not compared with itself."""
     return lambda row: of_baseline if is_baseline(row) else text(row)
 
 
