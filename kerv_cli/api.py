@@ -27,30 +27,31 @@ from kerv_cli.cli.sweep import covered_cells, run_covered
 from kerv_cli.lab.catalogue import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.lab.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.store import STUDIES, StudyStore
-from kerv_cli.report.measures import MICRO
+from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.report import report as write_report
 from kerv_cli.report.tables import load_study as load_data
-from kerv_cli.report.tables import per_task_table, rows_of, study_table
+from kerv_cli.report.tables import rows_of
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
+from kerv_cli.serve.wire import Message
 
 TABLES = ("settings", "tasks", "episodes")
 
 
 @dataclass(frozen=True)
 class Study:
-    """The complete episodes of a sweep or a rollout, read from disk whenever they are asked for."""
+    """The complete episodes of a sweep or a rollout. Every call reads them from disk."""
 
     store: StudyStore
 
     @property
     def name(self) -> str:
-        """By which `load_study` and the commands know it."""
+        """The name that `load_study` and the commands take."""
         return self.store.name
 
     @property
     def folder(self) -> Path:
-        """Where it lies."""
+        """The folder with its files."""
         return self.store.root
 
     def to_pandas(self, table: str = "settings") -> pd.DataFrame:
@@ -69,11 +70,10 @@ class Study:
         if table == "episodes":
             return data.episodes
         if table == "tasks":
-            return per_task_table(data)
-        whole = study_table(data)
-        return whole[whole["averaging"] == MICRO].reset_index(drop=True)
+            return data.per_task
+        return data.table[data.table["averaging"] == MICRO].reset_index(drop=True)
 
-    def episodes(self) -> list[dict[str, Any]]:
+    def episodes(self) -> list[Row]:
         """The rows of the table of episodes; errors as `to_pandas`."""
         return rows_of(self.to_pandas("episodes"))
 
@@ -88,7 +88,7 @@ class Study:
         return write_report(self.folder.parent.parent, self.name).files
 
 
-def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
+def rollout(*words: str, grid: bool = False, **settings: object) -> Study:
     """Runs episodes of one method, as `kerv rollout`; goes on with the same rollout where one was interrupted.
 
     Args:
@@ -105,7 +105,7 @@ def rollout(*words: str, grid: bool = False, **settings: Any) -> Study:
     return Study(run_cells(resolved, planned_cells(resolved), arguments))
 
 
-def sweep(study: str | Path, *words: str, **settings: Any) -> Study:
+def sweep(study: str | Path, *words: str, **settings: object) -> Study:
     """Runs what a study lacks, as `kerv sweep`: every setting on every task with the same seeds, in turn.
 
     Args:
@@ -168,7 +168,7 @@ class Policy:
         """The next observation begins an episode: histories are forgotten."""
         self._begins = True
 
-    def act(self, observation: Mapping[str, Any], executed: int | None = None) -> np.ndarray:
+    def act(self, observation: Message, executed: int | None = None) -> np.ndarray:
         """The actions (h, D) to execute from here, float64, environment units; h ≤ H.
 
         Args:
@@ -188,7 +188,7 @@ class Policy:
 
 
 def load_policy(
-    target: str = "mt10-vision", *words: str, method: str = "one_pass", task: str = "", **settings: Any
+    target: str = "mt10-vision", *words: str, method: str = "one_pass", task: str = "", **settings: object
 ) -> Policy:
     """A policy that answers observations, warmed up.
 
@@ -206,12 +206,12 @@ def load_policy(
     return Policy(Served(compose("serve", typed, ServeSettings)))
 
 
-def as_words(*words: str, **settings: Any) -> list[str]:
+def as_words(*words: str, **settings: object) -> list[str]:
     """Words and keywords as they are typed behind a command: `episodes=3`, `task=[reach,push]`, `threshold.r=5`."""
     return [*words, *(word for key, value in settings.items() for word in _typed(key, value))]
 
 
-def _typed(key: str, value: Any) -> Iterator[str]:
+def _typed(key: str, value: object) -> Iterator[str]:
     if isinstance(value, Mapping):
         for name, inner in value.items():
             yield from _typed(f"{key}.{name}", inner)
@@ -219,7 +219,7 @@ def _typed(key: str, value: Any) -> Iterator[str]:
         yield f"{key}={_text(value)}"
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{','.join(map(_text, value))}]"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

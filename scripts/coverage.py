@@ -81,8 +81,7 @@ class Study:
 
 def success(study: Study, where: np.ndarray) -> Estimate:
     """Success of the method with Wilson's interval."""
-    won, count = int(study.method[where].sum()), int(where.sum())
-    return Estimate(won / count, *stats.wilson(won, count))
+    return stats.wilson(int(study.method[where].sum()), int(where.sum()))
 
 
 def difference(study: Study, where: np.ndarray) -> Estimate:

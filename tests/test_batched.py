@@ -42,9 +42,9 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.plots import study_figures
-from kerv_cli.report.reprice import Machine, repriced_table
+from kerv_cli.report.reprice import NamedProfile, repriced_table
 from kerv_cli.report.summary import summary_frame
-from kerv_cli.report.tables import load_study, study_table
+from kerv_cli.report.tables import load_study
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -354,7 +354,7 @@ def test_no_speedup_is_made_of_what_was_not_timed(tmp_path: Path, which: str) ->
     store = StudyStore(tmp_path, "threshold")
     store.write_plan(threshold_settings(), cells)
     execute(cells, Prepared(), store)
-    table = study_table(load_study(store))
+    table = load_study(store).table
     methods = table[table["label"] != "ar"]
     for name in ("speedup", "speedup_low", "episode_speedup", "ceiling"):
         assert methods[name].isna().all()
@@ -374,7 +374,7 @@ def test_decodes_without_host_times_have_no_price(tmp_path: Path) -> None:
     store.write_plan(threshold_settings(), cells)
     execute(cells, Prepared(), store)
     with pytest.raises(UsageError, match="setting 'ar' ran 4 episodes at a time, without times"):
-        repriced_table(load_study(store), [Machine("there", Profile(31, {}))])
+        repriced_table(load_study(store), [NamedProfile("there", Profile(31, {}))])
 
 
 # --- the command

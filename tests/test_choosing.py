@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -25,7 +26,7 @@ from kerv_cli.report.decide import (
     pareto,
     safest_first,
     sentence,
-    short,
+    short_sentence,
     verdict_of,
 )
 from kerv_cli.report.measures import MICRO
@@ -79,7 +80,7 @@ def test_the_fastest_setting_before_the_first_that_is_not_shown_is_chosen(table:
         "the fastest setting that loses less than 4 points of success against ar, with 95 % confidence: r=9, per "
         "episode 1.50 (1.40–1.60) times as fast as ar on this machine (200 pairs)"
     )
-    assert short(found[1]) == "reach: r=9"
+    assert short_sentence(found[1]) == "reach: r=9"
 
 
 def test_what_is_not_shown_yet_says_how_many_episodes_more_would_do(table: pd.DataFrame) -> None:
@@ -90,6 +91,8 @@ def test_what_is_not_shown_yet_says_how_many_episodes_more_would_do(table: pd.Da
     assert "more would show it for r=9" in sentence(found, 2.0, "ar")
     slower = choices(table[table["label"].isin(["ar", "slow"])], None, 2.0)[0]
     assert sentence(slower, 2.0, "ar") == "no setting is faster per episode than ar (200 pairs)"
+    far = dataclasses.replace(found, candidate_pairs=110_128.0)
+    assert sentence(far, 2.0, "ar").endswith("; more than 10,000 pairs would be needed to show it for r=9")
     worse = choices(table[table["label"].isin(["ar", "r=20"])], table.iloc[:0], 2.0)[0]
     assert sentence(worse, 2.0, "ar").endswith("more would not show one")
 

@@ -21,7 +21,7 @@ from kerv_cli.lab.catalogue import find_runs
 from kerv_cli.lab.store import StudyStore, is_result_of
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.tables import load_study
-from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.report.viewing.viewer import read_recording
 
 STATUS = {"run": "r", "workers": 1, "device_name": "test"}
 _LEVELS = zip("abcdefghij", "bcdefghijk", strict=True)
@@ -162,7 +162,7 @@ def method_of(path: Path) -> object:
     return method_of_file([f"method={link}"])
 
 
-@pytest.mark.parametrize("read", [read_json, read_mapping, sha256_of, read_back])
+@pytest.mark.parametrize("read", [read_json, read_mapping, sha256_of, read_recording])
 def test_nobody_waits_for_a_pipe_or_opens_a_folder(pipe: Path, tmp_path: Path, read: Callable[[Path], object]) -> None:
     for path in (pipe, tmp_path, tmp_path / "absent"):
         with pytest.raises(KervError) as refused:

@@ -17,8 +17,8 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.settings import CameraSettings
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.expert import ExpertDecoder
-from kerv_cli.report.viewing.rerun_log import save_episode
-from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.report.viewing import save_recording
+from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds import resolve_tasks, spec_of, task_names
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -56,7 +56,7 @@ def test_an_episode_runs_and_is_recorded(spec: EnvironmentSpec, tmp_path: Path) 
     assert np.abs(record.actions).max() <= np.float32(0.05)
     assert record.gripper.tolist() == [1.0] * (record.steps + 1)
     assert record.frames[0].shape == (24, 24, 3)
-    found = read_back(save_episode(record, tmp_path / "point.rrd", method="expert"))
+    found = read_recording(save_recording(record, tmp_path / "point.rrd", method="expert", limits={}))
     assert found["timelines"]["time"] == (0, record.steps * 100_000_000)
 
 

@@ -23,9 +23,9 @@ from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row, table_bytes
 from kerv_cli.report.measures import MACRO, MICRO, measure
+from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.facts import summary
-from kerv_cli.report.viewing.rerun_log import save_episode
-from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.spec import World
 
@@ -94,7 +94,7 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
 def test_its_recording_can_be_written_and_read(episode: EpisodeRecord, tmp_path: Path, frames: bool) -> None:
     drawn = {i: np.zeros((8, 8, 3), dtype=np.uint8) for i in range(episode.steps + 1)} if frames else {}
     shown = dataclasses.replace(episode, frames=drawn)
-    found = read_back(save_episode(shown, tmp_path / "expert.rrd", method="expert"))
+    found = read_recording(save_recording(shown, tmp_path / "expert.rrd", method="expert", limits={}))
     rows = found["entities"]
     assert rows["/actions"] == rows["/decode/phases"] == rows["/decode/table"] == episode.steps
     assert rows["/mode"] == 1

@@ -13,8 +13,8 @@ from kerv_cli.base.errors import KervError
 from kerv_cli.base.settings import CameraSettings
 from kerv_cli.lab.episode import run_episode
 from kerv_cli.lab.expert import ExpertDecoder
-from kerv_cli.report.viewing.rerun_log import save_episode
-from kerv_cli.report.viewing.viewer import read_back
+from kerv_cli.report.viewing import save_recording
+from kerv_cli.report.viewing.viewer import read_recording
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.spec import World
@@ -157,6 +157,6 @@ def test_an_episode_is_recorded_with_all_seven_names(tmp_path: Path) -> None:
     assert episode.success
     assert episode.actions.shape == (episode.steps, 7)
     assert (episode.gripper[0], episode.gripper[-1]) == (1.0, 0.0)
-    found = read_back(save_episode(episode, tmp_path / "peg.rrd", method="expert"))
+    found = read_recording(save_recording(episode, tmp_path / "peg.rrd", method="expert", limits={}))
     assert found["episode"]["environment"] == "insertion"
     assert found["timelines"]["time"][1] == episode.steps * 50_000_000  # 20 Hz

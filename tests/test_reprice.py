@@ -19,7 +19,7 @@ from kerv_cli.engine.cost import Profile, predicted, work_of_record
 from kerv_cli.lab.execute import execute
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO, measure
-from kerv_cli.report.reprice import Machine, machine_columns, open_machines, repriced_summary, repriced_table
+from kerv_cli.report.reprice import NamedProfile, machine_columns, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.summary import differences
 from kerv_cli.report.tables import StudyData, load_study
 
@@ -63,7 +63,7 @@ def profile_file(results: Path, name: str = "there", without: str = "", **change
 
 def test_an_episode_costs_its_decodes_at_the_profiles_costs(data: StudyData) -> None:
     """Ratios of means over episodes and over times per step, of the very records that the cells were made of."""
-    table = repriced_table(data, [Machine("there", PROFILE)]).set_index("label")
+    table = repriced_table(data, [NamedProfile("there", PROFILE)]).set_index("label")
     seconds: dict[str, list[float]] = {}
     steps: dict[str, list[int]] = {}
     for cell in data.plan.cells:
@@ -91,7 +91,7 @@ def test_the_headline_takes_the_measured_speed_where_there_is_one(data: StudyDat
     here = {name: first[name] for name in ("device_name", "dtype", "threads")} | {"target": "mt10-vision"}
     known = dataclasses.replace(PROFILE, about=here)
     projection = dataclasses.replace(PROFILE, about={**ABOUT, "projected": True})
-    table = repriced_table(data, [Machine("here", known), Machine("gpu", projection)])
+    table = repriced_table(data, [NamedProfile("here", known), NamedProfile("gpu", projection)])
     columns = machine_columns(table)
     assert list(columns) == [
         f"per episode, mt10-vision, {first['device_name']}",
@@ -165,7 +165,7 @@ def test_shipped_profiles_can_price_what_ships(tmp_path: Path) -> None:
         profile = read_profile(path, FORMAT)
         assert missing(KINDS, profile) == []
         assert {"target", "dtype", "device_name"} <= set(profile.about)
-    assert [machine.name for machine in open_machines(tmp_path, [path.stem for path in shipped])] == [
+    assert [machine.name for machine in open_profiles(tmp_path, [path.stem for path in shipped])] == [
         path.stem for path in shipped
     ]
 

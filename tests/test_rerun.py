@@ -21,17 +21,16 @@ from rerun_synthetic import DOFS, decode_of, episode, prefill, skipped_decode, v
 from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, EpisodeRecord, Round
-from kerv_cli.report.viewing import rerun_log, viewer
+from kerv_cli.report.viewing import rerun_log, save_recording, viewer
 from kerv_cli.report.viewing.facts import readable
 from kerv_cli.report.viewing.film import save_film
-from kerv_cli.report.viewing.rerun_log import save_episode
 from kerv_cli.report.viewing.together import save_together
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of
-from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_back, read_summary
+from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_recording, read_summary
 
 
 def saved(record: EpisodeRecord, folder: Path, method: str = "spec_vla") -> Path:
-    return save_episode(record, folder / "episode.rrd", method=method)
+    return save_recording(record, folder / "episode.rrd", method=method, limits={})
 
 
 def batches(path: Path, entity: str) -> list[Any]:
@@ -77,7 +76,7 @@ def strings(value: Any) -> Iterator[str]:
 def test_a_recording_holds_what_the_record_says(kind: str, tmp_path: Path) -> None:
     record = episode(kind, frames=16)
     path = saved(record, tmp_path)
-    found = read_back(path)
+    found = read_recording(path)
     assert found["blueprint"]
     rows = found["entities"]
     assert rows["/actions"] == record.steps
@@ -108,7 +107,7 @@ def test_seven_dofs_have_their_names_and_limits(tmp_path: Path) -> None:
     first = [column(path, f"/tokens/step_0/{name}", "state")[0][0] for name in INSERTION.actions.names]
     assert first == ["target", *["accepted"] * 6]
     assert "| 7 | 1 | dx | 1 | 57 | 57 | 0 | 9 | 57 | ✓ accepted |" in column(path, "/decode/table", "text")[0][0]
-    assert read_back(path)["timelines"]["time"] == (0, 100_000_000)
+    assert read_recording(path)["timelines"]["time"] == (0, 100_000_000)
 
 
 def test_values_survive_to_the_last_digit(tmp_path: Path) -> None:
@@ -136,7 +135,7 @@ def test_series_have_names(tmp_path: Path) -> None:
 
 
 def test_without_frames_there_is_no_camera_and_one_step_is_enough(tmp_path: Path) -> None:
-    found = read_back(saved(episode("ar", horizon=1), tmp_path))
+    found = read_recording(saved(episode("ar", horizon=1), tmp_path))
     assert "/camera" not in found["entities"]
     assert found["timelines"]["step"] == (0, 1)
 
@@ -165,7 +164,7 @@ def test_a_damaged_recording_gets_one_line(share: float, tmp_path: Path) -> None
     path = saved(episode("drafter"), tmp_path)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
     with pytest.raises(KervError) as caught:
-        read_back(path)
+        read_recording(path)
     assert "\n" not in str(caught.value)
     assert "record the episode again" in str(caught.value)
 
@@ -231,7 +230,7 @@ def test_a_chunk_of_which_nothing_was_executed_to_the_end_keeps_its_size(tmp_pat
     record = episode("drafter", horizon=1)
     cut = decode_of((50, 60), (prefill(50), verify(1, (60, 99), (60, 70), 1, (9, 9, 9, 0))), 1, compensated=2, size=16)
     path = saved(replace(record, decodes=(cut,), decode_steps=(0,)), tmp_path)
-    assert "/tokens/step_3/gripper" in read_back(path)["entities"]
+    assert "/tokens/step_3/gripper" in read_recording(path)["entities"]
 
 
 def test_decodes_without_rounds_are_told_apart() -> None:
@@ -288,7 +287,7 @@ def test_optional_numbers_have_rows_only_where_they_are(tmp_path: Path) -> None:
         there = [(step, value) for step, value in there if value is not None]
         assert starts(path, f"/signals/{signal}") == [step for step, _ in there]
         assert [row[0] for row in column(path, f"/signals/{signal}", "scalars")] == [value for _, value in there]
-    assert "/signals/deviation" not in read_back(path)["entities"]
+    assert "/signals/deviation" not in read_recording(path)["entities"]
     assert named(path, "/decode/threshold") == ["r dx dy dz", "r gripper"]
     assert column(path, "/decode/threshold", "scalars")[0] == [9.0, 0.0]
 
@@ -400,7 +399,7 @@ def test_bytes_turned_over_inside_are_noticed_by_reading(tmp_path: Path) -> None
     content[middle : middle + 2000] = bytes(255 - b for b in content[middle : middle + 2000])
     path.write_bytes(content)
     with pytest.raises(KervError, match="damaged"):
-        read_back(path)
+        read_recording(path)
 
 
 def test_places_that_are_no_recordings(tmp_path: Path) -> None:
@@ -410,7 +409,7 @@ def test_places_that_are_no_recordings(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is not a recording"):
         find_recordings([tmp_path / "notes.txt"])
     with pytest.raises(KervError, match="is missing"):
-        read_back(tmp_path / "gone.rrd")
+        read_recording(tmp_path / "gone.rrd")
 
 
 def test_the_newest_recordings_come_first_and_not_all_are_opened(
@@ -471,23 +470,23 @@ def test_limits_and_places_are_drawn(tmp_path: Path) -> None:
     record = episode("mixed")
     still = np.zeros_like(record.path) + np.float32(0.1)
     record = replace(record, places={"object": still, "goal": still + np.float32(0.1)})
-    path = save_episode(record, tmp_path / "limits.rrd", method="heisd", limits={"metric": 0.3, "similarity": 0.975})
+    path = save_recording(record, tmp_path / "limits.rrd", method="heisd", limits={"metric": 0.3, "similarity": 0.975})
     assert named(path, "/signals/metric") == ["F, boundary metric", "F*"]
     assert {row[1] for row in column(path, "/signals/metric", "scalars")} == {0.3}
-    rows = read_back(path)["entities"]
+    rows = read_recording(path)["entities"]
     assert rows["/world/object"] == rows["/world/goal"] == record.steps + 1
 
 
 def test_two_recordings_of_one_seed_stand_side_by_side(tmp_path: Path) -> None:
-    first = save_episode(episode("ar"), tmp_path / "a.rrd", method="ar")
-    second = save_episode(episode("drafter"), tmp_path / "b.rrd", method="spec_vla")
-    both = read_back(save_together([first, second], tmp_path / "out"))
+    first = save_recording(episode("ar"), tmp_path / "a.rrd", method="ar", limits={})
+    second = save_recording(episode("drafter"), tmp_path / "b.rrd", method="spec_vla", limits={})
+    both = read_recording(save_together([first, second], tmp_path / "out"))
     assert both["blueprint"]
     assert both["name"] == "drawer-open-v3 · seed 7 · ar and spec_vla"
     for side, alone in (("left", first), ("right", second)):
-        rows = {name: count for name, count in read_back(alone)["entities"].items() if count}
+        rows = {name: count for name, count in read_recording(alone)["entities"].items() if count}
         assert {name: both["entities"][f"/{side}{name}"] for name in rows} == rows
-    other = save_episode(replace(episode("ar"), seed=8), tmp_path / "c.rrd", method="ar")
+    other = save_recording(replace(episode("ar"), seed=8), tmp_path / "c.rrd", method="ar", limits={})
     with pytest.raises(UsageError, match="the same seed on both sides, here 7 and 8"):
         save_together([first, other], tmp_path)
     with pytest.raises(UsageError, match="two recordings, not 1"):

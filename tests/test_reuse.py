@@ -29,7 +29,7 @@ from kerv_cli.lab.plan import Cell, plan
 from kerv_cli.lab.reuse import Covered, Stock, cover, disagreements, take_over
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.summary import not_in_turn
-from kerv_cli.report.tables import load_study, study_table
+from kerv_cli.report.tables import load_study
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def swept(store: StudyStore, cells: list[Cell], rerun: str = "never") -> Covered
 
 
 def table_of(store: StudyStore) -> pd.DataFrame:
-    return study_table(load_study(store)).query("averaging == 'micro over tasks'").set_index("label")
+    return load_study(store).table.query("averaging == 'micro over tasks'").set_index("label")
 
 
 def test_other_code_a_rename_and_a_new_part_run_nothing_again(

@@ -20,7 +20,7 @@ from kerv_cli.report.page import verdict as page_verdict
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.report import report
 from kerv_cli.report.stressed import by_kind, is_stressed, stem, summed_table, verdict
-from kerv_cli.report.tables import StudyData, load_study, rows_of, study_table
+from kerv_cli.report.tables import StudyData, load_study, rows_of
 
 TASKS = ["reach-v3", "push-v3"]
 EPISODES = 20
@@ -64,7 +64,7 @@ def data(results: Path) -> StudyData:
 
 @pytest.fixture(scope="module")
 def table(data: StudyData) -> pd.DataFrame:
-    return study_table(data)
+    return data.table
 
 
 def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(

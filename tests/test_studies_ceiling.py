@@ -19,7 +19,7 @@ from kerv_cli.lab.plan import Cell, make_cell, plan
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO
 from kerv_cli.report.summary import summary_frame
-from kerv_cli.report.tables import flatten, load_study, per_task_table, study_table
+from kerv_cli.report.tables import flatten, load_study
 
 STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip"}
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
@@ -92,7 +92,7 @@ def write(
         records = [record(cell, seed, factor) for seed in cell.seeds]
         store.write_cell(cell, records, {**STATUS, **(status or {}).get(cell.label, {})})
     store.write_plan(StudySettings("best", "", cells[0].label), cells)
-    return study_table(load_study(store))
+    return load_study(store).table
 
 
 def ceilings(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, float]:
@@ -156,7 +156,7 @@ def test_macro_takes_the_ratio_of_the_groups_means(tmp_path: Path) -> None:
 def test_per_task_rows_use_their_own_task(tmp_path: Path) -> None:
     cells = plan(settings(), ["reach-v3", "push-v3"], IDENTITY, baseline="ar")
     write(tmp_path, cells, {"push-v3": 3.0})
-    table = per_task_table(load_study(StudyStore(tmp_path, "best")))
+    table = load_study(StudyStore(tmp_path, "best")).per_task
     own = table[table["label"] == "kerv"].set_index("task")["ceiling_ms.own"]
     assert dict(own) == pytest.approx({"reach-v3": 300.0, "push-v3": 900.0})
     assert table[table["label"] == "kerv"]["ceiling"].to_list() == pytest.approx([EXPECTED["kerv"]] * 2)

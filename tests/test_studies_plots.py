@@ -20,7 +20,7 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.drawing import COLOURS, INK, STYLE, new_figure, place_labels, setting_colours
 from kerv_cli.report.measures import MICRO
 from kerv_cli.report.plots import has_task_map, series_of, study_figures, task_map
-from kerv_cli.report.tables import load_study, study_table
+from kerv_cli.report.tables import load_study
 
 
 def setting(method: str = "heisd", **parts: dict[str, Any]) -> RolloutSettings:
@@ -37,7 +37,7 @@ def table_of(results: Path, settings: dict[str, RolloutSettings], baseline: str 
     for cell in cells:
         store.write_cell(cell, run_cell(cell), {"run": "r1", "workers": 1, "device_name": "chip"})
     store.write_plan(StudySettings("drawn", "", baseline), cells)
-    return study_table(load_study(store))
+    return load_study(store).table
 
 
 def boundary_study() -> dict[str, RolloutSettings]:
@@ -164,7 +164,7 @@ def test_labels_keep_apart_in_a_crowd() -> None:
 
 
 def by_task(**columns: list[Any]) -> pd.DataFrame:
-    """Rows of `per_task_table` as far as the map reads them: two settings on two tasks."""
+    """Rows of a table by task, as far as the map reads them: two settings on two tasks."""
     rows = {
         "task": ["reach", "reach", "push", "push"],
         "label": ["ar", "bold"] * 2,

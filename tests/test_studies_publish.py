@@ -12,7 +12,7 @@ from kerv_cli.lab.execute import execute
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.publish import Unpublishable, refusals
 from kerv_cli.report.report import report
-from kerv_cli.report.tables import load_study, study_table
+from kerv_cli.report.tables import load_study
 
 COMMIT = "c" * 40
 
@@ -57,7 +57,7 @@ def test_sides_of_several_runs_or_commits_are_refused(tmp_path: Path, monkeypatc
     execute([cell for cell in cells if cell.label == "ar"], prepare, store)
     begin(tmp_path, monkeypatch, "d" * 40)
     execute(cells, prepare, store)
-    found = refusals(study_table(load_study(store)))
+    found = refusals(load_study(store).table)
     assert "its cells are of 2 commits" in found
     assert any(reason.startswith("not measured in one run with the baseline: naive_sd") for reason in found)
     assert any(reason.startswith("not measured in turn with the baseline") for reason in found)

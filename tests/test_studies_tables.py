@@ -34,8 +34,8 @@ from kerv_cli.lab.store import StudyStore
 from kerv_cli.report.measures import MACRO, MICRO, _realised_risk
 from kerv_cli.report.report import report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
-from kerv_cli.report.summary import not_in_turn, summary_frame, summary_table
-from kerv_cli.report.tables import StudyData, csv_text, load_study, per_task_table, study_table
+from kerv_cli.report.summary import SummaryTable, not_in_turn, summary_frame
+from kerv_cli.report.tables import StudyData, csv_text, load_study
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
 STATUS: dict[str, Any] = {"run": "r1", "workers": 1, "device_name": "chip", "torch_version": "2", "git_commit": "c"}
@@ -105,7 +105,7 @@ def row_of(table: pd.DataFrame, **wanted: str) -> dict[str, Any]:
 
 
 def test_one_task_by_hand(data: StudyData) -> None:
-    row = row_of(per_task_table(data), task="reach-v3", label="kerv")
+    row = row_of(data.per_task, task="reach-v3", label="kerv")
     expected = {
         "episodes": 2,
         "successes": 2,
@@ -143,7 +143,7 @@ def test_one_task_by_hand(data: StudyData) -> None:
 
 
 def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData) -> None:
-    row = row_of(per_task_table(data), task="reach-v3", label="ar")
+    row = row_of(data.per_task, task="reach-v3", label="ar")
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == 1.0
     assert row["forwards_per_step"] == 4.0
     assert all(math.isnan(row[name]) for name in ("AL", "accepted_per_round", "AFEP", "deviation"))
@@ -151,7 +151,7 @@ def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data: StudyData)
 
 
 def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> None:
-    table = study_table(data)
+    table = data.table
     micro, macro = row_of(table, averaging=MICRO, label="kerv"), row_of(table, averaging=MACRO, label="kerv")
     own, reference = [0.25, 0.05, 0.2, 0.2, 0.2], [0.5, 0.3, 1.0, 1.0, 1.0]
     assert micro["success"] == pytest.approx(3 / 5)
@@ -180,7 +180,7 @@ def test_micro_pools_episodes_and_macro_averages_difficulty(data: StudyData) -> 
 
 
 def test_every_interval_of_a_row_contains_the_row_s_own_figure(data: StudyData) -> None:
-    table = study_table(data)
+    table = data.table
     for low in (name for name in table if name.endswith("_low")):
         name = low.removesuffix("_low")
         known = table[table[low].notna()]
@@ -202,7 +202,7 @@ def test_the_realised_risk_counts_episodes_alike_whatever_their_length() -> None
 
 
 def test_a_row_says_everything(data: StudyData) -> None:
-    row = row_of(study_table(data), averaging=MICRO, label="kerv")
+    row = row_of(data.table, averaging=MICRO, label="kerv")
     expected = {
         "study": "hand",
         "method": "kerv",
@@ -244,7 +244,7 @@ def write_reach(tmp_path: Path, **harm: Any) -> dict[str, Any]:
     store.write_cell(cells[0], records_of(cells[0]), STATUS)
     store.write_cell(cells[1], records, {**STATUS, **harm})
     store.write_plan(StudySettings("hand", "", "ar"), cells)
-    return row_of(per_task_table(load_study(store)), label="kerv")
+    return row_of(load_study(store).per_task, label="kerv")
 
 
 def test_other_devices_are_not_compared(tmp_path: Path) -> None:
@@ -266,7 +266,7 @@ def test_pairs_of_one_block_are_told_from_others(tmp_path: Path) -> None:
         at = [Circumstances(block, i, "2026-01-01", 0.005 if first else 0.007) for i in range(2)]
         store.write_cell(cell, run_cell(cell), STATUS, at)
     store.write_plan(StudySettings("hand", "", "ar"), cells)
-    row = row_of(per_task_table(load_study(store)), label="kerv")
+    row = row_of(load_study(store).per_task, label="kerv")
     assert (row["pairs"], row["same_run"], row["same_block"]) == (4, True, 0.5)
     assert row["gauge_ms"] == pytest.approx(6.0)
 
@@ -281,7 +281,7 @@ def test_repeats_are_paired_with_their_own(tmp_path: Path) -> None:
         slower = replace(one, seconds=one.seconds * (10 if cell.repeat else 1))
         store.write_cell(cell, [still_episode(cell.task, seed, True, [slower]) for seed in cell.seeds], STATUS)
     store.write_plan(StudySettings("hand", "", "ar"), cells)
-    row = row_of(per_task_table(load_study(store)), label="kerv")
+    row = row_of(load_study(store).per_task, label="kerv")
     # a repeat is another time, not another world: successes count once
     assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (2, 4, 2, "100000-100001")
     assert (row["successes"], row["both"], row["success_low"]) == (2, 2, pytest.approx(wilson(2, 2).low))
@@ -297,7 +297,7 @@ def test_other_initial_states_are_no_pair(tmp_path: Path) -> None:
 
 def test_success_is_compared_with_another_run_and_times_are_not(tmp_path: Path) -> None:
     row = write_reach(tmp_path, run="r2")
-    table = study_table(load_study(StudyStore(tmp_path, "hand")))
+    table = load_study(StudyStore(tmp_path, "hand")).table
     assert summary_frame(table)["per step"].tolist() == ["1", "–"]
     assert not_in_turn(table) == ["kerv"]
     assert math.isnan(row["speedup"])
@@ -312,7 +312,7 @@ def test_without_the_baselines_cell_there_is_a_row_but_no_speedup(tmp_path: Path
     store.write_plan(StudySettings("hand", "", "ar"), cells)
     data = load_study(store)
     assert data.absent == [cells[0]]
-    table = study_table(data)
+    table = data.table
     assert list(table["label"]) == ["kerv", "kerv"]
     assert table["speedup"].isna().all()
     assert summary_frame(table)["per step"].tolist() == ["–"]
@@ -323,13 +323,13 @@ def test_two_labels_of_one_cell_are_two_rows(tmp_path: Path) -> None:
     cell = hand_cells()[0]
     store.write_cell(cell, records_of(cell), STATUS)
     store.write_plan(StudySettings("hand", "", "ar"), [cell, replace(cell, label="again")])
-    table = per_task_table(load_study(store))
+    table = load_study(store).per_task
     assert list(table["label"]) == ["ar", "again"]
     assert list(table["speedup"]) == [1.0, 1.0]
 
 
 def test_csv_has_sensible_digits_and_empty_cells(data: StudyData) -> None:
-    text = csv_text(per_task_table(data))
+    text = csv_text(data.per_task)
     lines = text.splitlines()
     assert len(lines) == 5
     values = dict(zip(lines[0].split(","), lines[4].split(","), strict=True))
@@ -341,12 +341,12 @@ def test_csv_has_sensible_digits_and_empty_cells(data: StudyData) -> None:
 
 def printed(table: pd.DataFrame, width: int = 80) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    console.print(summary_table(table))
+    console.print(SummaryTable(table))
     return console.export_text().splitlines()
 
 
 def test_summary_on_a_terminal(data: StudyData) -> None:
-    table = study_table(data)
+    table = data.table
     lines = printed(table, 120)
     assert lines[0].strip() == "hand: 2 tasks, 5 episodes each, micro over tasks, chip, float32"
     at = next(i for i, line in enumerate(lines) if line.startswith("kerv"))
@@ -356,7 +356,7 @@ def test_summary_on_a_terminal(data: StudyData) -> None:
 
 
 def test_summary_leaves_out_what_no_setting_uses(results: Path) -> None:
-    lines = printed(study_table(load_study(StudyStore(results, "threshold"))))
+    lines = printed(load_study(StudyStore(results, "threshold")).table)
     assert "skipped" not in " ".join(lines)
     rows = [line for line in lines if line.startswith(("ar", "naive_sd", "spec_vla"))]
     assert len(rows) == 4  # nothing wraps at 80 columns
@@ -428,7 +428,7 @@ def test_the_page_stands_alone(results: Path) -> None:
 def test_figures_show_the_axis_and_the_references(results: Path) -> None:
     from kerv_cli.report.plots import series_of, study_figures
 
-    table = study_table(load_study(StudyStore(results, "threshold")))
+    table = load_study(StudyStore(results, "threshold")).table
     rows = table[table["averaging"] == MICRO]
     series = series_of(rows, "threshold.r")
     assert {name: list(group["x"]) for name, group in series.items()} == {"naive_sd": [0], "spec_vla": [3, 9]}

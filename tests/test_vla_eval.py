@@ -49,7 +49,7 @@ from kerv_cli.lab.imported import read_evaluations, sides_of
 from kerv_cli.lab.run import Runner
 from kerv_cli.lab.served import read_served
 from kerv_cli.serve.policy import Policy
-from kerv_cli.serve.vla_eval import specs
+from kerv_cli.serve.vla_eval import dim_specs
 from kerv_cli.worlds.vla_eval import MetaWorld
 
 HORIZON = 10
@@ -586,7 +586,7 @@ def test_openvla_on_liberos_interface_from_checkpoint_to_paired_table(tmp_path: 
     for method in ("ar", "jacobi"):
         policy = policy_of(results, "libero", f"method={method}", "gripper=signed_inverted")
         stand = Stand()
-        own = {k: {n: DimSpec.from_dict(d) for n, d in v.items()} for k, v in specs(policy.interface).items()}
+        own = {k: {n: DimSpec.from_dict(d) for n, d in v.items()} for k, v in dim_specs(policy.interface).items()}
         pair = own["action_spec"], stand.get_action_spec(), own["observation_spec"], stand.get_observation_spec()
         assert check_specs(*pair) == []
         recordings.append(str(evaluated(policy, config, tmp_path / method, method)))

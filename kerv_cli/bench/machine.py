@@ -15,6 +15,7 @@ from kerv_cli.targets.compact.packed_bfloat16 import BlockedLinear, multiplies_b
 
 _BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: a server's caches hold 100 MB and more
 _ROWS, _WIDTH = 256, 4096
+REPEATS = 7
 
 
 @dataclass(frozen=True)
@@ -54,20 +55,15 @@ def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.
     return seconds
 
 
-def median_seconds(work: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Median of `timed`."""
-    return float(np.median(timed(work, device, repeats)))
-
-
 @torch.inference_mode()
-def measure_machine(device: torch.device, dtype: torch.dtype, repeats: int = 7) -> Machine:
+def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
     """The device's rates with this process's threads."""
     buffer = torch.ones(_BUFFER, device=device)
-    seconds = timed(buffer.sum, device, repeats).min()
+    seconds = timed(buffer.sum, device, REPEATS).min()
     del buffer
     x = torch.ones(_ROWS, _WIDTH, dtype=dtype, device=device)
     product = product_with(torch.ones(_WIDTH, _WIDTH, device=device), dtype)
-    best = timed(lambda: product(x), device, repeats).min()
+    best = timed(lambda: product(x), device, REPEATS).min()
     return Machine(4.0 * _BUFFER / float(seconds), 2.0 * _ROWS * _WIDTH**2 / float(best))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,7 +23,8 @@ from kerv_cli.base.settings import (
     TrainTargetSettings,
 )
 from kerv_cli.base.spaces import Observation
-from kerv_cli.bench.machine import median_seconds, product_with
+from kerv_cli.bench.machine import REPEATS, product_with, timed
+from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.lab.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
@@ -84,7 +86,7 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """The target's; caches are float32 on a CPU."""
+        """The target's shape; its caches are float32 on a CPU."""
         size = 4 if self.target.device.type == "cpu" else self.dtype.itemsize
         return Sizes(self.target.settings, self.target.actions.tokens, self.dtype.itemsize, size)
 
@@ -201,7 +203,7 @@ def shape_of(name: str, tokens: int) -> TargetSettings:
     return replace(shape, chunk=-(-tokens // SPEC.actions.dofs))
 
 
-def _drafter(target: Any) -> Drafter:
+def _drafter(target: ReadableTarget) -> Drafter:
     drafter = Drafter.beside(DrafterSettings(), target).to(device=target.device, dtype=target.dtype)
     drafter.eval().requires_grad_(False)
     pack(drafter)
@@ -209,7 +211,7 @@ def _drafter(target: Any) -> Drafter:
 
 
 def blank(target: Any) -> Observation:
-    """A black image and zeros."""
+    """An observation of the target: black images and zeros."""
     return still_observation(target, target.observation, target.settings.image_size)
 
 
@@ -224,7 +226,7 @@ def fastest(device: torch.device) -> torch.dtype:
     seconds = {}
     for dtype in (torch.bfloat16, torch.float32):
         product = product_with(torch.ones(8192, 4096), dtype)
-        seconds[dtype] = median_seconds(functools.partial(product, row.to(dtype)), device, 7)
+        seconds[dtype] = np.median(timed(functools.partial(product, row.to(dtype)), device, REPEATS))
     return min(seconds, key=seconds.__getitem__)
 
 

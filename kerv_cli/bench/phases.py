@@ -114,7 +114,7 @@ def decoders(model: Model) -> list[Decoder]:
     target, size = model.target, model.size
     rule, everything = Relaxed(target.actions, strict_dofs=False), Fixed(target.actions.tokens)
 
-    def decoder(in_prefill: int = 0, proposer: Any = None) -> Decoder:
+    def decoder(in_prefill: int = 0, proposer: Proposer | None = None) -> Decoder:
         draft = Dummy(in_prefill) if in_prefill else None
         return Decoder(target, Parts(rule, everything, draft, proposer))
 

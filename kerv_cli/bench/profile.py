@@ -16,8 +16,11 @@ from kerv_cli.engine.cost import KINDS, Profile
 _PER_LAYER = 15e-6  # seconds per layer and pass below which projections do not go: kernels of a captured graph
 _HALF = 2  # bytes of a bfloat16
 
+Document = dict[str, Any]
+"""What a bench writes, and compares, as JSON."""
 
-def profile_of(phases: Sequence[Phase], tokens: int = 0) -> Profile:
+
+def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
     """The profile of measured costs, their medians. tokens: N."""
     points = {kind: sorted((p.rows, p.seconds) for p in phases if p.kind == kind) for kind in KINDS}
     costs = {kind: tuple(zip(*pairs, strict=True)) for kind, pairs in points.items() if pairs}
@@ -27,7 +30,7 @@ def profile_of(phases: Sequence[Phase], tokens: int = 0) -> Profile:
 
 def projections(
     settings: BenchSettings, model: Model, machine: Machine, phases: Sequence[Phase]
-) -> Iterator[tuple[str, dict[str, Any]]]:
+) -> Iterator[tuple[str, Document]]:
     """(device, document) of every device of `projections`, for the shape `projected` in bfloat16. Its rows behind the
     prompt are those measured here."""
     shape = shape_of(settings.projected, model.size)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -17,7 +16,7 @@ from kerv_cli.bench.ceilings import MethodCeiling, ceilings
 from kerv_cli.bench.machine import Machine, measure_machine, synchronise
 from kerv_cli.bench.model import Model, open_model
 from kerv_cli.bench.phases import Phase, flipped, measure
-from kerv_cli.bench.profile import profile_of, projections
+from kerv_cli.bench.profile import Document, profile_of, projections
 from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.decoder import Decoder
 
@@ -31,7 +30,6 @@ class Bench:
 
     model: Model
     machine: Machine
-    card: dict[str, float]
     cold: dict[str, float]
     phases: list[Phase]
     ceilings: dict[int, list[MethodCeiling]]
@@ -49,8 +47,8 @@ class Bench:
         device = self.model.target.device
         return f"{self.model.name}, {self.dtype}, {stamp(str(device))['device_name']}, {torch.get_num_threads()} thread"
 
-    def document(self) -> dict[str, Any]:
-        """For JSON."""
+    def document(self) -> Document:
+        """The whole result, for JSON."""
         device = self.model.target.device
         return {
             "target": self.model.name,
@@ -59,7 +57,7 @@ class Bench:
             "device": str(device),
             "threads": torch.get_num_threads(),
             **stamp(str(device)),
-            "card": self.card,
+            "card": card_of(self.model, self.machine, max(self.ceilings)),
             "cold_start": self.cold,
             "phases": [phase.as_dict() for phase in self.phases],
             "ceilings": {str(n): [asdict(c) for c in rows] for n, rows in self.ceilings.items()},
@@ -89,14 +87,13 @@ def card_of(model: Model, machine: Machine, tokens: int) -> dict[str, float]:
     }
 
 
-def open_and_card(settings: BenchSettings) -> tuple[Model, Machine, dict[str, float], float]:
-    """The model, its machine, the card and the seconds that opening took. Errors as `open_model`."""
+def open_timed(settings: BenchSettings) -> tuple[Model, Machine, float]:
+    """The model, its machine's rates, and the seconds that opening the model took. Errors as `open_model`."""
     began = time.perf_counter()
     model = open_model(settings)
     synchronise(model.target.device)
     opened = time.perf_counter() - began
-    machine = measure_machine(model.target.device, model.dtype)
-    return model, machine, card_of(model, machine, max(settings.tokens)), opened
+    return model, measure_machine(model.target.device, model.dtype), opened
 
 
 def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) -> Bench:
@@ -107,25 +104,18 @@ def run(settings: BenchSettings, model: Model, machine: Machine, opened: float) 
     machine, phases = measure(model, machine, settings)
     profile = profile_of(phases, model.size)
     by_tokens = {n: ceilings(profile, n) for n in settings.tokens}
-    card = card_of(model, machine, max(settings.tokens))
-    return Bench(model, machine, card, cold, phases, by_tokens, flipped(model, FLIP_CHUNKS), profile)
+    return Bench(model, machine, cold, phases, by_tokens, flipped(model, FLIP_CHUNKS), profile)
 
 
 def write(settings: BenchSettings, bench: Bench) -> list[Path]:
     """Writes the document and the projections of `projected` -> their paths."""
-    path = place_of(settings.results, bench.model.name, bench.dtype, ".json")
-    write_json(path, bench.document())
-    paths = [path]
-    for device, document in (
-        projections(settings, bench.model, bench.machine, bench.phases) if settings.projected else ()
-    ):
-        kind = f"-{device.lower().replace(' ', '-')}.json"
-        paths.append(place_of(settings.results, settings.projected, document["dtype"], kind))
-        write_json(paths[-1], document)
-    return paths
-
-
-def place_of(results: str, model: str, dtype: str, kind: str) -> Path:
-    """results/bench/<model>-<dtype><kind>."""
-    name = model.rstrip("/").rsplit("/", 1)[-1]
-    return results_dir(results) / "bench" / f"{name}-{dtype}{kind}"
+    folder = results_dir(settings.results) / "bench"
+    name = bench.model.name.rstrip("/").rsplit("/", 1)[-1]
+    documents = {folder / f"{name}-{bench.dtype}.json": bench.document()}
+    if settings.projected:
+        for device, document in projections(settings, bench.model, bench.machine, bench.phases):
+            file = f"{settings.projected}-{document['dtype']}-{device.lower().replace(' ', '-')}.json"
+            documents[folder / file] = document
+    for path, document in documents.items():
+        write_json(path, document)
+    return list(documents)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.manifests import read
@@ -52,7 +52,7 @@ def _again(cell: Cell, results: str) -> Cell:
 
 
 def store_again(run: RunEntry, results: str, cells: list[Cell]) -> StudyStore:
-    """Where a repetition of these cells is stored: a new store, or that of one which was interrupted."""
+    """The store for a repetition of these cells: a new one, or that of a repetition which was interrupted."""
     ids = {cell.id for cell in cells}
     for store in stores(Path(results).expanduser(), run.folder.parent.name):
         with contextlib.suppress(KervError):
@@ -85,7 +85,7 @@ def run_again(run: RunEntry, store: StudyStore, cells: list[Cell]) -> RunEntry:
 
 
 def _free(folder: Path, name: str) -> str:
-    """`name-again`, or with a number behind it, where no folder has that name yet."""
+    """`name-again` or `name-again2`, …: the first that is no folder yet."""
     names = (f"{name}-again{number if number > 1 else ''}" for number in range(1, 1000))
     return next(candidate for candidate in names if not (folder / candidate).exists())
 
@@ -103,7 +103,7 @@ def training_again(run: RunEntry, results: str) -> TargetRun | DrafterRun:
     if not isinstance(training, dict):
         command = "target" if run.kind == "target" else "drafter"
         raise CheckpointError(f"{path} does not say how it was trained: train anew with 'kerv train {command}'")
-    value: dict[str, Any] = training | {"results": results}
+    value = training | {"results": results}
     name = _free(run.folder.parent, run.folder.name)
     if run.kind == "target":
         return TargetRun(dataclasses.replace(read(TrainTargetSettings, value, str(path)), name=name))

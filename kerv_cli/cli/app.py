@@ -55,7 +55,7 @@ class Commands(TyperGroup):
         return family
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """`demos export` is a command beside `demos`.
+        """The command that the first words name: `demos export` is a command beside `demos`.
 
         Raises:
             UsageError: the first word is no command; the line says which is meant.
@@ -74,7 +74,7 @@ class Commands(TyperGroup):
         raise UsageError(f"settings follow the command: kerv {self.prefix}{shlex.join(line)}{which}")
 
     def _unknown(self, word: str, rest: list[str], names: list[str]) -> UsageError:
-        """The refusal of a first word that is no command."""
+        """The error for a first word that is no command."""
         what = f"unknown {self.prefix}command '{word}'"
         if word == "kerv":
             return UsageError("kerv stands twice in this line: leave one out")

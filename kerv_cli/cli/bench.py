@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +14,11 @@ from kerv_cli.base.files import read_json
 from kerv_cli.base.settings import BenchSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import print_table
+
+if TYPE_CHECKING:
+    from kerv_cli.bench.ceilings import MethodCeiling
+    from kerv_cli.bench.phases import Phase
+    from kerv_cli.bench.profile import Document
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
 Compare = Annotated[
@@ -33,18 +39,18 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
     if compare is not None:
         _compare(*compare)
         return
-    from kerv_cli.bench import report
-    from kerv_cli.bench.run import open_and_card, run, write
+    from kerv_cli.bench.run import card_of, open_timed, run, write
 
-    model, machine, card, opened = open_and_card(settings)
-    print_table(("card", ""), report.card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
+    model, machine, opened = open_timed(settings)
+    card = card_of(model, machine, max(settings.tokens))
+    print_table(("card", ""), _card_rows(card), f"{model.name}, {model.dtype}".replace("torch.", ""))
     done = run(settings, model, machine, opened)
     typer.echo(
         f"cold start: opened in {opened:.1f} s, first prefill and token {done.cold['first_decode_seconds']:.2f} s"
     )
-    print_table(report.PHASE_COLUMNS, report.phase_rows(done.phases), done.title)
+    print_table(_PHASE_COLUMNS, _phase_rows(done.phases), done.title)
     columns = [name for n in settings.tokens for name in (f"N = {n}", "ceiling", "with its drafter")]
-    print_table(("method", *columns), report.ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
+    print_table(("method", *columns), _ceiling_rows(done.ceilings), "speedup if every draft were accepted whole")
     flipped, compared = done.ties
     typer.echo(f"{flipped} of {compared} tokens differ between one verification and single tokens ({done.dtype})")
     for path in write(settings, done):
@@ -54,13 +60,59 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
 
 
 def _compare(a: Path, b: Path) -> None:
-    from kerv_cli.bench.report import comparison_rows
-
-    documents: list[dict[str, Any]] = []
-    for path in (a, b):
-        document = read_json(path)
+    documents = {path: read_json(path) for path in (a, b)}
+    for path, document in documents.items():
         if not isinstance(document, dict) or not {"phases", "target", "dtype"} <= set(document):
             raise CheckpointError(f"{path} is no result of 'kerv bench'")
-        documents.append(document)
-    names = [f"{d['target']} {d['dtype']} ms" for d in documents]
-    print_table(("phase", *names, "ratio"), comparison_rows(*documents), f"{a} and {b}")
+    names = [f"{documents[path]['target']} {documents[path]['dtype']} ms" for path in (a, b)]
+    print_table(("phase", *names, "ratio"), _comparison_rows(documents[a], documents[b]), f"{a} and {b}")
+
+
+def _card_rows(card: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Sizes of the target, rates of the device and the floors that follow, before the target is measured."""
+    return [
+        ("weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"),
+        ("cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"),
+        ("bandwidth, measured", f"{card['bandwidth'] / 1e9:.1f} GB/s"),
+        ("products, measured", f"{card['flops'] / 1e9:.0f} GFLOP/s"),
+        ("floor of one token", f"{1e3 * card['floor_token']:.2f} ms"),
+        ("floor of a verification of N", f"{1e3 * card['floor_verify']:.2f} ms"),
+        ("floor of the prefill", f"{1e3 * card['floor_prefill']:.2f} ms"),
+        ("floor of prefill and N", f"{1e3 * card['floor_both']:.2f} ms"),
+    ]
+
+
+def _phase_rows(phases: Sequence[Phase]) -> list[tuple[str, ...]]:
+    """One row per phase: times in milliseconds, rates, share of the device's rate."""
+    rows: list[tuple[str, ...]] = []
+    for phase in phases:
+        limited = phase.floor > 0
+        rates = (f"{phase.read / phase.seconds / 1e9:.1f}", f"{phase.flops / phase.seconds / 1e9:.0f}")
+        times = (f"{1e3 * phase.seconds:.2f}", f"{1e3 * phase.p95:.2f}", f"{1e3 * phase.least:.2f}")
+        floor = (f"{1e3 * phase.floor:.2f}", f"{100 * phase.share:.0f}") if limited else ("–", "–")
+        rows.append((phase.name, *times, *(rates if limited else ("–", "–")), *floor))
+    return rows
+
+
+_PHASE_COLUMNS = ("phase", "median ms", "p95", "least", "GB/s", "GFLOP/s", "floor ms", "share %")
+
+
+def _ceiling_rows(by_tokens: Mapping[int, Sequence[MethodCeiling]]) -> list[tuple[str, ...]]:
+    """One row per method, two columns per N."""
+    by_method: dict[str, list[str]] = {}
+    for ceilings in by_tokens.values():
+        for ceiling in ceilings:
+            row = by_method.setdefault(ceiling.method, [])
+            row += [ceiling.how, f"{ceiling.free:.2f}", f"{ceiling.drafted:.2f}"]
+    return [(method, *row) for method, row in by_method.items()]
+
+
+def _comparison_rows(a: Document, b: Document) -> list[tuple[str, ...]]:
+    """Phases that both documents have: medians in milliseconds and a over b."""
+    other = {phase["name"]: phase for phase in b["phases"]}
+    rows: list[tuple[str, ...]] = []
+    for phase in a["phases"]:
+        if phase["name"] in other:
+            mine, theirs = phase["seconds"], other[phase["name"]]["seconds"]
+            rows.append((phase["name"], f"{1e3 * mine:.2f}", f"{1e3 * theirs:.2f}", f"{mine / theirs:.2f}"))
+    return rows

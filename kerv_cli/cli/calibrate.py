@@ -119,8 +119,8 @@ def _skip(calibration: Calibration) -> None:
     print_table(columns, rows, title)
 
 
-OWN = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}
-"""Settings of `kerv calibrate success` itself; all others are the study's."""
+OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}
+"""Settings of the test of `kerv calibrate success`; all others are the study's."""
 
 
 @command(
@@ -136,31 +136,31 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     from kerv_cli.base.config import compose, to_yaml
     from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve
-    from kerv_cli.report.certificate import certify, folder_of, verdicts, write
+    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, write
 
-    own = [word for word in words if word.split("=")[0] in OWN]
-    theirs = [word for word in words if word not in own]
-    if not any(word.startswith("study=") for word in theirs):
-        theirs = [f"study={CalibrateSuccessSettings.groups['study']}", *theirs]
-    folder = [word for word in theirs if word.startswith("results=")]
-    settings = compose("calibrate_success", [*own, *folder], CalibrateSuccessSettings)
-    resolved = resolve(theirs)
+    of_test = [word for word in words if word.split("=")[0] in OF_TEST]
+    of_study = [word for word in words if word not in of_test]
+    if not any(word.startswith("study=") for word in of_study):
+        of_study = [f"study={CalibrateSuccessSettings.groups['study']}", *of_study]
+    results = [word for word in of_study if word.startswith("results=")]
+    settings = compose("calibrate_success", [*of_test, *results], CalibrateSuccessSettings)
+    resolved = resolve(of_study)
     if cfg:
         lines = to_yaml(settings).splitlines()
-        typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OWN), "---"]))
+        typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OF_TEST), "---"]))
         print_settings(resolved)
         return
-    place = folder_of(resolved, settings.name)
-    store, covered = covered_cells(resolved, theirs)
+    folder = folder_of(resolved, settings.name)
+    store, covered = covered_cells(resolved, of_study)
     if plan:
         print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
         return
-    outcome = run_covered(resolved, covered, store, theirs)
+    outcome = run_covered(resolved, covered, store, of_study)
     if outcome.failed:
         raise typer.Exit(1)
     certificate = certify(resolved, store, covered.cells, settings.margin, settings.delta)
-    path = write(place, certificate)
-    rows = verdicts(certificate)
+    path = write(folder, certificate)
+    rows = candidate_rows(certificate)
     if as_json:
         print_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
         return

@@ -18,8 +18,10 @@ import typer
 from typer.core import TyperCommand
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import field_of
 from kerv_cli.base.near import KEYS, nearest, question
+from kerv_cli.base.places import check_writable
 from kerv_cli.base.registry import NoSettings, Part, add, find, load, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 
@@ -39,11 +41,11 @@ def command(name: str, settings: type = CommandSettings, keys: str = "", **trait
             of names.
     """
 
-    def declared(run: F) -> F:
+    def declare(run: F) -> F:
         add("command", name, f"{run.__module__}:{run.__name__}", settings, help=run.__doc__ or "", keys=keys, **traits)
         return run
 
-    return declared
+    return declare
 
 
 def schemas_of(part: Part) -> list[tuple[str, type]]:
@@ -53,7 +55,7 @@ def schemas_of(part: Part) -> list[tuple[str, type]]:
 
 
 def top_keys(part: Part) -> list[str]:
-    """What can stand in front of `=` or a dot: typed words, groups of conf/, settings."""
+    """The names that the command takes in front of `=` or a dot: typed words, groups of conf/, settings."""
     schemas = [schema for _, schema in schemas_of(part)]
     groups = [group for schema in schemas for group in choices_of(schema)]
     names = [at.name for schema in schemas for at in fields(schema)]
@@ -62,21 +64,21 @@ def top_keys(part: Part) -> list[str]:
 
 
 def typer_command(part: Part) -> TyperCommand:
-    """Typer's command of a registered one. Its module is imported now."""
+    """Makes typer's command from a registered one, whose module is imported now."""
     run = load(part.build)
     parameters = inspect.signature(run, eval_str=True).parameters
     more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
 
-    def callback(overrides: list[str] | None = None, cfg: bool = False, **options: Any) -> None:
-        words, names = _divided(part, overrides or [], "names" in parameters)
+    def callback(overrides: list[str] | None = None, cfg: bool = False, **options: object) -> None:
+        words, names = _split(part, overrides or [], "names" in parameters)
         _check_bare(part, words)
         arguments = {"words": words, "names": names, "cfg": cfg}
         if "settings" in parameters or (cfg and "cfg" not in parameters):
-            arguments["settings"] = _composed(part, words, cfg)
+            arguments["settings"] = _settings(part, words, cfg)
         run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
 
     cfg_option = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
-    callback.__signature__ = inspect.Signature([_option("overrides", None, _words(part)), *cfg_option, *more])  # type: ignore[attr-defined]
+    callback.__signature__ = inspect.Signature([_option("overrides", None, _words_argument(part)), *cfg_option, *more])  # type: ignore[attr-defined]
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     help = "\n\n".join(filter(None, (inspect.cleandoc(part.traits.get("help", "")), part.traits.get("names"))))
     single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(callback)
@@ -90,11 +92,11 @@ _ARGUMENTS = ("settings", "words", "names", "cfg")
 _CFG = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
 
 
-def _option(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+def _option(name: str, default: object, annotation: object) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _words(part: Part) -> Any:
+def _words_argument(part: Part) -> object:
     """The argument of all words that are no options; the help says what they can be in sections of its own."""
     metavar = "NAME" if "names" in part.traits else "KEY=VALUE"
     argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
@@ -147,7 +149,7 @@ def _values(part: Part, key: str) -> list[str]:
 
 
 def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
-    """Dotted keys of the command with the parts that were chosen in front."""
+    """Dotted keys of the command, given the parts that the words before choose."""
     from kerv_cli.base.config import keys_of
 
     for name, schema in schemas_of(part):
@@ -157,8 +159,8 @@ def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
     return []
 
 
-def _divided(part: Part, words: list[str], named: bool) -> tuple[list[str], list[str]]:
-    """(overrides, names). named: the command takes names; else every word has to be an override."""
+def _split(part: Part, words: list[str], named: bool) -> tuple[list[str], list[str]]:
+    """Splits words into (overrides, names). named: the command takes names; else every word has to be an override."""
     if not named:
         return words, []
     keys = set(top_keys(part)) if part.settings is not NoSettings else set()
@@ -175,7 +177,7 @@ def _divided(part: Part, words: list[str], named: bool) -> tuple[list[str], list
 
 
 def _check_bare(part: Part, words: list[str]) -> None:
-    """Refuses settings with spaces in them, and a value without its key: `kerv rollout reach`.
+    """Refuses settings with spaces around `=`, and a value without its key: `kerv rollout reach`.
 
     Raises:
         UsageError: names the setting that is meant.
@@ -189,7 +191,7 @@ def _check_bare(part: Part, words: list[str]) -> None:
             continue
         taking = [key for key in keys if {word, f"{word}-v3"} & set(_values(part, key))]
         if word[-1] in ",=":
-            meant = f"{word.rstrip(',')}{after}" if word[-1] == "=" else _listed(word + after)
+            meant = f"{word.rstrip(',')}{after}" if word[-1] == "=" else _in_brackets(word + after)
         elif word.rstrip(":") in keys and after and "=" not in after:
             meant = f"{word.rstrip(':')}={after}"
         elif taking:
@@ -201,20 +203,19 @@ def _check_bare(part: Part, words: list[str]) -> None:
         raise UsageError(f"'{word}' is not an override: did you mean {meant}?")
 
 
-def _listed(word: str) -> str:
+def _in_brackets(word: str) -> str:
     """A list in brackets: `task=reach,push` -> `task=[reach,push]`."""
     key, _, value = word.partition("=")
     return f"{key}=[{value.strip('[]')}]"
 
 
-def _composed(part: Part, words: list[str], cfg: bool) -> Any:
+def _settings(part: Part, words: list[str], cfg: bool) -> Any:
     """The command's settings. With --cfg they are printed and the command ends.
 
     Raises:
         UsageError: as `config.compose`. StorageError: as `places.check_writable`.
     """
     from kerv_cli.base.config import compose, to_yaml
-    from kerv_cli.base.places import check_writable
 
     typed = part.traits.get("typed", {})
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
@@ -241,7 +242,7 @@ class CommandWithSettings(TyperCommand):
     part: Part
 
     def keys(self) -> list[str]:
-        """What can stand in front of `=`."""
+        """Every key that the command takes, dotted ones included."""
         from kerv_cli.base.config import keys_of
 
         if self.part.settings is NoSettings:
@@ -250,7 +251,7 @@ class CommandWithSettings(TyperCommand):
         return [*top_keys(self.part), *(key for keys in below for key in keys)]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Reads options and words; an error says of which command it is, which typer leaves out for some."""
+        """Reads options and words. Some of typer's errors do not say which command they are of: here all do."""
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:
@@ -274,7 +275,7 @@ class CommandWithSettings(TyperCommand):
 
 
 def summary_of(part: Part) -> str:
-    """What stands before the first full stop or semicolon of a command's help."""
+    """A command's help up to the first full stop or semicolon."""
     return re.split(r"[.;]\s", part.traits.get("help", "") + " ")[0]
 
 
@@ -289,10 +290,9 @@ def _row(part: Part, key: str) -> tuple[str, str]:
     return f"{key}={_plain(default)}", f"{kind}: {at.metadata.get('help', '')}"
 
 
-def _of_file(schema: type, key: str, default: Any) -> Any:
+def _of_file(schema: type, key: str, default: object) -> object:
     """The value of a dotted key in the file of conf/ that its group chooses; `default` where that does not say."""
     from kerv_cli.base.config import conf_dir
-    from kerv_cli.base.files import read_yaml_file
 
     group, *path = key.split(".")
     file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
@@ -309,7 +309,7 @@ def _type_name(at: Field[Any]) -> str:
     return {"str": "text", "bool": "true or false", "dict": "mapping", "float": "number"}.get(plain, plain)
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     if isinstance(value, list):
         return f"[{','.join(map(str, value))}]"
     return "" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
 import shlex
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from kerv_cli.base.errors import Interrupted, KervError
 from kerv_cli.base.near import KEYS, OPTIONS, nearest, question
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
@@ -22,14 +27,12 @@ ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on standard output, nothing else.")]
 
 
-def print_json(value: Any) -> None:
+def print_json(value: object) -> None:
     """Prints a value as indented JSON; NaN and infinity, which JSON lacks, become null."""
-    import json
-
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -48,7 +51,7 @@ def print_notes(idle: Mapping[str, str]) -> None:
 
 
 def print_plan(text: str, as_json: bool = False) -> None:
-    """Prints what would be done, for --plan; the command ends."""
+    """Prints what a command would do, for --plan, and ends it."""
     if as_json:
         print_json({"plan": text})
     else:
@@ -94,16 +97,17 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
         return f"{error.message.rstrip('.')}: {options[name].help}"
     typed = next((word for word in words if word.startswith(name) or re.match(rf"-[^-].*{name[-1]}", word)), name)
     stem, _, value = typed.lstrip("-").partition("=")
+    after = next(iter(words[words.index(typed) + 1 :]), "")
+    value = value or ("" if "=" in after or after.startswith("-") else after)
     key = stem.replace("-", "_")
-    after = [word for word in words[words.index(typed) + 1 :][:1] if "=" not in word and word[:1] != "-"]
     keys: list[str] = command.keys() if hasattr(command, "keys") else []
     if key in ("resume", "continue"):
         return f"No such option: {typed}: leave it out, the same command goes on where it was interrupted"
     near = nearest(f"--{key}", [*options, *keys], {**KEYS, **OPTIONS})
-    if near[:1] == ["runtime.device"] and (value or (after or ["0"])[0]).isdigit():
-        after, value = ["cuda"], ""  # a GPU's number
+    if near[:1] == ["runtime.device"] and (value or "0").isdigit():  # a GPU's number
+        value = "cuda"
     if near and not near[0].startswith("-"):
-        return f"No such option: {typed}; settings have no dashes: {near[0]}={value or (after or ['VALUE'])[0]}"
+        return f"No such option: {typed}; settings have no dashes: {near[0]}={value or 'VALUE'}"
     return f"No such option: {typed}: {question(near) or f'{error.ctx.command_path} --help lists them'}"
 
 
@@ -120,8 +124,8 @@ _CARRIED = {
 
 
 def runnable(message: str, words: Sequence[str]) -> str:
-    """The message with every quoted command made complete: how kerv is called here, and those of the present command's
-    settings without which it would work on another folder or another policy."""
+    """The message, in which every quoted command can be copied: it begins as kerv is called here, and has the present
+    command's settings without which it would work on another folder or another policy."""
 
     def completed(match: re.Match[str]) -> str:
         quote, name, rest = match.groups()
@@ -129,7 +133,7 @@ def runnable(message: str, words: Sequence[str]) -> str:
         given = [re.sub("^method=", "for=", word) for word in words] if name == "prepare" else words
         keys = {word.split("=", 1)[0] for word in shlex.split(rest)}
         carried = [shlex.quote(word) for word in given if _carries(word, name) and word.split("=", 1)[0] not in keys]
-        return f"{quote}{' '.join([called(), name, *rest.split(), *carried])}{quote}"
+        return f"{quote}{' '.join([kerv_command(), name, *rest.split(), *carried])}{quote}"
 
     return _QUOTED.sub(completed, message)
 
@@ -140,8 +144,8 @@ def _carries(word: str, command: str) -> bool:
     return takers is None or command in takers
 
 
-def in_same(words: Iterable[str]) -> str:
-    """` results=DIR` where these words name one, for commands to type next; else nothing."""
+def results_word(words: Iterable[str]) -> str:
+    """` results=DIR` for the end of a command to type next, if these words name a folder; else empty."""
     return "".join(f" {shlex.quote(word)}" for word in words if word.startswith("results="))
 
 
@@ -205,14 +209,12 @@ def _plain_lines(title: str) -> Callable[..., None]:
     return advance
 
 
-def called() -> str:
+def kerv_command() -> str:
     """The command to show in hints: `kerv` where the shell finds it, else the path of this script."""
-    import shutil
-
     return "kerv" if shutil.which("kerv") or not sys.argv[0].endswith("kerv") else os.path.relpath(sys.argv[0])
 
 
-def console(stderr: bool = False) -> Any:
+def console(stderr: bool = False) -> Console:
     """A rich console; 200 columns wide where the output is no terminal."""
     from rich.console import Console
 

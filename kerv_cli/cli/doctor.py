@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kerv_cli.base.errors import StorageError
+from kerv_cli.base.errors import KervError, StorageError, UnknownName
+from kerv_cli.base.files import visible
 from kerv_cli.base.findings import Finding
+from kerv_cli.base.leftovers import left_over, remove
+from kerv_cli.base.places import check_writable, find_target, results_dir, shipped_dir
 from kerv_cli.base.settings import DoctorSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, print_json, print_table
@@ -62,7 +67,7 @@ def _machine(settings: DoctorSettings) -> list[Finding]:
     says = f"{len(paths)} files of killed commands, kerv doctor --repair removes them" if paths else "nothing"
     return [
         Finding("versions", True, numbers),
-        *(_drawn(spec, settings) for spec in specs().values()),
+        *(_rendering(spec, settings) for spec in specs().values()),
         _torch(settings),
         *_policies(settings),
         _disk(settings),
@@ -97,7 +102,6 @@ def _environment(settings: DoctorSettings) -> list[Finding]:
     """Whether the environment keeps the protocol, on its first task."""
     if not settings.environment:
         return []
-    from kerv_cli.base.errors import UnknownName
     from kerv_cli.worlds import specs
     from kerv_cli.worlds.conformance import check_environment
 
@@ -107,11 +111,8 @@ def _environment(settings: DoctorSettings) -> list[Finding]:
     return check_environment(environments[settings.environment], settings.seed)
 
 
-def _drawn(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
+def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
     """Draws frames of a world and times them: a backend can load and still draw nothing."""
-    import time
-
-    from kerv_cli.base.errors import KervError
     from kerv_cli.worlds.camera import choose_backend
 
     what, first = f"rendering {spec.name}", next(iter(spec.suites.values()), tuple(spec.tasks))[0]
@@ -134,7 +135,6 @@ def _drawn(spec: EnvironmentSpec, settings: DoctorSettings) -> Finding:
 def _torch(settings: DoctorSettings) -> Finding:
     import torch
 
-    from kerv_cli.base.errors import KervError
     from kerv_cli.base.provenance import device_name
     from kerv_cli.base.runtime import set_up
 
@@ -147,9 +147,6 @@ def _torch(settings: DoctorSettings) -> Finding:
 
 
 def _policies(settings: DoctorSettings) -> list[Finding]:
-    from kerv_cli.base.errors import KervError
-    from kerv_cli.base.files import visible
-    from kerv_cli.base.places import find_target, shipped_dir
     from kerv_cli.targets.checkpoint import read_target
 
     findings = []
@@ -169,10 +166,6 @@ def _policies(settings: DoctorSettings) -> list[Finding]:
 
 
 def _disk(settings: DoctorSettings) -> Finding:
-    import shutil
-
-    from kerv_cli.base.places import check_writable, results_dir
-
     folder = results_dir(settings.results)
     try:
         parent = check_writable(settings.results)
@@ -184,8 +177,6 @@ def _disk(settings: DoctorSettings) -> Finding:
 
 def _left_over(settings: DoctorSettings) -> list[Path]:
     """Temporary files and folders of dead processes, and claims and notes of dead sweeps, in the results."""
-    from kerv_cli.base.leftovers import left_over
-    from kerv_cli.base.places import results_dir
     from kerv_cli.lab.claims import void
 
     root = results_dir(settings.results)
@@ -195,8 +186,6 @@ def _left_over(settings: DoctorSettings) -> list[Path]:
 
 def _repair(settings: DoctorSettings) -> None:
     """Removes the files of `_left_over` and prints their names; sets damaged cells aside."""
-    from kerv_cli.base.leftovers import remove
-    from kerv_cli.base.places import results_dir
     from kerv_cli.lab.store import ROLLOUTS, STUDIES, stores
 
     paths = _left_over(settings)

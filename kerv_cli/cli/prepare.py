@@ -11,10 +11,10 @@ from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import PrepareSettings
 from kerv_cli.cli.command import command, typer_command
-from kerv_cli.cli.common import ShowPlan, called, in_same, print_table
+from kerv_cli.cli.common import ShowPlan, kerv_command, print_table, results_word
 
-OWN = ("for", "steps")
-"""Settings that the steps do not take; those of demonstrations are for all but the certificate."""
+NOT_OF_STEPS = ("for", "steps")
+"""Settings that the steps do not take; demos= is for all of them but the certificate."""
 
 
 def method_names() -> list[str]:
@@ -41,13 +41,13 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
 
     def line(step: Step) -> str:
         """The step's command, as it can be typed alone."""
-        shared = [word for word in words if word.split("=")[0] not in OWN]
+        shared = [word for word in words if word.split("=")[0] not in NOT_OF_STEPS]
         if step.command[-1] == "success":
             shared = [word for word in shared if not word.startswith("demos=")]
         return shlex.join([*step.command, *shared])
 
     steps, name = planned(settings), settings.policy.target
-    rows = [(s.kind, s.state, _minutes(s.seconds) if s.seconds else "", f"{called()} {line(s)}") for s in steps]
+    rows = [(s.kind, s.state, _minutes(s.seconds) if s.seconds else "", f"{kerv_command()} {line(s)}") for s in steps]
     title = f"{name}, about {_minutes(sum(step.seconds for step in steps))} (a guess)"
     print_table(("what", "state", "about", "command"), rows, title)
     if plan:
@@ -56,9 +56,9 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
         # read anew: what was just made decides whether what is made from it is still good
         step = next(step for step in planned(settings) if step.kind == kind)
         if step.state != THERE:
-            typer.echo(f"\n{called()} {line(step)}")
+            typer.echo(f"\n{kerv_command()} {line(step)}")
             run(shlex.split(line(step)))
-    typer.echo(f"\n{name} is ready: {called()} sweep study=own policy.target={name}{in_same(words)}")
+    typer.echo(f"\n{name} is ready: {kerv_command()} sweep study=own policy.target={name}{results_word(words)}")
 
 
 def _minutes(seconds: float) -> str:

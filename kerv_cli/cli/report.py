@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import ReportSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, print_json, print_table
@@ -49,59 +50,53 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page of the studies."""
+    from kerv_cli.cli.sweep import print_study, print_verdict
     from kerv_cli.lab.resolve import study_name
-
-    settings.only = settings.only and study_name(settings.only)
-    from kerv_cli.base.places import results_dir
-    from kerv_cli.cli.sweep import tell_end, tell_table
     from kerv_cli.lab.store import StudyStore
     from kerv_cli.report.report import report as write_report
     from kerv_cli.report.reprice import ASSUMES, repriced_summary
     from kerv_cli.report.tables import rows_of
 
+    settings.only = settings.only and study_name(settings.only)
     if choose:
-        _choose(settings, as_json)
+        _print_choice(settings, as_json)
         return
-    output = write_report(results_dir(settings.results), settings.only, publish, settings.on, settings.loss)
+    results = results_dir(settings.results)
+    output = write_report(results, settings.only, publish, settings.on, settings.loss)
     if as_json:
         tables = {name: rows_of(table) for name, table in output.tables.items()}
         priced = {} if output.priced is None else {"priced": rows_of(output.priced)}
         print_json({"files": output.files, "studies": tables, **priced})
         return
     for name, table in output.tables.items():
-        tell_table(table, StudyStore(results_dir(settings.results), name), words)
+        print_study(table, StudyStore(results, name), words)
     if output.priced is not None:
         summary = repriced_summary(output.priced)
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
-    for path in output.files if files or not output.tables else ():
+    for path in output.files if files else ():
         typer.echo(str(path))
     for name, table in output.tables.items():
         if settings.only is None:
             typer.echo(name)
-        tell_end(table, StudyStore(results_dir(settings.results), name), settings.loss)
+        print_verdict(table, StudyStore(results, name), settings.loss)
 
 
-def _choose(settings: ReportSettings, as_json: bool) -> None:
+def _print_choice(settings: ReportSettings, as_json: bool) -> None:
     """Prints the choice of one study, or of every study that has results."""
-    from kerv_cli.base.errors import UsageError
-    from kerv_cli.base.places import results_dir
-    from kerv_cli.lab.store import StudyStore, begun_studies
-    from kerv_cli.report.decide import choices, sentence, short
-    from kerv_cli.report.tables import load_study, per_task_table, study_table
+    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.report.decide import choices, sentence, short_sentence
+    from kerv_cli.report.report import names_to_report
+    from kerv_cli.report.tables import load_study
 
-    results = results_dir(settings.results)
-    names = [settings.only] if settings.only else begun_studies(results)
-    if not names:
-        raise UsageError(f"no study in {results / 'studies'} has a complete cell: run `kerv sweep study=demo`")
-    answers = {}
-    for name in names:
+    results, answers = results_dir(settings.results), {}
+    for name in names_to_report(results, settings.only):
         data = load_study(StudyStore(results, name))
-        groups = choices(study_table(data), per_task_table(data), settings.loss)
+        groups = choices(data.table, data.per_task, settings.loss)
         answers[name] = [choice.as_dict() for choice in groups]
         if not as_json:
             typer.echo(f"{name}, not beaten in speed and success at once: {', '.join(groups[0].front)}")
             typer.echo(f"  {sentence(groups[0], settings.loss, data.plan.baseline)}")
             for choice in groups[1:]:
-                typer.echo(f"  {short(choice)}")
+                typer.echo(f"  {short_sentence(choice)}")
     if as_json:
         print_json(answers)

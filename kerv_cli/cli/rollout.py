@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,21 +14,21 @@ from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
     at_work,
-    called,
     console,
-    in_same,
+    kerv_command,
     print_json,
     print_notes,
     print_table,
+    results_word,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
+    from kerv_cli.lab.identity import Plain
     from kerv_cli.lab.plan import Cell
     from kerv_cli.lab.resolve import ResolvedStudy
     from kerv_cli.lab.store import StudyStore
-    from kerv_cli.report.tables import Row, StudyData
+    from kerv_cli.report.measures import Row
+    from kerv_cli.report.tables import StudyData
 
 Many = Annotated[bool, typer.Option("-m", "--multirun", help="Comma lists form a grid; every point is run.")]
 
@@ -45,8 +46,6 @@ def rollout(
     words: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
-    from dataclasses import asdict
-
     from kerv_cli.base.config import to_yaml
     from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
@@ -70,10 +69,10 @@ def rollout(
         return
     arguments = ["rollout", *(["-m"] if multirun else []), *words]
     store = run_cells(resolved, cells, arguments)
-    _tell(store, cells, as_json, in_same(words))
+    _print_rollout(store, cells, as_json, results_word(words))
 
 
-def _stressed(settings: Mapping[str, Any]) -> str:
+def _stressed(settings: Plain) -> str:
     """The stress in plain RolloutSettings, as text behind a setting's label; empty without one."""
     from kerv_cli.lab.identity import stress_of
 
@@ -82,8 +81,8 @@ def _stressed(settings: Mapping[str, Any]) -> str:
 
 
 def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
-    """The cells of a study, after everything that can be refused without running was. Says on standard error what it
-    comes to, and which tasks a policy was not trained on."""
+    """The cells of a study. Everything that can be refused before an episode runs is refused here. Prints the number of
+    episodes, and the tasks that a policy was not trained on, to standard error."""
     from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import unseen_tasks
     from kerv_cli.worlds import resolve_tasks
@@ -121,7 +120,7 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
 
 
 def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) -> StudyStore:
-    """Runs a rollout's cells, going on where the same command was interrupted -> where they are stored.
+    """Runs a rollout's cells, or those that the same command left when it was interrupted -> their store.
 
     Raises:
         Interrupted: Ctrl-C. KervError: an episode failed.
@@ -138,28 +137,28 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) 
     return store
 
 
-def _tell(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+def _print_rollout(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
     from kerv_cli.report.measures import MICRO
-    from kerv_cli.report.summary import summary_table
-    from kerv_cli.report.tables import load_study, per_task_table, rows_of, study_table
+    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.tables import load_study, rows_of
 
     data = load_study(store)
-    table, per_task = study_table(data), rows_of(per_task_table(data))
-    whole = rows_of(table, MICRO)
+    whole, per_task = rows_of(data.table, MICRO), rows_of(data.per_task)
     if as_json:
         print_json({"run": store.name, "folder": store.root, "settings": whole, "tasks": per_task,
                     "recordings": store.recordings})  # fmt: skip
         return
     if len(data.plan.labels) > 1:
-        console().print(summary_table(table))
+        console().print(SummaryTable(data.table))
     else:
-        _single(data, per_task, whole[0])
-    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {called()} runs show {store.name}{where}")
+        _print_setting(data, per_task, whole[0])
+    show = f"{kerv_command()} runs show {store.name}{where}"
+    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")
     if store.recordings:
-        typer.echo(f"{len(store.recordings)} recordings; open one with: {called()} view {store.recordings[0]}")
+        typer.echo(f"{len(store.recordings)} recordings; open one with: {kerv_command()} view {store.recordings[0]}")
 
 
-def _single(data: StudyData, per_task: list[Row], whole: Row) -> None:
+def _print_setting(data: StudyData, per_task: list[Row], whole: Row) -> None:
     """Figures of a run with one setting: by task, and time by phase."""
     from kerv_cli.engine.record import PHASES
     from kerv_cli.lab.identity import batch_of

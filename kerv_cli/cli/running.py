@@ -21,8 +21,8 @@ from kerv_cli.report.viewing import save_recording
 def running(
     store: StudyStore, cells: Sequence[Cell], runtime: RuntimeSettings
 ) -> Iterator[Callable[[Sequence[Cell]], Outcome]]:
-    """Yields what runs those of the cells that are not complete. The cells of a rollout share a decoder, and the first
-    failure ends it.
+    """Yields the function that runs those of its cells that are not complete. The cells of a rollout share a decoder,
+    and the first failure ends it.
 
     Raises:
         Interrupted: Ctrl-C. KervError: a rollout's episode failed. StorageError: the disk refused.

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kerv_cli.base.errors import Interrupted, UsageError
+from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import CommandSettings, ImportSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, called, console, in_same, print_json, print_table
+from kerv_cli.cli.common import AsJson, ShowPlan, console, kerv_command, print_json, print_table, results_word
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,12 +37,12 @@ def run_ids() -> list[str]:
     return [run.id for run in find_runs("results")]
 
 
-def _of_runs(name: str, *examples: str) -> Callable[[F], F]:
+def _command_on_runs(name: str, *examples: str) -> Callable[[F], F]:
     """Declares a command whose names are runs."""
     return command(f"runs {name}", names=RUNS, completes=run_ids, keys="results", examples=examples)
 
 
-def _runs(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
+def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
     """The names as those of runs. Raises UsageError: too few or too many."""
     from kerv_cli.lab.resolve import study_name
 
@@ -61,7 +63,7 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
             raise UsageError(f"'{word}' is no filter: write kind=, method=, task=, state= or since=")
     runs = matching(find_runs(settings.results), dict(word.split("=", 1) for word in names))
     if as_json:
-        print_json([_plain(run) for run in runs])
+        print_json([_entry_row(run) for run in runs])
         return
     if not runs:
         typer.echo(f"no runs in {settings.results}" + (" that agree" if names else ""))
@@ -79,37 +81,33 @@ def _few(names: tuple[str, ...]) -> str:
 
 
 def _headline(run: RunEntry) -> str:
-    for name in ("success", "score"):
-        if name in run.figures:
-            value = run.figures[name]
-            return f"success {value:.0%}" if name == "success" else f"score {value:.4g}"
-    return ""
+    if "success" in run.figures:
+        return f"success {run.figures['success']:.0%}"
+    return f"score {run.figures['score']:.4g}" if "score" in run.figures else ""
 
 
-def _plain(run: RunEntry) -> dict[str, Any]:
-    from dataclasses import asdict
-
+def _entry_row(run: RunEntry) -> dict[str, object]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
-@_of_runs("show", "kerv runs show last", "kerv runs show main --json")
+@_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
     from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
-    from kerv_cli.report.summary import summary_table
-    from kerv_cli.report.tables import load_study, rows_of, study_table
+    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.tables import load_study, rows_of
 
-    results, (name,) = settings.results, _runs(names)
+    results, (name,) = settings.results, _run_names(names)
     chosen = sides(results, name)
     run = chosen[0].run
-    table = study_table(load_study(store_of(run))) if run.has_episodes and run.episodes else None
+    table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
     if table is not None:
         table = table[table["label"].isin([side.label for side in chosen])]
     size, origin = disk_bytes(run.folder), parents(run, find_runs(results))
     if as_json:
         rows = [] if table is None else rows_of(table)
-        print_json({**_plain(run), "made_from": origin, "bytes": size, "settings": rows})
+        print_json({**_entry_row(run), "made_from": origin, "bytes": size, "settings": rows})
         return
     line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
@@ -117,20 +115,20 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": line} | parts).items():
         typer.echo(f"{name:<9} {value}")
     if table is not None:
-        console().print(summary_table(table))
+        console().print(SummaryTable(table))
     elif run.figures:
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
-@_of_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
+@_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: what differs in settings beside what differs in results, with intervals."""
     from kerv_cli.report import compare as comparing
 
-    runs = _runs(names, 2, 2, "two runs, ID or ID:SETTING")
+    runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(settings.results, *runs)]
     if as_json:
-        print_json([comparing.as_plain(comparison) for comparison in comparisons])
+        print_json([asdict(comparison) for comparison in comparisons])
         return
     for comparison in comparisons:
         typer.echo(f"\n{comparison.first}  →  {comparison.second}")
@@ -138,14 +136,12 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
         _print_results(comparison)
 
 
-@_of_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
+@_command_on_runs("diff", "kerv runs diff main:ar main:kerv", "kerv runs diff main last")
 def diff(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show what differs between two runs in settings, weights, machine and versions."""
-    from dataclasses import asdict
-
     from kerv_cli.report import compare as comparing
 
-    pairs = comparing.pairs_to_compare(settings.results, *_runs(names, 2, 2, "two runs, ID or ID:SETTING"))
+    pairs = comparing.pairs_to_compare(settings.results, *_run_names(names, 2, 2, "two runs, ID or ID:SETTING"))
     by_pair = {f"{a.name} → {b.name}": comparing.differences(a, b) for a, b in pairs}
     if as_json:
         print_json({name: [asdict(difference) for difference in rows] for name, rows in by_pair.items()})
@@ -164,15 +160,17 @@ def _print_differences(rows: list[Difference]) -> None:
 
 
 def _print_results(comparison: Comparison) -> None:
+    from kerv_cli.report.tables import is_number
+
     rows = []
     for row in comparison.results:
-        interval = f"{row['low']:.3g} to {row['high']:.3g}" if row.get("low") == row.get("low") and "low" in row else ""
+        interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
         numbers = (f"{row[name]:.4g}" for name in ("first", "second", "change"))
         rows.append((row["measure"], *numbers, interval, row.get("what", "")))
     print_table(("measure", "first", "second", "change", "95 % interval", ""), rows)
 
 
-@_of_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
+@_command_on_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
 def rerun(
     settings: CommandSettings, names: list[str], words: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
@@ -180,7 +178,7 @@ def rerun(
     from kerv_cli.lab.catalogue import find_run
     from kerv_cli.lab.store import IMPORT
 
-    results, (name,) = settings.results, _runs(names)
+    results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
     if run.is_training:
         _train_again(run, results, plan, as_json)
@@ -204,7 +202,7 @@ def rerun(
         print_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
         return
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
-    typer.echo(f"both side by side: {called()} runs compare {run.id} {entry.id}{in_same(words)}")
+    typer.echo(f"both side by side: {kerv_command()} runs compare {run.id} {entry.id}{results_word(words)}")
 
 
 def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None:
@@ -214,12 +212,12 @@ def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None
     run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
 
 
-@_of_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
+@_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after a question."""
     from kerv_cli.lab.catalogue import check_removable, disk_bytes, find_run, remove
 
-    runs = [find_run(settings.results, name, exact=yes) for name in _runs(names, 1, 1000)]
+    runs = [find_run(settings.results, name, exact=yes) for name in _run_names(names, 1, 1000)]
     for run in runs:
         check_removable(run)
     total = sum(disk_bytes(run.folder) for run in runs)
@@ -236,16 +234,15 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@_of_runs("export", "kerv runs export last", "kerv runs export main --to mlflow")
+@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to mlflow")
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
     """Hand a run to a tracker, or write its episodes or its curves as CSV."""
-    from kerv_cli.base.places import results_dir
     from kerv_cli.lab.catalogue import find_run
     from kerv_cli.report.export import export as hand_over
 
-    (name,) = _runs(names)
+    (name,) = _run_names(names)
     folder = folder or results_dir(settings.results) / "exports" / to
     run_names = hand_over(find_run(settings.results, name), to, folder)
     if as_json:
@@ -269,22 +266,21 @@ def export(
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Read evaluations of vla-eval as a study, whose episodes are paired as those of a sweep are."""
-    from kerv_cli.base.places import results_dir
     from kerv_cli.lab import imported
     from kerv_cli.lab.store import IMPORT, StudyStore
-    from kerv_cli.report.summary import summary_table
-    from kerv_cli.report.tables import load_study, rows_of, study_table
+    from kerv_cli.report.summary import SummaryTable
+    from kerv_cli.report.tables import load_study, rows_of
 
     if not names:
         raise UsageError("name a recording of vla-eval: kerv runs import recording-ID.sqlite")
     sides = imported.sides_of([imported.read_evaluations(Path(name)) for name in names], settings.labels)
     results, name = results_dir(settings.results), settings.name or imported.study_name(sides)
     notes = imported.write_study(results, name, sides, settings.baseline, [*IMPORT, *names])
-    table = study_table(load_study(StudyStore(results, name)))
+    table = load_study(StudyStore(results, name)).table
     if as_json:
         print_json({"study": name, "notes": notes, "settings": rows_of(table)})
         return
     for line in notes:
         typer.echo(line)
-    console().print(summary_table(table))
-    typer.echo(f"study {name}: {called()} report study={name}, {called()} report --choose study={name}")
+    console().print(SummaryTable(table))
+    typer.echo(f"study {name}: {kerv_command()} report study={name}, {kerv_command()} report --choose study={name}")

@@ -13,8 +13,8 @@ from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
     at_work,
-    called,
     console,
+    kerv_command,
     print_json,
     print_notes,
     print_table,
@@ -63,7 +63,7 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
         print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
         return
     outcome = run_covered(resolved, covered, store, words)
-    _tell(outcome, resolved, covered.cells, store, words, as_json)
+    _print_outcome(outcome, resolved, covered.cells, store, words, as_json)
     if outcome.failed:
         raise typer.Exit(1)
 
@@ -78,8 +78,9 @@ def print_settings(resolved: ResolvedStudy) -> None:
 
 
 def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore, Covered]:
-    """The study's store, and its cells as those on disk and those to run, after everything that can be refused without
-    running was. Says what has no effect and which cells disagree. words: of the command."""
+    """The study's store, and its cells: those on disk and those to run. Everything that can be refused before an
+    episode runs is refused here. Prints which overrides have no effect and which cells disagree. words: of the
+    command."""
     from kerv_cli.cli.rollout import planned_cells
     from kerv_cli.lab.resolve import idle_overrides
     from kerv_cli.lab.reuse import Stock, cover, disagreements
@@ -110,7 +111,7 @@ def _list_studies(as_json: bool) -> None:
         print_json([dict(zip((*columns[:5], "title"), row, strict=True)) for row in rows])
         return
     print_table(columns, rows, "episodes: per task; in all: settings x tasks x episodes")
-    typer.echo(f"run one, e.g.: {called()} sweep study=demo; what it would do: --plan")
+    typer.echo(f"run one, e.g.: {kerv_command()} sweep study=demo; what it would do: --plan")
 
 
 def _warn(lines: Iterable[str]) -> None:
@@ -145,7 +146,11 @@ def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json:
 
 
 def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
-    """Runs what is not complete yet; says what differs from what it was before. Raises Interrupted: Ctrl-C."""
+    """Runs the cells that are not complete; warns of results that differ from earlier ones.
+
+    Raises:
+        Interrupted: Ctrl-C.
+    """
     from kerv_cli.cli.running import running
     from kerv_cli.lab.reuse import Stock, disagreements, take_over
 
@@ -155,7 +160,7 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, wo
         store.write_plan(resolved.study, cells)
     store.note_command(["sweep", *words])
     with running(store, cells, resolved.first.runtime) as run:
-        outcome = _until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
+        outcome = _run_until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
     if not outcome.failed:
         store.note_finished()
     if resolved.sweep.rerun != "never":
@@ -163,17 +168,18 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, wo
     return outcome
 
 
-def _until_decided(
+def _run_until_decided(
     resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, run: Callable[[list[Cell]], Outcome]
 ) -> Outcome:
-    """Runs block after block of seeds, without the settings whose question is answered; the plan holds what was run."""
+    """Runs block after block of seeds and leaves out the settings that are decided. The plan holds the cells that
+    ran."""
     from kerv_cli.lab.events import Outcome
     from kerv_cli.report import decide
     from kerv_cli.report.tables import load_study
 
     study, margin = resolved.study, resolved.sweep.loss / 100
     blocks = decide.looks_of(cells, study.block)
-    typer.echo(decide.rule(resolved.sweep.loss, len(blocks)), err=True)
+    typer.echo(decide.stopping_rule(resolved.sweep.loss, len(blocks)), err=True)
     latest: dict[str, decide.Verdict] = {}
     planned: list[Cell] = []
     total = Outcome()
@@ -187,7 +193,7 @@ def _until_decided(
         if outcome.failed:
             return total
         verdicts = decide.verdicts(load_study(store, planned), open_labels, margin, look, len(blocks))
-        typer.echo(f"look {look} of {len(blocks)}: {decide.summary(verdicts)}", err=True)
+        typer.echo(f"look {look} of {len(blocks)}: {decide.progress_line(verdicts)}", err=True)
         latest |= {verdict.label: verdict for verdict in verdicts}
         decide.write_verdicts(store.root, latest, resolved.sweep.loss, len(blocks))
         open_labels = [verdict.label for verdict in verdicts if verdict.verdict == decide.OPEN]
@@ -196,13 +202,13 @@ def _until_decided(
     return total
 
 
-def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
-    """Prints a study's table, what is to be seen in it, and how times that it lacks are measured. words: of the
-    command, for the one that is named."""
-    from kerv_cli.report.summary import not_in_turn, summary_table
+def print_study(table: DataFrame, store: StudyStore, words: list[str]) -> None:
+    """Prints a study's table, its note, and the command that measures the times which it lacks. words: of the present
+    command."""
+    from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import values_of
 
-    console().print(summary_table(table))
+    console().print(SummaryTable(table))
     codes, commits = values_of(table, "code"), values_of(table, "git_commit")
     if len(codes) > 1:
         names = ", ".join(sorted(commit[:12] for commit in commits))
@@ -216,7 +222,7 @@ def tell_table(table: DataFrame, store: StudyStore, words: list[str]) -> None:
         typer.echo(f"\n{note}\n")
 
 
-def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
+def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
     """Prints the last three lines of a study: the verdict, the page to open, the recording to watch."""
     from kerv_cli.report.page import verdict
 
@@ -224,34 +230,36 @@ def tell_end(table: DataFrame, store: StudyStore, loss: float) -> None:
     typer.echo(f"page: {store.root / 'report.html'}")
     recordings = store.recordings
     mend = "" if store.is_imported else "; the same sweep with record=1 rerun=all does that"
-    typer.echo(f"watch: {f'{called()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
+    typer.echo(f"watch: {f'{kerv_command()} view {recordings[0]}' if recordings else f'nothing is recorded{mend}'}")
 
 
-def _tell(
+def _print_outcome(
     outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
 ) -> None:
-    from kerv_cli.report.tables import load_study, rows_of, study_table
+    from kerv_cli.report.tables import load_study, rows_of
 
     complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
-    table = study_table(load_study(store, [cell for cell in cells if cell.id in complete])) if complete else None
+    data = load_study(store, [cell for cell in cells if cell.id in complete]) if complete else None
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
-        rows = [] if table is None else rows_of(table)
+        rows = [] if data is None else rows_of(data.table)
         print_json({"study": store.name, "folder": store.root, "cells": counts, "settings": rows,
                     "recordings": store.recordings})  # fmt: skip
     else:
-        if table is not None:
-            tell_table(table, store, words)
+        if data is not None:
+            print_study(data.table, store, words)
         episodes, minutes = sum(len(cell.seeds) for cell in outcome.done), outcome.seconds / 60
         if episodes and minutes:
             typer.echo(f"{episodes} episodes in {minutes:.1f} min: {episodes / minutes:.0f} per minute")
         typer.echo(f"{counts['run']} cells run, {counts['reused']} reused, {counts['failed']} failed")
-        if table is not None and not outcome.failed:
+        if data is not None and not outcome.failed:
             with at_work("writing the page"):
-                from kerv_cli.report.report import report
+                from kerv_cli.report.report import write_study
 
-                report(store.root.parent.parent, store.name, loss=resolved.sweep.loss)
-            tell_end(table, store, resolved.sweep.loss)
+                # the study may hold tasks of other sweeps
+                is_whole = [cell.id for cell in data.plan.cells] == [cell.id for cell in store.read_plan().cells]
+                write_study(store, data if is_whole else load_study(store), resolved.sweep.loss)
+            print_verdict(data.table, store, resolved.sweep.loss)
     for failure in outcome.failed:
         reason = runnable(failure.reason, words)
         typer.echo(f"kerv: {failure.cell.label} on {failure.cell.task}: {reason}", err=True)

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import ViewSettings
 from kerv_cli.cli.command import command
 
@@ -36,14 +37,13 @@ def view(
     """Open recordings in the Rerun viewer; without a display, name the command that serves them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary, serve_web
 
-    places = [Path(name) for name in names] or [Path(settings.results)]
+    paths = [Path(name) for name in names] or [Path(settings.results)]
     if together:
-        from kerv_cli.base.places import check_writable, results_dir
         from kerv_cli.report.viewing.together import save_together
 
         check_writable(settings.results)
-        places = [save_together(places, results_dir(settings.results) / "together")]
-    recordings = find_recordings(places)
+        paths = [save_together(paths, results_dir(settings.results) / "together")]
+    recordings = find_recordings(paths)
     if summary:
         for recording in recordings:
             typer.echo(read_summary(recording))

@@ -132,7 +132,7 @@ def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings
 OnCellStep = Callable[[Cell, int, int], None]
 """Told the cell, the seed and the number of control steps executed, after each of them."""
 
-Save = Callable[[EpisodeRecord, Path, str, Mapping[str, float]], None]
+Save = Callable[[EpisodeRecord, Path, str, Mapping[str, float]], object]
 """Writes a recording: the record of the episode, the .rrd file, the label of the setting, and the limits that its
 signals are compared with."""
 

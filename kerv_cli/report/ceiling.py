@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import astuple, dataclass
-from typing import Any
 
 import pandas as pd
 
 from kerv_cli.base.settings import MODEL
+from kerv_cli.lab.identity import Plain
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Ceiling:
     prefill: float
     one_token: float  # T_1, a forward over one token
     tokens: float  # N
-    own: float  # the method's prefill with its draft, or its verification
+    forward: float  # the method's prefill with its draft, or its verification
     in_prefill: float = 0.0  # 1: the method has an in-prefill draft
     chunks: float = 1.0  # H of the method / H of the baseline
 
@@ -34,13 +33,13 @@ class Ceiling:
     def value(self) -> float:
         """Ratio of times per control step; NaN where a part is missing."""
         baseline = self.overhead + self.prefill + (self.tokens - 1) * self.one_token
-        least = self.overhead + (0.0 if self.in_prefill else self.prefill) + self.own
+        least = self.overhead + (0.0 if self.in_prefill else self.prefill) + self.forward
         return self.chunks * baseline / least if least > 0 else math.nan
 
     def columns(self) -> dict[str, float]:
         """For a row of a table: the ceiling, and its times in milliseconds per decode."""
-        times = ("overhead", "prefill", "one_token", "own")
-        parts = {f"ceiling_ms.{name}": 1000.0 * getattr(self, name) for name in times}
+        fields = {"overhead": "overhead", "prefill": "prefill", "one_token": "one_token", "own": "forward"}
+        parts = {f"ceiling_ms.{name}": 1000.0 * getattr(self, field) for name, field in fields.items()}
         return {"ceiling": self.value, "ceiling_tokens": self.tokens, **parts}
 
 
@@ -86,7 +85,7 @@ def _parts(episodes: pd.DataFrame, baseline: pd.DataFrame, in_prefill: bool, chu
         prefill=_seconds(baseline, "prefill") / decodes,
         one_token=one_token,
         tokens=float(baseline["forwards"].sum()) / decodes,
-        own=verification if verification > 0 else math.nan,
+        forward=verification if verification > 0 else math.nan,
         in_prefill=float(in_prefill),
         chunks=chunks,
     )
@@ -96,23 +95,23 @@ def _seconds(episodes: pd.DataFrame, phase: str) -> float:
     return float(episodes[f"seconds.{phase}"].sum(skipna=False))  # NaN where an episode was not timed
 
 
-def is_autoregressive(settings: Mapping[str, Any]) -> bool:
+def is_autoregressive(settings: Plain) -> bool:
     """Whether a setting is a model that decodes token by token: nothing drafts, nothing is skipped."""
     drafts = any(kind_of(settings, part) != "none" for part in ("prefill_draft", "proposer", "skip"))
     return not drafts and settings["policy"].get("kind", MODEL) == MODEL
 
 
-def verifies_in_prefill(settings: Mapping[str, Any]) -> bool:
+def verifies_in_prefill(settings: Plain) -> bool:
     """Whether a setting drafts before the prefill."""
     return kind_of(settings, "prefill_draft") != "none"
 
 
-def kind_of(settings: Mapping[str, Any], part: str) -> str:
+def kind_of(settings: Plain, part: str) -> str:
     """Kind of a setting's part; `none` for stored settings that are older than that part."""
     return str(settings.get(part, {"kind": "none"})["kind"])
 
 
-def chunk_ratio(settings: Mapping[str, Any], baseline: Mapping[str, Any]) -> float:
+def chunk_ratio(settings: Plain, baseline: Plain) -> float:
     """H over the baseline's H; NaN if only one of them is the target's default."""
     steps, baseline_steps = settings.get("chunk") or 0, baseline.get("chunk") or 0
     if steps == baseline_steps:

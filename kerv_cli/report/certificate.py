@@ -25,6 +25,7 @@ from kerv_cli.methods.certified.betting import more_to_decide, p_value
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
 from kerv_cli.report.measures import paired
+from kerv_cli.report.statistics import MOST_PAIRS
 from kerv_cli.report.tables import load_study
 from kerv_cli.worlds import resolve_tasks, spec_of
 
@@ -120,7 +121,7 @@ def write(folder: Path, certificate: Certificate) -> Path:
     return path
 
 
-def verdicts(certificate: Certificate) -> list[dict[str, str]]:
+def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
     """A row per candidate, as text."""
     return [
         {
@@ -131,14 +132,17 @@ def verdicts(certificate: Certificate) -> list[dict[str, str]]:
             "p": "not tested"
             if one.p is None
             else f"{one.p:.3g}" + (" certified" if one.p <= certificate.delta else ""),
-            "pairs needed": ""
-            if not one.needed
-            else f"about {one.needed} more"
-            if one.needed > 0
-            else "not at these rates",
+            "pairs needed": _needed_text(one.needed),
         }
         for one in certificate.candidates
     ]
+
+
+def _needed_text(pairs: int) -> str:
+    """`Candidate.needed` in words."""
+    if pairs > MOST_PAIRS:
+        return f"more than {MOST_PAIRS:,}"
+    return {0: "", -1: "not at these rates"}.get(pairs, f"about {pairs} more")
 
 
 def _lengths(episodes: pd.DataFrame) -> dict[str, list[int]]:
@@ -152,7 +156,7 @@ def _bound(margin: float) -> float:
 
 
 def _values(both: np.ndarray) -> np.ndarray:
-    """(n, 2) success of AR and of the rule -> v (n,) = (1 + AR − rule) / 2, in an order that knows no task."""
+    """(n, 2) success of AR and of the rule -> v (n,) = (1 + AR − rule) / 2, in an order that no task decides."""
     values = (1 + both[:, 0] - both[:, 1]) / 2
     seed = int.from_bytes(hashlib.sha256(str(len(values)).encode()).digest()[:4], "big")
     return np.random.default_rng(seed).permutation(values)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import pandas as pd
 
@@ -14,7 +12,7 @@ from kerv_cli.base.files import read_table
 from kerv_cli.lab.catalogue import RunEntry, description_of, find_run, store_of
 from kerv_cli.lab.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.plan import Cell, seeds_text
-from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.measures import MICRO, Row, measure
 from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, flatten, is_number, load_study
 
@@ -24,11 +22,13 @@ _STATUS_KEYS = ("host", "device_name", "git_commit", "torch_version", "mujoco_ve
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison: a run, and one of its settings unless it is a training."""
+    """One side of a comparison: a run, and one of its settings unless it is a training. data: of the run's episodes,
+    read by `pairs_to_compare`."""
 
     name: str
     run: RunEntry
     label: str = ""
+    data: StudyData | None = None
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Difference:
     """A setting, weight, machine or version in which the two sides differ. `None`: that side lacks it."""
 
     key: str
-    first: Any
-    second: Any
+    first: object
+    second: object
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Comparison:
     first: str
     second: str
     settings: list[Difference]
-    results: list[dict[str, Any]]
+    results: list[Row]
 
 
 def sides(results: str, name: str) -> list[Side]:
@@ -76,29 +76,26 @@ def pairs_to_compare(results: str, first: str, second: str) -> list[tuple[Side, 
     second run's.
 
     Raises:
-        UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes.
+        UsageError, UnknownName: no such run or setting. UsageError: a training beside a run with episodes, or a run
+            without complete cells. CheckpointError: a damaged one.
     """
     ours, theirs = sides(results, first), sides(results, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
         raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: one of them has no episodes")
-    shared = [(a, b) for a in ours for b in theirs if a.label == b.label]
-    if len(shared) > 1 or (shared and len(ours) == len(theirs) == 1):
-        return shared
-    return [(ours[0], side) for side in theirs if side != ours[0]]
+    pairs = [(a, b) for a in ours for b in theirs if a.label == b.label]
+    if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
+        pairs = [(ours[0], side) for side in theirs if side != ours[0]]
+    runs = {side.run.id: side.run for side in (ours[0], theirs[0]) if side.run.has_episodes}
+    data = {name: load_study(store_of(run)) for name, run in runs.items()}
+    return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
 
 
 def compare(first: Side, second: Side) -> Comparison:
-    """The differences between two sides.
-
-    Raises:
-        UsageError: a run without complete cells. CheckpointError: a damaged one.
-    """
-    if not first.run.has_episodes:
+    """The differences between two sides. Raises UsageError: a setting without complete cells."""
+    if first.data is None or second.data is None:
         rows = _training_results(first.run, second.run)
     else:
-        rows = _episode_results(
-            load_study(store_of(first.run)), first.label, load_study(store_of(second.run)), second.label
-        )
+        rows = _episode_results(first.data, first.label, second.data, second.label)
     return Comparison(first.name, second.name, differences(first, second), rows)
 
 
@@ -109,33 +106,28 @@ def differences(first: Side, second: Side) -> list[Difference]:
     return [Difference(k, ours.get(k), theirs.get(k)) for k in keys if ours.get(k) != theirs.get(k)]
 
 
-def _settings_of(side: Side) -> dict[str, Any]:
-    if not side.run.has_episodes:
+def _settings_of(side: Side) -> Row:
+    if side.data is None:
         description = description_of(side.run)
-        settings: dict[str, Any] = dict(description.get("settings", {}))
+        settings: Row = dict(description.get("settings", {}))
         settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
         return flatten(settings)
-    store = store_of(side.run)
-    cells = [cell for cell in store.read_plan().cells if cell.label == side.label]
-    cell = cells[0]
-    settings = flatten(without(cell.settings, NOT_DETERMINING - {"policy", "method"}))
-    weights = {name: value[:12] for name, value in cell.identity.items() if name != OBSERVATION}
-    return {**settings, **weights, **_tasks_and_seeds(cells), **_circumstances(side, cells)}
+    cells = [cell for cell in side.data.plan.cells if cell.label == side.label]
+    settings = flatten(without(cells[0].settings, NOT_DETERMINING - {"policy", "method"}))
+    weights = {name: value[:12] for name, value in cells[0].identity.items() if name != OBSERVATION}
+    statuses = [side.data.cells[cell.id].status for cell in side.data.complete.get(side.label, ())]
+    circumstances = {
+        key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS if statuses
+    }
+    return {**settings, **weights, **_tasks_and_seeds(cells), **circumstances}
 
 
-def _tasks_and_seeds(cells: list[Cell]) -> dict[str, Any]:
+def _tasks_and_seeds(cells: list[Cell]) -> Row:
     tasks = ";".join(sorted({cell.task for cell in cells}))
     return {"tasks": tasks, "seeds": seeds_text(seed for cell in cells for seed in cell.seeds)}
 
 
-def _circumstances(side: Side, cells: list[Cell]) -> dict[str, Any]:
-    store = store_of(side.run)
-    stored, _ = store.read_cells(cells)
-    statuses = [cell.status for cell in stored.values()]
-    return {key: ";".join(sorted({str(status.get(key, "")) for status in statuses})) for key in _STATUS_KEYS}
-
-
-def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[dict[str, Any]]:
+def _episode_results(first: StudyData, ours: str, second: StudyData, theirs: str) -> list[Row]:
     baseline, episodes = _episodes(first, ours), _episodes(second, theirs)
     if baseline.empty or episodes.empty:
         raise UsageError("one of the two settings has no complete cell: run it to the end first")
@@ -159,7 +151,7 @@ def _episodes(data: StudyData, label: str) -> pd.DataFrame:
     return data.episodes[data.episodes["label"] == label]
 
 
-def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> Iterator[dict[str, Any]]:
+def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> Iterator[Row]:
     """The speedups of both settings against the baselines of their runs, and how far they differ: of two runs of one
     study, how far these agree."""
     a, b = (
@@ -173,13 +165,13 @@ def _speedups(first: StudyData, ours: str, second: StudyData, theirs: str) -> It
                    "change": b[column] / a[column], "what": "ratio of the speedups"}  # fmt: skip
 
 
-def _row(name: str, first: float, second: float, measured: dict[str, Any], column: str, what: str) -> dict[str, Any]:
+def _row(name: str, first: float, second: float, measured: Row, column: str, what: str) -> Row:
     low, high = measured[f"{column}_low"], measured[f"{column}_high"]
     return {"measure": name, "first": first, "second": second, "change": measured[column], "low": low, "high": high,
             "what": what}  # fmt: skip
 
 
-def _training_results(first: RunEntry, second: RunEntry) -> list[dict[str, Any]]:
+def _training_results(first: RunEntry, second: RunEntry) -> list[Row]:
     names = [name for name in first.figures if name in second.figures]
     return [
         {"measure": name, "first": first.figures[name], "second": second.figures[name],
@@ -209,8 +201,3 @@ def _tokens(run: RunEntry) -> dict[tuple[str, str, int, int], list[list[int]]]:
         for seed, group in decodes.groupby("seed"):
             tokens[cell.label, cell.task, int(str(seed)), cell.repeat] = [list(row) for row in group["tokens"]]
     return tokens
-
-
-def as_plain(comparison: Comparison) -> dict[str, Any]:
-    """A comparison for JSON."""
-    return dataclasses.asdict(comparison)

@@ -65,7 +65,7 @@ def loss_figure(losses: Sequence[float], title: str) -> Figure:
     return figure
 
 
-def save_curves(folder: Path, losses: Sequence[float] = ()) -> Path:
+def save_curves(folder: Path, losses: Sequence[float]) -> Path:
     """Writes `curves.png` beside a training's log.csv -> its path. losses: of every step; drawn where there are fewer
     than `_FEW` validations.
 

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any
 
 import pandas as pd
 
@@ -24,8 +23,8 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_json, write_json
 from kerv_cli.lab.plan import Cell
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import MICRO, pair_counts, paired
-from kerv_cli.report.tables import Row, StudyData, is_baseline, is_number, rows_of
+from kerv_cli.report.measures import MICRO, Row, pair_counts, paired
+from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 from kerv_cli.report.text import interval
 
 POINTS = 100.0
@@ -52,7 +51,7 @@ class Choice:
     episode_speedup_low: float
     episode_speedup_high: float
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Row:
         """For JSON."""
         return {**asdict(self), "front": ";".join(self.front)}
 
@@ -61,7 +60,7 @@ def choices(study: pd.DataFrame, per_task: pd.DataFrame | None, loss: float) -> 
     """The suite's choice, then each task's.
 
     Args:
-        study, per_task: the tables of `tables.study_table` and `tables.per_task_table`; None: the suite alone.
+        study, per_task: a study's table, and that by task; None: the suite alone.
         loss: bound on the loss of success, points.
     """
     suite = rows_of(study, MICRO)
@@ -100,12 +99,12 @@ def safest_first(rows: Sequence[Row]) -> list[Row]:
 
 
 def _unverified(row: Row) -> float:
-    """Share in whole per cent; all where nothing decodes."""
+    """Share of unverified tokens, rounded to a per cent; 1 where nothing decodes."""
     return round(float(row["unverified_share"]), 2) if is_number(row["unverified_share"]) else 1.0
 
 
 def _fastest(rows: Sequence[Row]) -> Row | None:
-    """The fastest of settings in the order of their tests; the last where none is timed."""
+    """The fastest of settings, which are in the order of their tests; where none is timed, the last of them."""
     return max(reversed(rows), key=lambda row: row[SPEED] if is_number(row[SPEED]) else -math.inf, default=None)
 
 
@@ -145,7 +144,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
     return f"{choice.pairs} pairs do not yet show a setting that is faster and {bound}; {_missing(choice)}"
 
 
-def short(choice: Choice) -> str:
+def short_sentence(choice: Choice) -> str:
     """The choice for one task in a few words."""
     if choice.chosen:
         return f"{choice.where}: {choice.chosen}"
@@ -158,6 +157,8 @@ def _missing(choice: Choice) -> str:
     if not choice.candidate:
         return "more would not show one"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
+    if more > stats.MOST_PAIRS:
+        return f"more than {stats.MOST_PAIRS:,} pairs would be needed to show it for {choice.candidate}"
     return f"about {more} more would show it for {choice.candidate} at the present rates"
 
 
@@ -241,7 +242,7 @@ def read_verdicts(folder: Path) -> pd.DataFrame | None:
     return pd.DataFrame(read_json(path)["settings"]) if path.is_file() else None
 
 
-def rule(loss: float, looks: int) -> str:
+def stopping_rule(loss: float, looks: int) -> str:
     """The stopping rule in one sentence."""
     confidence = 100 * confidence_of_a_look(looks)
     return (
@@ -251,7 +252,7 @@ def rule(loss: float, looks: int) -> str:
     )
 
 
-def summary(answers: Sequence[Verdict]) -> str:
+def progress_line(answers: Sequence[Verdict]) -> str:
     """Verdicts in one line, for progress."""
     clauses = [f"{v.label}: {v.verdict} after {v.pairs} pairs" for v in answers if v.verdict != OPEN]
     waiting = sum(v.verdict == OPEN for v in answers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from PIL import Image
 
 from kerv_cli.base.files import atomic_path
 from kerv_cli.base.registry import parts
+from kerv_cli.report.measures import Row
 
 INK, MUTED, GRID = "#1f2933", "#6b7785", "#e3e8ee"
 COLOURS = ("#0b6fb8", "#d1495b", "#2a9d6f", "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
@@ -116,7 +117,7 @@ def place_labels(
 
 
 def _offsets(width: float, height: float, pixels: float) -> Iterator[np.ndarray]:
-    """From a point to the centres of a label around it, pixels, from near to far."""
+    """Vectors from a point to the centre of a label beside it, pixels, from near to far."""
     for distance in _DISTANCES:
         for angle in np.radians(_ANGLES):
             way = np.array([math.cos(angle), math.sin(angle)])
@@ -137,7 +138,7 @@ _COLOUR_COLUMNS = {"policy.kind": "policy", "prefill_draft.kind": "proposer", "p
 """Columns whose parts give a setting its colour -> the kind of those parts."""
 
 
-def setting_colours(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+def setting_colours(rows: Iterable[Row]) -> list[str]:
     """A colour per setting, from its row of a study's table: ink for the baseline; for another the first free colour of
     its parts, else of the palette."""
     colours: list[str] = []

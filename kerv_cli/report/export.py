@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -16,7 +15,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.lab.catalogue import RunEntry, description_of, store_of
 from kerv_cli.report.curves import read_log
 from kerv_cli.report.measures import MICRO
-from kerv_cli.report.tables import flatten, load_study, rows_of, study_table, write_csv
+from kerv_cli.report.tables import flatten, load_study, rows_of, write_csv
 
 PROJECT = "kerv"
 
@@ -28,9 +27,9 @@ class Tracked:
 
     name: str
     group: str
-    config: dict[str, Any]
+    config: Mapping[str, object]
     history: list[tuple[int, dict[str, float]]]
-    summary: dict[str, float] = field(default_factory=dict)
+    summary: dict[str, float]
 
 
 def export(run: RunEntry, to: str, folder: Path) -> list[str]:
@@ -41,11 +40,10 @@ def export(run: RunEntry, to: str, folder: Path) -> list[str]:
     """
     if to not in TRACKERS:
         raise UnknownName("tracker", to, TRACKERS)
-    package, extra, write = TRACKERS[to]
-    if package and importlib.util.find_spec(package) is None:
-        raise UsageError(f"--to {to} needs the package {package}: pip install 'kerv[{extra}]'")
+    if to != "csv" and importlib.util.find_spec(to) is None:
+        raise UsageError(f"--to {to} needs the package {to}: pip install 'kerv[{to}]'")
     folder.mkdir(parents=True, exist_ok=True)
-    return [write(tracked, folder) for tracked in tracked_runs(run)]
+    return [TRACKERS[to](tracked, folder) for tracked in tracked_runs(run)]
 
 
 def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
@@ -54,7 +52,7 @@ def tracked_runs(run: RunEntry) -> Iterator[Tracked]:
         yield _training(run)
         return
     data = load_study(store_of(run))
-    for row in rows_of(study_table(data), MICRO):
+    for row in rows_of(data.table, MICRO):
         episodes = data.episodes[data.episodes["label"] == row["label"]]
         history = []
         for number, episode in enumerate(rows_of(episodes)):
@@ -77,7 +75,7 @@ def _training(run: RunEntry) -> Tracked:
     return Tracked(run.id, run.kind, {"kind": run.kind, **flatten(settings)}, history, dict(run.figures))
 
 
-def _is_measure(value: Any) -> bool:
+def _is_measure(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -125,11 +123,10 @@ def _to_mlflow(tracked: Tracked, folder: Path) -> str:
     return tracked.name
 
 
-Write = Callable[[Tracked, Path], str]
-TRACKERS: dict[str, tuple[str, str, Write]] = {
-    "csv": ("", "", _to_csv),
-    "trackio": ("trackio", "trackio", _to_trackio),
-    "wandb": ("wandb", "wandb", _to_wandb),
-    "mlflow": ("mlflow", "mlflow", _to_mlflow),
+TRACKERS: dict[str, Callable[[Tracked, Path], str]] = {
+    "csv": _to_csv,
+    "trackio": _to_trackio,
+    "wandb": _to_wandb,
+    "mlflow": _to_mlflow,
 }
-"""Name -> package that it needs, the extra that brings it, and what hands a run over."""
+"""Name, which is also that of its package and of kerv's extra -> what hands a run over."""

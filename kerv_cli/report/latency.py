@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from typing import Any
 
 import pandas as pd
 
 from kerv_cli.base.settings import REAL, TimingSettings
+from kerv_cli.lab.identity import Plain
 from kerv_cli.report.ceiling import is_autoregressive
-from kerv_cli.report.measures import MICRO, measure
+from kerv_cli.report.measures import MICRO, Row, measure
 from kerv_cli.report.tables import StudyData, rows_of
 from kerv_cli.report.text import LOST_WON, Column, compared, intervals, lost_won, numbers, p_value, shares, text_frame
 
@@ -44,12 +43,12 @@ def latency_table(data: StudyData) -> pd.DataFrame | None:
     return pd.DataFrame(rows) if rows else None
 
 
-def _timing(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _timing(settings: Plain) -> Row:
     """`rollout.*` of stored settings; the defaults where settings lack it, because they are older."""
     return {**dataclasses.asdict(TimingSettings()), **settings.get("rollout", {})}
 
 
-def _key(settings: Mapping[str, Any]) -> str:
+def _key(settings: Plain) -> str:
     return json.dumps(_timing(settings), sort_keys=True)
 
 

@@ -14,6 +14,9 @@ from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import Estimate
 
+Row = dict[str, Any]
+"""One row of a table by column."""
+
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 MARGIN = 0.03  # of success: a method is non-inferior where the difference's lower bound lies above -MARGIN
@@ -41,7 +44,7 @@ _RATIOS = {
 """Quotients of sums over episodes; NaN where the denominator is 0."""
 
 
-def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apart: bool = False) -> dict[str, Any]:
+def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apart: bool = False) -> Row:
     """Every measure of a setting's episodes, pooled (`MICRO`, or one task) or averaged over difficulty (`MACRO`).
 
     success has a Wilson interval. speedup is that of the time per step, episode_speedup that of the time per episode
@@ -66,12 +69,12 @@ def measure(episodes: pd.DataFrame, baseline: pd.DataFrame, averaging: str, apar
     has_times = decodes(episodes) and is_timed(timed, "time_method") and is_timed(timed, "time_baseline")
     return {
         "successes": int(once["success"].sum()),
-        **_columns("success", _averaged(once, macro, _success)),
-        **_columns("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
-        **_columns("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
+        **columns_of("success", _averaged(once, macro, _success)),
+        **columns_of("speedup", _speedup(timed, "time", macro) if has_times else stats.NO_ESTIMATE),
+        **columns_of("episode_speedup", _speedup(timed, "seconds", macro) if has_times else stats.NO_ESTIMATE),
         **(_by_group(episodes, _means) if macro else _means(episodes)),
-        **_columns("AL", _averaged(episodes, macro, _acceptance_length)),
-        **(_columns("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
+        **columns_of("AL", _averaged(episodes, macro, _acceptance_length)),
+        **(columns_of("realised_risk", _averaged(episodes, macro, _realised_risk)) if "audits" in episodes else {}),
         **paired_columns(
             pair_counts(worlds), _averaged(worlds, macro, lambda part: stats.paired_difference(pair_counts(part)))
         ),
@@ -96,7 +99,7 @@ def _motion(episodes: pd.DataFrame, pairs: pd.DataFrame, macro: bool) -> dict[st
         values = successes[column].astype(float)
         groups = values.groupby(successes["difficulty"]).mean() if macro else values
         columns[name] = math.nan if values.empty or values.isna().any() else float(groups.mean())
-        columns |= _columns(f"{name}_ratio", _motion_ratio(both, column, macro))
+        columns |= columns_of(f"{name}_ratio", _motion_ratio(both, column, macro))
     return columns
 
 
@@ -125,8 +128,7 @@ def _averaged(frame: pd.DataFrame, macro: bool, estimate: Callable[[pd.DataFrame
 
 
 def _success(episodes: pd.DataFrame) -> Estimate:
-    successes, count = int(episodes["success"].sum()), len(episodes)
-    return Estimate(successes / count, *stats.wilson(successes, count))
+    return stats.wilson(int(episodes["success"].sum()), len(episodes))
 
 
 def _acceptance_length(episodes: pd.DataFrame) -> Estimate:
@@ -144,18 +146,18 @@ def _realised_risk(episodes: pd.DataFrame) -> Estimate:
 def _per_world(
     episodes: pd.DataFrame, estimate: Callable[..., Estimate], above: pd.Series, below: pd.Series
 ) -> Estimate:
-    """A quotient of sums over episodes, whose interval goes by task and seed; NaN where the sum below is 0."""
+    """The sum of `above` over the sum of `below`, with an interval by task and seed; NaN where the latter is 0."""
     if not below.sum():
         return stats.NO_ESTIMATE
     return estimate(above.to_numpy(), below.to_numpy(), list(episodes["task"]), list(episodes["seed"]))
 
 
 def pair_counts(pairs: pd.DataFrame) -> stats.PairedCounts:
-    """Pairs of `paired` by their two successes."""
+    """Counts of pairs, rows of `paired`, by success of the baseline and of the method."""
     return stats.paired_counts(pairs["success_baseline"].to_numpy(), pairs["success_method"].to_numpy())
 
 
-def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = None) -> dict[str, Any]:
+def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = None) -> Row:
     """Columns on the success of paired episodes: their number and counts, McNemar's p (NaN without pairs), the
     difference with its interval, by default that of the counts, and whether the interval lies above minus the
     margin."""
@@ -164,13 +166,14 @@ def paired_columns(counts: stats.PairedCounts, difference: Estimate | None = Non
         "pairs": sum(counts),
         **counts._asdict(),
         "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
-        **_columns("difference", difference),
+        **columns_of("difference", difference),
         "margin": MARGIN,
         "non_inferior": bool(difference.low > -MARGIN),
     }
 
 
-def _columns(name: str, estimate: Estimate) -> dict[str, float]:
+def columns_of(name: str, estimate: Estimate) -> dict[str, float]:
+    """Columns of an estimate: its value under the name, and its interval with the endings _low and _high."""
     return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
 
 
@@ -236,7 +239,7 @@ def _means(episodes: pd.DataFrame) -> dict[str, float]:
     values |= {name: float(sums[a] / sums[b]) if sums[b] else math.nan for name, (a, b) in _RATIOS.items()}
     values["felt_latency_ms"] = 1000.0 * values.pop("felt_latency")
     values |= _alarms(episodes) if "audits" in episodes else {}
-    return values | {name: float(part.built(episodes)) for name, part in own_columns().items()}
+    return values | {name: float(part.built(episodes)) for name, part in registered_columns().items()}
 
 
 def _alarms(episodes: pd.DataFrame) -> dict[str, float]:
@@ -249,8 +252,8 @@ def _alarms(episodes: pd.DataFrame) -> dict[str, float]:
     }
 
 
-def own_columns() -> Mapping[str, Part]:
-    """Columns that are not kerv's, by name: registered functions of a setting's episodes."""
+def registered_columns() -> Mapping[str, Part]:
+    """Columns that a plug-in adds, by name: functions of a setting's episodes."""
     return parts("column")
 
 

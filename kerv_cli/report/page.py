@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import pandas as pd
@@ -16,13 +15,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from kerv_cli.lab.store import StudyStore
 from kerv_cli.report import stressed
 from kerv_cli.report.decide import choices, read_verdicts, sentence
-from kerv_cli.report.measures import MACRO, MICRO
+from kerv_cli.report.measures import MACRO, MICRO, Row
 from kerv_cli.report.reprice import machine_columns
 from kerv_cli.report.summary import SPEEDS, differences, motion_frame, summary_frame
 from kerv_cli.report.tables import StudyData, is_baseline, is_number, rows_of
 
 LOSS = 3.0
-"""Points of success that the verdict at the top of the page allows where nobody says otherwise."""
+"""Points of success that the page's verdict allows to lose by default."""
 
 
 @dataclass(frozen=True)
@@ -35,29 +34,18 @@ class Section:
     table: pd.DataFrame | None = None  # of text
 
 
-@dataclass(frozen=True)
-class Link:
-    """A file beside the page. href: relative to it."""
-
-    text: str
-    href: str
-
-
 def render(
     store: StudyStore,
     data: StudyData,
-    whole: pd.DataFrame,
-    per_task: pd.DataFrame,
     figures: Sequence[str],
     sections: Sequence[Section],
     files: Sequence[Path],
-    priced: pd.DataFrame | None = None,
-    loss: float = LOSS,
+    priced: pd.DataFrame | None,
+    loss: float,
 ) -> str:
     """The page.
 
     Args:
-        whole, per_task: the study's `study_table` and `per_task_table`.
         figures: HTML elements.
         files: the study's tables and plots; the page links the tables.
         priced: `repriced_table` of the machines that the report was asked for.
@@ -67,35 +55,35 @@ def render(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
     ).get_template("report.html.j2")
     stopped = read_verdicts(store.root)
-    answer, shown = verdict(whole, loss)
+    answer, is_shown = verdict(data.table, loss)
     return template.render(
         name=store.name,
         title=data.plan.title or store.name,
         verdict=answer[:1].upper() + answer[1:],
-        shown=shown,
-        caution=caution(whole),
+        is_shown=is_shown,
+        caution=caution(data.table),
         note=data.plan.note,
-        about=_about(whole),
+        about=_about(data.table),
         baseline=data.plan.baseline,
         absent=[f"{cell.label} on {cell.task}" for cell in data.absent],
         planned=len({cell.id for cell in data.plan.cells}),
         how_to_run=_how_to_run(store),
-        suite=_suite(whole, priced),
-        motion=motion_frame(whole),
-        reasons=differences(rows_of(whole, MICRO)),
+        suite=_suite(data.table, priced),
+        motion=motion_frame(data.table),
+        reasons=differences(rows_of(data.table, MICRO)),
         stopped=[] if stopped is None else rows_of(stopped),
         figures=figures,
         sections=sections,
-        tasks=_by_task(per_task),
-        recordings=[Link(path.stem, _href(path, store.root)) for path in store.recordings],
-        files=[Link(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
+        tasks=_by_task(data.per_task),
+        recordings=[(path.stem, _href(path, store.root)) for path in store.recordings],
+        files=[(path.name, _href(path, store.root)) for path in files if path.suffix == ".csv"],
         commands=[(cell.label, cell.overrides) for cell in {c.label: c for c in data.plan.cells}.values()],
     )
 
 
 def verdict(whole: pd.DataFrame, loss: float) -> tuple[str, bool]:
     """The study's answer in one sentence, and whether it names a setting that is shown to be faster at that loss of
-    success, in points. whole: `study_table`."""
+    success, in points. whole: a study's table."""
     if stressed.is_stressed(whole):
         return stressed.verdict(whole), False
     rows = rows_of(whole, MICRO)
@@ -121,16 +109,11 @@ def caution(whole: pd.DataFrame) -> str:
     return "; ".join(clauses)
 
 
-def policies(whole: pd.DataFrame) -> str:
-    """Names of the targets that a table compares."""
-    return ", ".join(dict.fromkeys(str(name) for name in whole["target"]))
-
-
 def _about(whole: pd.DataFrame) -> str:
     first = whole.iloc[0]
     return ", ".join(
         [
-            f"policy {policies(whole)}",
+            f"policy {', '.join(whole['target'].unique())}",
             f"{whole['tasks'].max()} tasks",
             f"{whole['episodes'].max()} episodes per setting",
             str(first["device_name"]),
@@ -166,21 +149,18 @@ def _how_to_run(store: StudyStore) -> str:
 def _by_task(per_task: pd.DataFrame) -> pd.DataFrame:
     """A row per task, a column per setting: successes and speeds, per episode and per step. A study of stress has
     many settings: they are the rows there, and the tasks the columns."""
-    texts = {(row["label"], row["task"]): _cell(row) for row in rows_of(per_task)}
-    labels, tasks = list(dict.fromkeys(per_task["label"])), sorted(set(per_task["task"]))
-    if stressed.is_stressed(per_task):
-        return pd.DataFrame(
-            {"setting": label, **{task: texts.get((label, task), "–") for task in tasks}} for label in labels
-        )
-    return pd.DataFrame({"task": task, **{label: texts.get((label, task), "–") for label in labels}} for task in tasks)
+    cells = per_task.assign(text=[_cell(row) for row in rows_of(per_task)])
+    table = cells.pivot(index="task", columns="label", values="text")[per_task["label"].unique()].fillna("–")
+    return (table.T.rename_axis("setting") if stressed.is_stressed(per_task) else table).reset_index()
 
 
-def _cell(row: Mapping[str, Any]) -> str:
+def _cell(row: Row) -> str:
     share = f"{int(row['successes'])}/{int(row['episodes'] // max(1, row['repeats']))}"
-    if row["label"] == row["baseline"] or not is_number(row["speedup"]):
+    if is_baseline(row) or not is_number(row["speedup"]):
         return share
     return f"{share} · {row['episode_speedup']:.2f}×, {row['speedup']:.2f}×"
 
 
-def _href(path: Path, page: Path) -> str:
-    return quote(Path(os.path.relpath(path, page)).as_posix())
+def _href(path: Path, folder: Path) -> str:
+    """A file's address, relative to the folder of the page."""
+    return quote(Path(os.path.relpath(path, folder)).as_posix())

@@ -27,9 +27,9 @@ from kerv_cli.report.drawing import (
     setting_colours,
     shared_legend,
 )
-from kerv_cli.report.measures import MICRO
+from kerv_cli.report.measures import MICRO, Row
 from kerv_cli.report.stressed import by_kind, is_stressed
-from kerv_cli.report.tables import Row, is_baseline, is_number, rows_of
+from kerv_cli.report.tables import is_baseline, is_number, rows_of
 
 _PHASE_COLOURS = ("#7fb2d9", "#0b6fb8", "#e9b44c", "#d1495b", "#e8a0a8", "#2a9d6f", "#dfe5eb")
 _DASHES: Any = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (7, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
@@ -68,21 +68,20 @@ MEASURES = (
 )
 
 
-def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = MICRO) -> dict[str, Figure]:
+def study_figures(table: pd.DataFrame, axis: str, title: str) -> dict[str, Figure]:
     """Name suffix -> figure: measures against the axis, and inference time by phase where it was measured; without an
     axis the measures by setting, and success against speed. A study of stress has one figure, of success.
 
     Args:
-        table: `study_table`.
+        table: a study's; its rows pooled over tasks are drawn.
         axis: column for the x axis, e.g. `threshold.r`; empty, or without a setting at two of its numbers: one row per
             setting.
         title: the study's.
-        averaging: the rows that are drawn; named in the figure.
     """
-    rows = table[table["averaging"] == averaging].reset_index(drop=True)
-    heading = title, about(rows, averaging)
+    rows = table[table["averaging"] == MICRO].reset_index(drop=True)
+    heading = title, about(rows)
     if is_stressed(rows):
-        return {"": lines_figure(by_kind(table, averaging), "stress_level", "level", *heading)}
+        return {"": lines_figure(by_kind(table), "stress_level", "level", *heading)}
     numbers = any(len(group) > 1 for group in series_of(rows, axis).values())
     figures = {"": _against_axis(rows, axis, *heading) if numbers else _by_setting(rows, *heading)}
     if rows["time_per_step_ms"].notna().any():
@@ -92,13 +91,13 @@ def study_figures(table: pd.DataFrame, axis: str, title: str, averaging: str = M
     return figures
 
 
-def about(rows: pd.DataFrame, averaging: str) -> str:
-    """A figure's subtitle: targets, counts, averaging, device."""
+def about(rows: pd.DataFrame, what: str = MICRO) -> str:
+    """A figure's subtitle: targets, counts, what is drawn, device."""
     first = rows.iloc[0]
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes per setting"
     targets = dict.fromkeys(str(name) for name in rows["target"])
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} targets"  # more are wider than a figure
-    return f"{names} · {counts} · {averaging} · {first['device_name']}, {first['dtype']}"
+    return f"{names} · {counts} · {what} · {first['device_name']}, {first['dtype']}"
 
 
 def draw(
@@ -108,7 +107,7 @@ def draw(
     measure: Measure,
     shade: str,
     along_x: bool = False,
-    **style: Any,
+    **style: object,
 ) -> None:
     """Draws the rows' values at these positions, joined by the style's line, and bars for their 95 % intervals. A value
     that does not exist is left out. along_x: the measure is on the x axis."""
@@ -366,7 +365,7 @@ def has_task_map(per_task: pd.DataFrame) -> bool:
 
 def task_map(per_task: pd.DataFrame, title: str, about: str) -> Figure:
     """Tasks down, settings across: successes of episodes in each field, coloured by the difference to the baseline in
-    points over the same worlds. per_task: `per_task_table`."""
+    points over the same worlds. per_task: a study's table by task."""
     tasks, labels = (list(dict.fromkeys(per_task[name])) for name in ("task", "label"))
     points = 100.0 * per_task.pivot(index="task", columns="label", values="difference").loc[tasks, labels].to_numpy(
         float

@@ -15,7 +15,7 @@ class Unpublishable(KervError):
 def refusals(table: pd.DataFrame) -> list[str]:
     """Why a study's table may not be published, a clause each; empty where it may.
 
-    table: `study_table`, with labels in `label` and several values of a column joined by semicolons.
+    table: a study's, with labels in `label` and several values of a column joined by semicolons.
     """
     clauses = []
     commits = values_of(table, "git_commit")
@@ -35,10 +35,10 @@ def refusals(table: pd.DataFrame) -> list[str]:
     return clauses
 
 
-def check_publishable(data: StudyData, table: pd.DataFrame) -> None:
+def check_publishable(data: StudyData) -> None:
     """Raises Unpublishable: cells are missing, or there are `refusals`; its line lists them all."""
     clauses = [f"{len(data.absent)} of its cells are missing"] if data.absent else []
-    clauses += refusals(table)
+    clauses += refusals(data.table)
     if clauses:
         raise Unpublishable(
             f"study {data.plan.name} may not be published: {'; '.join(clauses)}. Commit, then run 'kerv sweep "

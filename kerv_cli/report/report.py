@@ -18,15 +18,23 @@ from kerv_cli.report.measures import MICRO
 from kerv_cli.report.page import LOSS, Section, render
 from kerv_cli.report.plots import about, has_task_map, latency_figure, study_figures, task_map
 from kerv_cli.report.publish import check_publishable
-from kerv_cli.report.reprice import ASSUMES, Machine, open_machines, repriced_summary, repriced_table
+from kerv_cli.report.reprice import ASSUMES, open_profiles, repriced_summary, repriced_table
 from kerv_cli.report.stressed import is_stressed, summed_table
-from kerv_cli.report.tables import StudyData, load_study, per_task_table, study_table, write_csv
+from kerv_cli.report.tables import StudyData, load_study, write_csv
+
+
+def names_to_report(results: Path | str, study: str | None) -> list[str]:
+    """The study of that name; None: every study that has a complete cell. Raises UsageError: there is none."""
+    names = [study] if study else begun_studies(results)
+    if not names:
+        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=demo`")
+    return names
 
 
 @dataclass
 class Report:
-    """Files and tables of a report. files: in the order of writing. tables: study -> its `study_table`. priced: the
-    `repriced_table` of the machines in `on`."""
+    """Files and tables of a report. files: in the order of writing. tables: study -> its table. priced: the
+    `repriced_table` of the profiles in `on`."""
 
     files: list[Path]
     tables: dict[str, pd.DataFrame]
@@ -54,90 +62,99 @@ def report(
     """
     if on and not study:
         raise UsageError(f"on={','.join(on)}: name the study whose decodes are to be priced, study=NAME")
-    names = [study] if study else begun_studies(results)
-    if not names:
-        raise UsageError(f"no study in {Path(results) / 'studies'} has a complete cell: run `kerv sweep study=demo`")
-    reporter = _Reporter(Path(results), publish, open_machines(results, on), loss)
+    names = names_to_report(results, study)
+    profiles, output = open_profiles(results, on), Report([], {})
     for name in names:
-        reporter.report_study(name)
-    return reporter.report
-
-
-class _Reporter:
-    """Writes the files of studies."""
-
-    def __init__(self, results: Path, publish: bool, machines: Sequence[Machine], loss: float) -> None:
-        self.results, self.publish, self.machines, self.loss = results, publish, machines, loss
-        self.folder = results if publish else results / "report"
-        self.report = Report([], {})
-
-    def report_study(self, name: str) -> None:
-        """The files of one study; errors as `report`."""
-        store = StudyStore(self.results, name)
+        store = StudyStore(results, name)
         data = load_study(store)
-        priced = repriced_table(data, self.machines) if self.machines else None
-        whole, per_task = study_table(data), per_task_table(data)
-        if self.publish:
-            check_publishable(data, whole)
-        self.report.tables[name] = whole
-        before = len(self.report.files)
-        self._save_table(whole, name)
-        self._save_table(per_task, f"{name}_per_task")
-        title = data.plan.title or name
-        figures = study_figures(whole, data.plan.axis, title)
-        if has_task_map(per_task):
-            figures["_tasks"] = task_map(per_task, f"{title}: task by task", about(whole, "successes of each task"))
-        plots = [self._save_plot(figure, f"{name}{suffix}") for suffix, figure in figures.items()]
-        sections = [self.machines_section(priced), self.latency_section(data), self.stress_section(whole, name)]
-        page = store.root / "report.html"
-        files = self.report.files[before:]
-        with atomic_path(page) as temporary:
-            present = [section for section in sections if section is not None]
-            text = render(store, data, whole, per_task, plots, present, files, priced, self.loss)
-            temporary.write_text(text, encoding="utf-8")
-        self.report.files.append(page)
+        output.priced = repriced_table(data, profiles) if profiles else None
+        output.files += write_study(store, data, loss, publish, output.priced)
+        output.tables[name] = data.table
+    return output
 
-    def machines_section(self, priced: pd.DataFrame | None) -> Section | None:
-        """Writes the study's decodes at other machines' costs; None where none was asked for."""
-        if priced is None:
-            return None
-        name = f"{priced['study'].iloc[0]}_on"
-        self._save_table(priced, name)
-        self.report.priced = priced
-        return Section("On other machines", f"{ASSUMES}: tables/{name}.csv.", "", repriced_summary(priced))
 
-    def latency_section(self, data: StudyData) -> Section | None:
-        """Writes success at the latencies of a study whose world goes on; None where it waits."""
-        table = latency_table(data)
-        if table is None:
-            return None
-        name, title = f"{data.plan.name}_latency", "Success against the time that AR takes"
-        self._save_table(table, name)
-        about = f"{table['episodes'].max()} episodes per setting, {MICRO}"
-        return Section(
-            title=title,
-            note=f"Every setting beside AR at the same latency and compensation, same episodes: tables/{name}.csv.",
-            figure=self._save_plot(latency_figure(table, title, about), name) if table["ar_latency_ms"].any() else "",
-            table=latency_summary(table),
+def write_study(
+    store: StudyStore, data: StudyData, loss: float, publish: bool = False, priced: pd.DataFrame | None = None
+) -> list[Path]:
+    """Writes the tables, plots and page of one study -> its files, the page last; errors as `report`.
+
+    Args:
+        data: of the whole study.
+        priced: its decodes at the costs of other machines, `repriced_table`.
+    """
+    results = store.root.parent.parent
+    if publish:
+        check_publishable(data)
+    files = _Files(results if publish else results / "report")
+    files.add_table(data.table, store.name)
+    files.add_table(data.per_task, f"{store.name}_per_task")
+    title = data.plan.title or store.name
+    figures = study_figures(data.table, data.plan.axis, title)
+    if has_task_map(data.per_task):
+        figures["_tasks"] = task_map(
+            data.per_task, f"{title}: task by task", about(data.table, "successes of each task")
         )
+    plots = [files.add_plot(figure, f"{store.name}{suffix}") for suffix, figure in figures.items()]
+    sections = [_machines_section(priced, files), _latency_section(data, files), _stress_section(data, files)]
+    page = store.root / "report.html"
+    with atomic_path(page) as temporary:
+        present = [section for section in sections if section is not None]
+        text = render(store, data, plots, present, files.paths, priced, loss)
+        temporary.write_text(text, encoding="utf-8")
+    return [*files.paths, page]
 
-    def stress_section(self, whole: pd.DataFrame, study: str) -> Section | None:
-        """Writes a study of stress summed over levels, kinds and all; None where nothing is stressed."""
-        if not is_stressed(whole):
-            return None
-        table = summed_table(whole)
-        name, title = f"{study}_summed", "Summed over levels, and over kinds"
-        self._save_table(table, name)
-        fields = table.drop(columns="label").rename(columns={"sum": "task", "method": "label"})
-        figure = task_map(fields, title, about(whole, "successes over all tasks"))
-        note = f"Points against the baseline under the same stresses, same episodes: tables/{name}.csv."
-        return Section(title, note, self._save_plot(figure, name))
 
-    def _save_table(self, table: pd.DataFrame, name: str) -> None:
-        self.report.files.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
+class _Files:
+    """The tables and plots of a study below a folder. paths: in the order of writing."""
 
-    def _save_plot(self, figure: Figure, name: str) -> str:
-        """The figure's HTML element."""
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.paths: list[Path] = []
+
+    def add_table(self, table: pd.DataFrame, name: str) -> None:
+        """Writes tables/<name>.csv."""
+        self.paths.append(write_csv(table, self.folder / "tables" / f"{name}.csv"))
+
+    def add_plot(self, figure: Figure, name: str) -> str:
+        """Writes plots/<name>.png and .svg -> the figure's HTML element."""
         plot = save_plot(figure, self.folder / "plots", name)
-        self.report.files.extend(plot.files)
+        self.paths.extend(plot.files)
         return plot.html
+
+
+def _machines_section(priced: pd.DataFrame | None, files: _Files) -> Section | None:
+    """The study's decodes at other machines' costs; None where no machine is named."""
+    if priced is None:
+        return None
+    name = f"{priced['study'].iloc[0]}_on"
+    files.add_table(priced, name)
+    return Section("On other machines", f"{ASSUMES}: tables/{name}.csv.", "", repriced_summary(priced))
+
+
+def _latency_section(data: StudyData, files: _Files) -> Section | None:
+    """Success at the latencies of a study whose world goes on; None where it waits."""
+    table = latency_table(data)
+    if table is None:
+        return None
+    name, title = f"{data.plan.name}_latency", "Success against the time that AR takes"
+    files.add_table(table, name)
+    subtitle = f"{table['episodes'].max()} episodes per setting, {MICRO}"
+    return Section(
+        title=title,
+        note=f"Every setting beside AR at the same latency and compensation, same episodes: tables/{name}.csv.",
+        figure=files.add_plot(latency_figure(table, title, subtitle), name) if table["ar_latency_ms"].any() else "",
+        table=latency_summary(table),
+    )
+
+
+def _stress_section(data: StudyData, files: _Files) -> Section | None:
+    """A study of stress summed over levels, kinds and all; None where nothing is stressed."""
+    if not is_stressed(data.table):
+        return None
+    table = summed_table(data.table)
+    name, title = f"{data.plan.name}_summed", "Summed over levels, and over kinds"
+    files.add_table(table, name)
+    fields = table.drop(columns="label").rename(columns={"sum": "task", "method": "label"})
+    figure = task_map(fields, title, about(data.table, "successes over all tasks"))
+    note = f"Points against the baseline under the same stresses, same episodes: tables/{name}.csv."
+    return Section(title, note, files.add_plot(figure, name))

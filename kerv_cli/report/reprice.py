@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +18,7 @@ from kerv_cli.base.places import as_path, shipped_dir
 from kerv_cli.engine.cost import FORMAT, READ_PHASES, Profile, Work, missing, prices, read_profile, work_of
 from kerv_cli.lab.identity import batch_of
 from kerv_cli.lab.plan import Cell
-from kerv_cli.report.measures import MICRO, decodes, measure
+from kerv_cli.report.measures import MICRO, Row, decodes, measure
 from kerv_cli.report.summary import SPEEDS
 from kerv_cli.report.tables import StudyData, is_baseline, rows_of
 from kerv_cli.report.text import compared, interval, intervals
@@ -35,8 +34,8 @@ _TIMES = ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")
 
 
 @dataclass(frozen=True)
-class Machine:
-    """A profile under the name by which it was asked for."""
+class NamedProfile:
+    """A profile, and the name in `on` that chose it."""
 
     name: str
     profile: Profile
@@ -49,14 +48,14 @@ class Machine:
         return ", ".join(names or [self.name]) + (", projected" if about.get("projected") else "")
 
 
-def open_machines(results: Path | str, names: Iterable[str]) -> list[Machine]:
+def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
     """The profiles of these names: paths, documents in <results>/bench, or those that kerv ships.
 
     Raises:
         UsageError: no such document, one without a profile, or one of another kerv.
     """
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
-    machines = []
+    profiles = []
     for name in names:
         paths = (as_path(name), *(folder / f"{name}{end}" for folder in folders for end in (".json", _SHIPPED)))
         path = next((path for path in paths if path.is_file()), None)
@@ -67,15 +66,15 @@ def open_machines(results: Path | str, names: Iterable[str]) -> list[Machine]:
                 + (f", or take one of {', '.join(shipped)}" if shipped else "")
             )
         try:
-            machines.append(Machine(name, read_profile(path, FORMAT)))
+            profiles.append(NamedProfile(name, read_profile(path, FORMAT)))
         except CheckpointError as error:
             raise UsageError(f"on={name}: {error}") from error
-    return machines
+    return profiles
 
 
-def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame:
+def repriced_table(data: StudyData, profiles: Sequence[NamedProfile]) -> pd.DataFrame:
     """One row per machine and label, pooled over tasks: speeds against the baseline there, per episode and per control
-    step, with paired bootstrap intervals over the study's blocks; times; and the speeds as they were measured.
+    step, with their intervals; times; and the speeds as they were measured.
 
     Raises:
         UsageError: a profile lacks a cost that the study needs, or is of chunks of another length; a setting has no
@@ -83,11 +82,11 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
     """
     episodes = {str(label): group for label, group in data.episodes.groupby("label", sort=False)}
     labels = [label for label in data.plan.labels if label in episodes and decodes(episodes[label])]
-    works = {label: _recorded(data, label) for label in labels}
+    works = {label: _label_work(data, label) for label in labels}
     rows = []
-    for machine in machines:
-        _check(machine, works)
-        priced = {label: _priced(episodes[label], works[label], machine.profile) for label in labels}
+    for named in profiles:
+        _check(named, works)
+        priced = {label: _priced(episodes[label], works[label], named.profile) for label in labels}
         for label in labels:
             reference = data.references[label]
             baseline = priced[reference] if reference in priced else priced[label].iloc[:0]
@@ -98,11 +97,11 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
                     "study": data.plan.name,
                     "label": label,
                     "baseline": reference,
-                    "on": machine.name,
-                    "machine": machine.title,
-                    "projected": bool(machine.profile.about.get("projected")),
+                    "on": named.name,
+                    "machine": named.title,
+                    "projected": bool(named.profile.about.get("projected")),
                     "same": _same(
-                        machine.profile.about, data.complete.get(reference, data.complete[label])[0], episodes[label]
+                        named.profile.about, data.complete.get(reference, data.complete[label])[0], episodes[label]
                     ),
                     **_speeds(values, ""),
                     **{name: values[name] for name in _TIMES},
@@ -115,19 +114,19 @@ def repriced_table(data: StudyData, machines: Sequence[Machine]) -> pd.DataFrame
     return pd.DataFrame(rows)
 
 
-def _same(about: Mapping[str, Any], cell: Cell, episodes: pd.DataFrame) -> bool:
+def _same(about: Mapping[str, object], cell: Cell, episodes: pd.DataFrame) -> bool:
     """Whether a profile is of the machine that these episodes ran on, and of the target of `cell`, the baseline's."""
     here = {name: set(episodes[name]) for name in ("device_name", "dtype", "threads")}
     here["target"] = {cell.settings["policy"]["target"]}
     return not about.get("projected") and all({about.get(name)} == values for name, values in here.items())
 
 
-def _speeds(values: Mapping[str, Any], prefix: str) -> dict[str, float]:
+def _speeds(values: Row, prefix: str) -> dict[str, float]:
     return {f"{prefix}{name}{end}": values[f"{name}{end}"] for name in SPEEDS for end in ("", "_low", "_high")}
 
 
 @dataclass(frozen=True)
-class Recorded:
+class LabelWork:
     """The work of a label's decodes. episode: (decodes,) row of the label's episodes that each belongs to. size: N."""
 
     work: Work
@@ -135,7 +134,7 @@ class Recorded:
     size: int
 
 
-def _recorded(data: StudyData, label: str) -> Recorded:
+def _label_work(data: StudyData, label: str) -> LabelWork:
     """The decodes of a label's cells, in the order of its episodes."""
     cells = data.complete[label]
     if (batch := batch_of(cells[0].settings)) > 1:
@@ -157,7 +156,7 @@ def _recorded(data: StudyData, label: str) -> Recorded:
     proposer = cells[0].settings.get("proposer", {})
     drafter = (int(proposer["depth"]), int(proposer["top_k"])) if "top_k" in proposer else None
     work, size = _work(whole, drafter)
-    return Recorded(work, np.concatenate(owners), size)
+    return LabelWork(work, np.concatenate(owners), size)
 
 
 def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:
@@ -180,29 +179,29 @@ def _work(table: pa.Table, drafter: tuple[int, int] | None) -> tuple[Work, int]:
     return work_of(columns, counts, phases, looked_up, size, drafter), size
 
 
-def _check(machine: Machine, works: Mapping[str, Recorded]) -> None:
+def _check(named: NamedProfile, works: Mapping[str, LabelWork]) -> None:
     """Raises UsageError for a profile that cannot price the study."""
-    target = machine.profile.about.get("target", "TARGET")
-    for label, recorded in works.items():
-        needs = recorded.work.needs
-        if lacks := missing(needs, machine.profile):
+    target = named.profile.about.get("target", "TARGET")
+    for label, label_work in works.items():
+        needs = label_work.work.needs
+        if lacks := missing(needs, named.profile):
             raise UsageError(
-                f"on={machine.name}: no cost of '{lacks[0]}', which setting '{label}' needs: measure it with "
+                f"on={named.name}: no cost of '{lacks[0]}', which setting '{label}' needs: measure it with "
                 f"'kerv bench target={target}'"
             )
-        if machine.profile.tokens < recorded.size:
+        if named.profile.tokens < label_work.size:
             raise UsageError(
-                f"on={machine.name}: its costs are of chunks of {machine.profile.tokens} tokens, setting '{label}' "
-                f"decodes {recorded.size}: measure them with 'kerv bench target={target} tokens=[{recorded.size}]'"
+                f"on={named.name}: its costs are of chunks of {named.profile.tokens} tokens, setting '{label}' "
+                f"decodes {label_work.size}: measure them with 'kerv bench target={target} tokens=[{label_work.size}]'"
             )
 
 
-def _priced(episodes: pd.DataFrame, recorded: Recorded, profile: Profile) -> pd.DataFrame:
+def _priced(episodes: pd.DataFrame, label_work: LabelWork, profile: Profile) -> pd.DataFrame:
     """The episodes, with the seconds that their decodes would take there."""
-    seconds = prices(recorded.work, profile)
-    whole = np.bincount(recorded.episode, seconds, len(episodes))
-    order = np.argsort(recorded.episode, kind="stable")
-    stops = np.cumsum(np.bincount(recorded.episode, minlength=len(episodes)))[:-1]
+    seconds = prices(label_work.work, profile)
+    whole = np.bincount(label_work.episode, seconds, len(episodes))
+    order = np.argsort(label_work.episode, kind="stable")
+    stops = np.cumsum(np.bincount(label_work.episode, minlength=len(episodes)))[:-1]
     return episodes.assign(seconds=whole, decode_seconds=pd.Series(np.split(seconds[order], stops), episodes.index))
 
 

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import pandas as pd
 
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import MICRO, paired_columns
-from kerv_cli.report.tables import Row, rows_of
+from kerv_cli.report.measures import MICRO, Row, columns_of, paired_columns
+from kerv_cli.report.tables import rows_of
 
 BEHIND = 0.10
 """A method falls behind where its success is lower than the baseline's, under the same stress, by this or more."""
@@ -27,9 +27,9 @@ def stem(label: str) -> str:
     return re.sub(r",?\s+(kind|level)=\S+", "", label)
 
 
-def by_kind(table: pd.DataFrame, averaging: str = MICRO) -> dict[str, dict[str, list[Row]]]:
+def by_kind(table: pd.DataFrame) -> dict[str, dict[str, list[Row]]]:
     """Kind -> method -> rows of the table along the level, beginning with the method's unstressed row."""
-    rows = rows_of(table, averaging)
+    rows = rows_of(table, MICRO)
     plain = {stem(str(row["label"])): row for row in rows if row["stress"] == NONE}
     kinds: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
@@ -49,7 +49,7 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
     difference from the baseline in the same worlds under the same stresses; the unstressed row is in no sum.
 
     Args:
-        table: `study_table`.
+        table: a study's.
 
     Returns:
         Columns study, label (`METHOD SUM`), method (label without stress), sum (`push`, `level 2`, `all`), baseline,
@@ -73,7 +73,6 @@ def summed_table(table: pd.DataFrame) -> pd.DataFrame:
 def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
     counts = stats.PairedCounts(*(sum(int(row[count]) for row in rows) for count in stats.PairedCounts._fields))
     episodes, successes = (sum(int(row[column]) for row in rows) for column in ("episodes", "successes"))
-    bounds = stats.wilson(successes, episodes)
     return {
         "study": rows[0]["study"],
         "label": f"{method} {name}",
@@ -82,9 +81,7 @@ def _sum(rows: list[Row], method: str, name: str, reference: str) -> Row:
         "baseline": f"{reference} {name}",
         "episodes": episodes,
         "successes": successes,
-        "success": successes / episodes,
-        "success_low": bounds.low,
-        "success_high": bounds.high,
+        **columns_of("success", stats.wilson(successes, episodes)),
         **paired_columns(counts),
     }
 

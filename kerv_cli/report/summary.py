@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -13,8 +13,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from kerv_cli.report.measures import MICRO, own_columns
-from kerv_cli.report.tables import Row, is_baseline, is_number, rows_of
+from kerv_cli.report.measures import MICRO, Row, registered_columns
+from kerv_cli.report.tables import is_baseline, is_number, rows_of
 from kerv_cli.report.text import (
     LOST_WON,
     Column,
@@ -56,7 +56,7 @@ _LABEL = 16
 
 
 def _speed(name: str) -> TextOf:
-    """A speedup, marked where it is of some of the pairs; 1 for the baseline, where it has a time at all."""
+    """A speedup as text, marked if it is of some of the pairs alone; 1 for a baseline that was timed."""
 
     def text(row: Row) -> str:
         if is_baseline(row):
@@ -82,7 +82,7 @@ def _columns() -> list[Column]:
         Column("deviation", numbers("deviation"), needs="deviation"),
         Column("felt ms", numbers("felt_latency_ms"), needs="felt_latency_ms"),
         Column("held", shares("held_share"), needs="held_share"),
-        *(Column(name.replace("_", " "), numbers(name), needs=name) for name in own_columns()),
+        *(Column(name.replace("_", " "), numbers(name), needs=name) for name in registered_columns()),
         Column(LOST_WON, compared(lost_won)),
         Column("p", compared(p_value)),
     ]
@@ -97,15 +97,14 @@ def _motion_columns() -> Iterator[Column]:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """The rows of one averaging of `study_table`, for the terminal, with all measures that fit; a narrow one wraps
+    """A study's table for the terminal: its rows pooled over tasks, with all measures that fit; a narrow one wraps
     labels."""
 
     table: pd.DataFrame
-    averaging: str = MICRO
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        frame = _fitting(summary_frame(self.table, self.averaging), options.max_width)
-        yield Text(_title(self.table, self.averaging), style="bold", overflow="fold")
+        frame = _fitting(summary_frame(self.table), options.max_width)
+        yield Text(_title(self.table), style="bold", overflow="fold")
         yield _printed(frame)
         first, several = self.table["baseline"].iloc[0], self.table["baseline"].nunique() > 1
         against = f"{first}, under the same stress" if several else first
@@ -117,8 +116,8 @@ class SummaryTable:
             yield Text(f"not timed, for success alone: {', '.join(map(str, untimed))}")
         if "ceiling" in frame:
             yield Text("ceiling: speed per step if every chunk were accepted whole at once")
-        yield from (Text(reason) for reason in differences(rows_of(self.table, self.averaging)))
-        motion = motion_frame(self.table, self.averaging)
+        yield from (Text(reason) for reason in differences(rows_of(self.table, MICRO)))
+        motion = motion_frame(self.table)
         if motion is not None and _width(motion) <= options.max_width:
             yield Text("Successful episodes, and ratios over the pairs in which both succeeded", style="bold")
             yield _printed(motion)
@@ -148,11 +147,6 @@ def _width(frame: pd.DataFrame) -> int:
     return sum(wide) - max(0, wide[0] - max([_LABEL, *map(len, words)])) + len(wide) - 1
 
 
-def summary_table(table: pd.DataFrame, averaging: str = MICRO) -> SummaryTable:
-    """A study's table for the terminal."""
-    return SummaryTable(table, averaging)
-
-
 def _fitting(frame: pd.DataFrame, width: int) -> pd.DataFrame:
     """The columns that fit into so many characters; where not all do, the shares of decodes stand in one."""
     if _width(frame) <= width:
@@ -177,9 +171,9 @@ def summary_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame:
     return text_frame(rows_of(table, averaging), _columns())
 
 
-def motion_frame(table: pd.DataFrame, averaging: str = MICRO) -> pd.DataFrame | None:
+def motion_frame(table: pd.DataFrame) -> pd.DataFrame | None:
     """The measures of `measures.MOTION` as text, each with its ratio to the baseline's; None where no row has them."""
-    rows = rows_of(table, averaging)
+    rows = rows_of(table, MICRO)
     return text_frame(rows, _motion_columns()) if any(is_number(row[key]) for row in rows for key in _MOTION) else None
 
 
@@ -191,11 +185,11 @@ def not_in_turn(table: pd.DataFrame) -> list[str]:
     return [str(label) for label in dict.fromkeys(rows["label"])] if of_baseline else []
 
 
-def _title(table: pd.DataFrame, averaging: str) -> str:
-    rows = table[table["averaging"] == averaging]
+def _title(table: pd.DataFrame) -> str:
+    rows = table[table["averaging"] == MICRO]
     first = rows.iloc[0]
     counts = f"{rows['tasks'].max()} tasks, {rows['episodes'].max()} episodes each"
-    return f"{first['study']}: {counts}, {averaging}, {first['device_name']}, {first['dtype']}"
+    return f"{first['study']}: {counts}, {MICRO}, {first['device_name']}, {first['dtype']}"
 
 
 def why_different(row: Row, reference: Row) -> str:
@@ -221,9 +215,8 @@ def why_different(row: Row, reference: Row) -> str:
     return f"{row['label']}: {episode:.2f} per episode, {step:.2f} per step: {', '.join(reasons)}"
 
 
-def differences(rows: Iterable[Row]) -> list[str]:
+def differences(rows: Sequence[Row]) -> list[str]:
     """`why_different` of all rows of a study's table, those without a reason left out."""
-    rows = list(rows)
     by_label = {row["label"]: row for row in rows}
     reasons = [why_different(row, by_label[row["baseline"]]) for row in rows if row["baseline"] in by_label]
     return [reason for reason in reasons if reason]

@@ -20,6 +20,7 @@ from kerv_cli.lab.identity import (
     NOT_DETERMINING,
     NOT_DETERMINING_RUNTIME,
     OBSERVATION,
+    Plain,
     flat,
     stress_of,
     without,
@@ -35,7 +36,7 @@ from kerv_cli.report.ceiling import (
     is_autoregressive,
     verifies_in_prefill,
 )
-from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, measure
+from kerv_cli.report.measures import COMPARABLE, MACRO, MICRO, Row, measure
 from kerv_cli.worlds import specs
 
 _MACHINE = ("executor", "workers", "device_name", "host")
@@ -43,16 +44,13 @@ _CODE = ("git_commit", "engine", "code", "run")
 _STATUS_COLUMNS = (*_MACHINE, *(f"{name}_version" for name in PACKAGES), "python_version", *_CODE)
 
 
-Row = dict[str, Any]
-"""One row of a table by column."""
-
 _OLDER = {"engine": 1}
 """Values of the entries that the status of an older cell lacks."""
 
 
 @dataclass(frozen=True)
 class StudyData:
-    """A study's plan and the episodes of its complete cells."""
+    """A study's plan and the episodes of its complete cells; its tables are computed once."""
 
     plan: StudyPlan
     cells: dict[str, StoredCell]  # by id
@@ -86,6 +84,17 @@ class StudyData:
             if cell.id in self.cells:
                 cells.setdefault(cell.label, []).append(cell)
         return cells
+
+    @functools.cached_property
+    def table(self) -> pd.DataFrame:
+        """Two rows per label: micro over tasks and macro over difficulty groups."""
+        return _frame([row for averaging in (MICRO, MACRO) for row in _rows(self, self.episodes, averaging)])
+
+    @functools.cached_property
+    def per_task(self) -> pd.DataFrame:
+        """One row per task and label: tasks by name, labels in the plan's order."""
+        by_task = [episodes for _, episodes in self.episodes.groupby("task", sort=True)]
+        return _frame([row for episodes in by_task for row in _rows(self, episodes, "one task")])
 
 
 def _stress(cell: Cell) -> tuple[str, int]:
@@ -146,18 +155,7 @@ def difficulty_of(task: str) -> str:
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
-def per_task_table(data: StudyData) -> pd.DataFrame:
-    """One row per task and label: tasks by name, labels in the plan's order."""
-    by_task = [episodes for _, episodes in data.episodes.groupby("task", sort=True)]
-    return _frame([row for episodes in by_task for row in _rows(data, episodes, "one task")])
-
-
-def study_table(data: StudyData) -> pd.DataFrame:
-    """Two rows per label: micro over tasks and macro over difficulty groups."""
-    return _frame([row for averaging in (MICRO, MACRO) for row in _rows(data, data.episodes, averaging)])
-
-
-Sections = list[dict[str, Any]]
+Sections = list[Row]
 """One row of a table as sections of columns. A column that only some settings have stays within its section."""
 
 
@@ -241,12 +239,12 @@ def _origin(data: StudyData, cells: Sequence[Cell]) -> Sections:
     return [{"overrides": cells[0].overrides}, flatten(parts), weights, surroundings]
 
 
-def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(settings: Plain) -> Row:
     """Nested settings as dotted keys: {"threshold": {"r": 5}} -> {"threshold.r": 5}; lists joined by semicolons."""
-    return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings, prefix).items()}
+    return {k: _joined(v) if isinstance(v, list | tuple) else v for k, v in flat(settings).items()}
 
 
-def _joined(values: Iterable[Any]) -> str:
+def _joined(values: Iterable[object]) -> str:
     return ";".join(dict.fromkeys(str(value) for value in values))
 
 
@@ -278,7 +276,7 @@ def is_number(value: Any) -> bool:
     return value is not None and not math.isnan(value)
 
 
-def is_baseline(row: Mapping[str, Any]) -> bool:
+def is_baseline(row: Row) -> bool:
     """Whether the row of a table is that of the setting which it is compared with."""
     return bool(row["label"] == row["baseline"])
 

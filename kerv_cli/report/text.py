@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 
-from kerv_cli.report.tables import Row, is_baseline, is_number
+from kerv_cli.report.measures import Row
+from kerv_cli.report.tables import is_baseline, is_number
 
 TextOf = Callable[[Row], str]
 
@@ -33,8 +33,15 @@ def text_frame(rows: Iterable[Row], columns: Iterable[Column]) -> pd.DataFrame:
 
 
 def numbers(name: str) -> TextOf:
-    """A column's `number`."""
-    return lambda row: number(row[name])
+    """A column's value with three significant digits and no exponent; `–` where there is none."""
+
+    def text(row: Row) -> str:
+        value = row[name]
+        if not is_number(value):
+            return "–"
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
+
+    return text
 
 
 def shares(name: str) -> TextOf:
@@ -48,11 +55,11 @@ def intervals(name: str, scale: float = 1.0, digits: int = 2, between: str = "�
 
 
 def compared(text: TextOf, of_baseline: str = "") -> TextOf:
-    """The text, and that of the baseline, which is not compared with itself."""
+    """The text of a setting; `of_baseline` for the baseline, which is not compared with itself."""
     return lambda row: of_baseline if is_baseline(row) else text(row)
 
 
-def interval(row: Mapping[str, Any], name: str, scale: float = 1.0, digits: int = 2, between: str = "–") -> str:
+def interval(row: Row, name: str, scale: float = 1.0, digits: int = 2, between: str = "–") -> str:
     """A value with its 95 % interval in brackets; `–` for a missing value."""
     if not is_number(row[name]):
         return "–"
@@ -63,21 +70,14 @@ def interval(row: Mapping[str, Any], name: str, scale: float = 1.0, digits: int 
     return f"{text} ({low * scale:.{digits}f}{between}{high * scale:.{digits}f})" if is_number(low) else text
 
 
-def number(value: float) -> str:
-    """Three significant digits without an exponent; `–` for a missing value."""
-    if not is_number(value):
-        return "–"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
-
-
-def p_value(row: Mapping[str, Any]) -> str:
+def p_value(row: Row) -> str:
     """McNemar's p; empty without pairs."""
     if not row["pairs"]:
         return ""
     return "<0.001" if row["mcnemar_p"] < 0.001 else f"{row['mcnemar_p']:.2g}"
 
 
-def lost_won(row: Mapping[str, Any]) -> str:
+def lost_won(row: Row) -> str:
     """Pairs that the baseline alone and the setting alone solved, of how many: what McNemar's p is of; empty without
     pairs."""
     return f"{row['only_baseline']}/{row['only_method']} of {row['pairs']}" if row["pairs"] else ""

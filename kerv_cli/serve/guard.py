@@ -11,6 +11,7 @@ from torch import Tensor
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.protocol import Target
 
 REFUSE, HOLD = "refuse", "hold"
 """Of `outside`: answer with an error; execute the last action once more."""
@@ -19,8 +20,8 @@ LEAST_WIDTH = 1.0
 
 
 class StateRange:
-    """The range of the numbers that a policy reads. low, high: what its demonstrations reached (p,). margin: by how
-    many widths it is exceeded on either side."""
+    """The range of the numbers that a policy may act on. low, high: the least and the largest of its demonstrations
+    (p,). margin: widths of that range which are added on either side."""
 
     def __init__(self, low: np.ndarray, high: np.ndarray, names: tuple[str, ...], margin: float) -> None:
         more = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
@@ -41,9 +42,9 @@ class StateRange:
 
 
 class Finite:
-    """A target that notices numbers which are not finite in its prompts and logits. All else is the target's own."""
+    """A target, and a check that its prompts and logits are finite."""
 
-    def __init__(self, target: Any) -> None:
+    def __init__(self, target: Target) -> None:
         self._target = target
         self._fine: list[Tensor] = []  # read once per decode, so that no forward waits for the device
 

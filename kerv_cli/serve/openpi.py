@@ -3,7 +3,6 @@ is answered by a chunk of actions, or by a text frame that says what was wrong w
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,14 +12,14 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.serve.guard import HOLD
 from kerv_cli.serve.policy import Policy
-from kerv_cli.serve.server import Reply
+from kerv_cli.serve.server import Conversation, Reply
 from kerv_cli.serve.session import Interface, Session, hand_of, keys_of, text_of
-from kerv_cli.serve.wire import packed, unpacked
+from kerv_cli.serve.wire import Message, packed, unpacked
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 
 
-def metadata(interface: Interface, chunk: int) -> dict[str, Any]:
+def metadata(interface: Interface, chunk: int) -> dict[str, object]:
     """The first frame that a client gets. chunk: H."""
     return {
         "server": "kerv",
@@ -38,7 +37,7 @@ def metadata(interface: Interface, chunk: int) -> dict[str, Any]:
     }
 
 
-def observation_of(interface: Interface, message: Mapping[str, Any]) -> Observation:
+def observation_of(interface: Interface, message: Message) -> Observation:
     """The observation in a message.
 
     Raises:
@@ -55,7 +54,7 @@ def observation_of(interface: Interface, message: Mapping[str, Any]) -> Observat
     return Observation(*interface.numbers(message.get(STATE), STATE, message), prompt, images)
 
 
-class OpenPi:
+class OpenPi(Conversation):
     """One client. A robot executes what it is sent, so that there is one at a time, and silence means that it is gone.
 
     last: the actions (H, D) of the last decode, environment units. at: the end effector's position (3,) at that decode,
@@ -65,7 +64,7 @@ class OpenPi:
     seats, ping_s, idle_s = 1, 10.0, 120.0
 
     def __init__(self, policy: Policy, session: Session) -> None:
-        self.policy, self.session = policy, session
+        super().__init__(policy, session)
         self.last: np.ndarray = np.zeros((0, 0))
         self.at = np.zeros(3)
         self.decodes, self.begun = 0, False
@@ -77,12 +76,10 @@ class OpenPi:
 
     def answer(self, frame: bytes | str) -> Reply:
         """The answer to the observation in a frame. Raises UsageError: it holds none, or a wrong `executed`."""
-        if not isinstance(frame, bytes):
-            raise UsageError("a text frame came, observations are binary (msgpack)")
         values = self.act(unpacked(frame))
         return Reply(packed(values), values["policy_timing"]["infer_ms"] / 1000)
 
-    def act(self, message: Mapping[str, Any]) -> dict[str, Any]:
+    def act(self, message: Message) -> dict[str, Any]:
         """The actions (H, D) for the observation in a message, their time and their forwards.
 
         Raises:
@@ -115,15 +112,15 @@ class OpenPi:
             "server_timing": timing | ({"prev_total_ms": self.before} if self.before is not None else {}),
         }
 
-    def took(self, milliseconds: float) -> None:
-        """The last answer took so long as a whole, which the client gets with the next one."""
+    def note_latency(self, milliseconds: float) -> None:
+        """The last answer took so long as a whole; the client is told with the next one."""
         self.before = milliseconds
 
     def fault(self, line: str) -> str:
         """The frame that says what was wrong."""
         return f"kerv: {line}"
 
-    def _executed(self, message: Mapping[str, Any]) -> np.ndarray:
+    def _executed(self, message: Message) -> np.ndarray:
         """The actions of the last answer that were executed since: all of them, or the first `executed` ones."""
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):

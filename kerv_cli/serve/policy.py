@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -62,7 +63,7 @@ class Policy:
         first = self._decoder(self._any_task())
         self.chunk = first.steps
         self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
-        self.released(first)
+        self.take_back(first)
 
     def _interface(self) -> Interface:
         description = self.artifacts.description
@@ -84,7 +85,7 @@ class Policy:
         )
 
     def _range(self) -> StateRange | None:
-        """Of the numbers that the policy reads; None where its target does not say, or it reads none."""
+        """The range of the numbers that the policy reads; None where its target does not say, or it reads none."""
         stored, interface = self.artifacts.description.state_range, self.interface
         if stored is None or interface.images_alone:
             return None
@@ -97,36 +98,36 @@ class Policy:
         return sorted(kind for kind in self.method.needs if find("artifact", kind).traits.get("by_task"))
 
     def _any_task(self) -> str:
-        """The task of the settings; without one, where a client names its tasks, one that the method's levels know."""
-        if self.by_task and self.settings.protocol == VLA_EVAL:
-            for kind in self._task_artifacts():
-                artifact = self.artifacts.load(kind)
-                return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ("",)))
-        return self.settings.task_name
+        """The task of the settings; without one, where a client names its tasks, one for which the method has
+        levels."""
+        if not self.by_task or self.settings.protocol != VLA_EVAL:
+            return self.settings.task_name
+        artifact = self.artifacts.load(self._task_artifacts()[0])
+        return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ()), "")
 
     @contextlib.contextmanager
     def session(self) -> Iterator[Session]:
-        """For one more client, until it leaves: then its decoder serves the next one."""
+        """A session for one more client; when it leaves, its decoder serves the next one."""
         session = self.new_session()
         try:
             yield session
         finally:
             if isinstance(session.decoder, Alone):
-                self.released(session.decoder.decoder)
+                self.take_back(session.decoder.decoder)
 
     def new_session(self) -> Session:
-        """For one more client."""
+        """A session for one more client."""
         holds = self.settings.outside == HOLD
-        return Session(self._follower, self.settings.task_name, self.by_task, self.range, holds)
+        return Session(self._client_decoder, self.settings.task_name, self.by_task, self.range, holds)
 
-    def released(self, decoder: Decoder) -> None:
-        """A decoder that nobody uses any more; those of one task alone are not kept."""
+    def take_back(self, decoder: Decoder) -> None:
+        """Keeps the decoder of a client that has left, for the next client; not one that is for a single task."""
         if not self.by_task:
             self._idle.append(decoder)
 
-    def _follower(self, task: str) -> ActionDecoder:
+    def _client_decoder(self, task: str) -> ActionDecoder:
         if self._together is not None:
-            return self._together.seat()
+            return Seat(self._together)
         return Alone(self._idle.pop() if self._idle else self._decoder(task), self._turn)
 
     def _decoder(self, task: str) -> Decoder:
@@ -137,8 +138,8 @@ class Policy:
             warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
         return decoder
 
-    def facts(self) -> dict[str, Any]:
-        """What a result must say about it: settings of a rollout, hashes, machine and versions; plain values."""
+    def facts(self) -> dict[str, object]:
+        """The settings of a rollout, hashes, machine and versions that belong to its results; plain values."""
         shared = {at.name: getattr(self.settings, at.name) for at in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
         settings["runtime"]["device"] = self.artifacts.device
@@ -168,31 +169,22 @@ class Alone(Around):
         return record
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Request:
     lane: Lane
     observation: Observation
-    record: DecodeRecord | None = None
-    error: Exception | None = None
-
-    @property
-    def is_settled(self) -> bool:
-        return self.record is not None or self.error is not None
+    answer: Future[DecodeRecord] = field(default_factory=Future)
 
 
 @dataclass
 class Together:
-    """Decodes together what several clients ask for at nearly the same time. most: clients of a batch."""
+    """Decodes the observations of several clients as one batch. most: clients of a batch."""
 
     decoder: BatchDecoder
     most: int
     _turn: threading.Lock = field(default_factory=threading.Lock)
     _arrived: threading.Condition = field(default_factory=threading.Condition)
     _waiting: list[_Request] = field(default_factory=list)
-
-    def seat(self) -> Seat:
-        """For one more client."""
-        return Seat(self)
 
     def decode(self, lane: Lane, observation: Observation) -> DecodeRecord:
         """The record of one client's observation. Whoever has the turn decodes for all who wait."""
@@ -201,15 +193,12 @@ class Together:
             self._waiting.append(mine)
             self._arrived.notify_all()
         with self._turn:
-            while not mine.is_settled:
+            while not mine.answer.done():
                 with self._arrived:
                     self._arrived.wait_for(lambda: len(self._waiting) >= self.most, GATHER)
                     batch, self._waiting = self._waiting[: self.most], self._waiting[self.most :]
                 self._settle(batch)
-        if mine.error is not None:
-            raise mine.error
-        assert mine.record is not None
-        return mine.record
+        return mine.answer.result()
 
     def _settle(self, batch: Sequence[_Request]) -> None:
         """Decodes the batch; where that fails, one by one, so that one client's fault is no other's."""
@@ -217,10 +206,10 @@ class Together:
             records = self.decoder.decode([one.lane for one in batch], [one.observation for one in batch])
             check_finite(self.decoder)
             for one, record in zip(batch, records, strict=True):
-                one.record = record
+                one.answer.set_result(record)
         except Exception as error:  # noqa: BLE001 - it is raised in its client's thread
             if len(batch) == 1:
-                batch[0].error = error
+                batch[0].answer.set_exception(error)
                 return
             for one in batch:
                 self._settle([one])

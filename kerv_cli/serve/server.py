@@ -5,6 +5,7 @@ A connection stays open after an error, and the server after any client.
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import http
 import logging
@@ -13,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,11 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import load
 from kerv_cli.base.settings import ServeSettings
 from kerv_cli.serve.policy import Policy
+from kerv_cli.serve.session import Session
+
+if TYPE_CHECKING:
+    from websockets.http11 import Request, Response
+    from websockets.sync.server import Server, ServerConnection
 
 Log = Callable[[str], None]
 PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.serve.vla_eval:VlaEval"}
@@ -43,7 +49,7 @@ class Reply:
     seconds: float | None = None
 
 
-class Conversation(Protocol):
+class Conversation(abc.ABC):
     """One client, in the words of its protocol. seats, ping_s, idle_s: where the settings leave them to the
     protocol."""
 
@@ -51,17 +57,23 @@ class Conversation(Protocol):
     ping_s: float
     idle_s: float
 
-    def greeting(self) -> bytes | None:
-        """What the server says first."""
+    def __init__(self, policy: Policy, session: Session) -> None:
+        self.policy, self.session = policy, session
 
+    def greeting(self) -> bytes | None:
+        """What the server says first; None: the client speaks first."""
+        return None
+
+    @abc.abstractmethod
     def answer(self, frame: bytes | str) -> Reply | None:
         """The answer to a frame; None: it needs none. Raises KervError: what is wrong with it."""
 
-    def took(self, milliseconds: float) -> None:
-        """The last decode took so long, from the frame's arrival to the answer's end."""
-
+    @abc.abstractmethod
     def fault(self, line: str) -> bytes | str:
         """The frame that tells the client what was wrong with the last one."""
+
+    def note_latency(self, milliseconds: float) -> None:  # noqa: B027 - not every protocol tells it
+        """The last decode took so long, from the frame's arrival to the answer's end."""
 
 
 @dataclass
@@ -88,15 +100,15 @@ class Latencies:
 
 
 class Seats:
-    """Who is being served. takeover: a newcomer gets the seat of whoever was silent longest."""
+    """The connections that are served. takeover: a newcomer gets the seat of the one that was silent longest."""
 
     def __init__(self, count: int, takeover: bool) -> None:
         self.count, self.takeover = count, takeover
         self._changed = threading.Condition()
-        self._heard: dict[Any, float] = {}  # connection -> when it was last heard
+        self._heard: dict[ServerConnection, float] = {}  # connection -> when it was last heard
 
-    def take(self, connection: Any) -> tuple[bool, Any]:
-        """Whether the connection has a seat now, and the connection that lost its own to it, or None."""
+    def take(self, connection: ServerConnection) -> tuple[bool, ServerConnection | None]:
+        """Whether the connection gets a seat, and the connection that loses its own to it, or None."""
         with self._changed:
             lost = None
             if self.takeover and len(self._heard) >= self.count:
@@ -107,21 +119,21 @@ class Seats:
             self._heard[connection] = time.monotonic()
             return True, lost
 
-    def heard(self, connection: Any) -> None:
-        """The client said something."""
+    def heard(self, connection: ServerConnection) -> None:
+        """Notes that the client sent a frame."""
         with self._changed:
             if connection in self._heard:
                 self._heard[connection] = time.monotonic()
 
-    def leave(self, connection: Any) -> None:
-        """The seat is free, unless somebody else took it."""
+    def leave(self, connection: ServerConnection) -> None:
+        """Frees the connection's seat, unless another one took it."""
         with self._changed:
             self._heard.pop(connection, None)
             self._changed.notify_all()
 
     @property
-    def taken(self) -> list[Any]:
-        """The connections that have one."""
+    def connections(self) -> list[ServerConnection]:
+        """The connections that have a seat."""
         with self._changed:
             return list(self._heard)
 
@@ -131,13 +143,13 @@ class PolicyServer:
 
     def __init__(self, policy: Policy, settings: ServeSettings, log: Log) -> None:
         self.policy, self.settings, self.log = policy, settings, log
-        self.protocol: Any = load(PROTOCOLS[settings.protocol])
+        self.protocol: type[Conversation] = load(PROTOCOLS[settings.protocol])
         self.seats = Seats(settings.seats or self.protocol.seats, settings.takeover)
         self.ping_s = settings.ping_s or self.protocol.ping_s
         self.idle_s = settings.idle_s or self.protocol.idle_s
 
     @contextlib.contextmanager
-    def listening(self, host: str, port: int) -> Iterator[Any]:
+    def listening(self, host: str, port: int) -> Iterator[Server]:
         """The listening server, with the methods `serve_forever()` and `shutdown()`. port 0: a free one.
 
         Raises:
@@ -165,10 +177,10 @@ class PolicyServer:
             raise UsageError(f"cannot listen on {host}:{port}: {error.strerror or error}") from error
         with server:
             yield server
-        for connection in self.seats.taken:
+        for connection in self.seats.connections:
             connection.close(GONE, "the server stops")
 
-    def handle(self, connection: Any) -> None:
+    def handle(self, connection: ServerConnection) -> None:
         """One connection, from its handshake to its end."""
         from websockets.exceptions import ConnectionClosed
 
@@ -199,11 +211,11 @@ class PolicyServer:
     def _full(self) -> str:
         return "another client is being served" if self.seats.count == 1 else f"{self.seats.count} clients are served"
 
-    def _talk(self, connection: Any, latencies: Latencies) -> None:
+    def _talk(self, connection: ServerConnection, latencies: Latencies) -> None:
         """Answers frames until the connection ends. Raises ConnectionClosed, and TimeoutError for silence."""
         with self.policy.session() as session:
             session.say = lambda line: self.log(f"{_address(connection)} {line}")
-            conversation: Conversation = self.protocol(self.policy, session)
+            conversation = self.protocol(self.policy, session)
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
             while True:
@@ -211,7 +223,9 @@ class PolicyServer:
                 self.seats.heard(connection)
                 self.reply(connection, conversation, frame, latencies)
 
-    def reply(self, connection: Any, conversation: Conversation, frame: bytes | str, latencies: Latencies) -> None:
+    def reply(
+        self, connection: ServerConnection, conversation: Conversation, frame: bytes | str, latencies: Latencies
+    ) -> None:
         """Answers one frame, or says in one line to client and log what was wrong with it."""
         began = time.perf_counter()
         try:
@@ -228,23 +242,23 @@ class PolicyServer:
         if reply.seconds is None:
             return
         whole = 1000 * (time.perf_counter() - began)
-        conversation.took(whole)
+        conversation.note_latency(whole)
         latencies.add(1000 * reply.seconds, whole)
         if self.settings.log_every and len(latencies.whole) % self.settings.log_every == 0:
             self.log(str(latencies))
 
-    def _refuse(self, connection: Any, conversation: Conversation, reason: str) -> None:
+    def _refuse(self, connection: ServerConnection, conversation: Conversation, reason: str) -> None:
         line = " ".join(reason.split())[:LONGEST]
         self.log(f"{_address(connection)} error: {line}")
         connection.send(conversation.fault(line))
 
 
-def _close(connection: Any, code: int, reason: str) -> None:
+def _close(connection: ServerConnection, code: int, reason: str) -> None:
     """Closes a connection that may never answer, in a thread of its own: nobody waits for it."""
     threading.Thread(target=connection.close, args=(code, reason), daemon=True).start()
 
 
-def _address(connection: Any) -> str:
+def _address(connection: ServerConnection) -> str:
     """The client's address, for the log."""
     try:
         return str(connection.remote_address)
@@ -253,7 +267,7 @@ def _address(connection: Any) -> str:
 
 
 def _lines(log: Log) -> logging.Logger:
-    """Where websockets reports what it cannot handle: a line of the log each, no traceback."""
+    """A logger for websockets, which writes every error as one line of the log, without a traceback."""
 
     class Lines(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
@@ -264,6 +278,6 @@ def _lines(log: Log) -> logging.Logger:
     return logger
 
 
-def _health(connection: Any, request: Any) -> Any:
+def _health(connection: ServerConnection, request: Request) -> Response | None:
     """Answers GET /healthz without a handshake."""
     return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path in HEALTH else None

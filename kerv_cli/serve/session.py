@@ -14,6 +14,7 @@ from kerv_cli.base.views import frame_shape
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.episode import ActionDecoder
 from kerv_cli.serve.guard import StateRange
+from kerv_cli.serve.wire import Message
 
 LARGEST = 4096
 """Pixels of an image's longest side, where the policy resizes images itself."""
@@ -48,31 +49,32 @@ class Interface:
     cameras: tuple[str, ...]
     size: int
     privileged: bool
-    gripper: str = "as_is"
-    grip: tuple[float, ...] = ()
-    task: str = ""
-    images_alone: bool = False
+    gripper: str
+    grip: tuple[float, ...]
+    task: str
+    images_alone: bool
 
-    def image(self, image: Any, camera: str, key: str) -> np.ndarray:
+    def image(self, image: object, camera: str, key: str) -> np.ndarray:
         """The image (h, w, 3) uint8 of a camera. key: its name in messages.
 
         Raises:
             UsageError: it is of another size or type.
         """
-        shape: tuple[Any, ...] = frame_shape(camera, self.size)
-        fits = isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.ndim == 3
-        if self.images_alone:
-            shape = ("height", "width", 3)
-            fits = fits and image.shape[2] == 3 and min(image.shape[:2]) >= 2 and max(image.shape[:2]) <= LARGEST
-        if not fits or (not self.images_alone and image.shape != shape):
+        shape = "(height, width, 3)" if self.images_alone else str(frame_shape(camera, self.size))
+        if not (isinstance(image, np.ndarray) and image.dtype == np.uint8 and self._fits(image.shape, camera)):
             what = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-            wanted = str(shape).replace("'", "")
-            raise UsageError(f"{key} is {what}, {wanted} uint8 is wanted")
-        return np.asarray(image)
+            raise UsageError(f"{key} is {what}, {shape} uint8 is wanted")
+        return image
 
-    def numbers(self, values: Any, key: str, message: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Proprioception (p,) and state (s,) from what stands under `key` of a message, None where nothing does;
-        numbers that the policy does not read are zero.
+    def _fits(self, shape: tuple[int, ...], camera: str) -> bool:
+        """Whether an image of that shape can be one of the camera's."""
+        if not self.images_alone:
+            return shape == frame_shape(camera, self.size)
+        return len(shape) == 3 and shape[2] == 3 and min(shape[:2]) >= 2 and max(shape[:2]) <= LARGEST
+
+    def numbers(self, values: object, key: str, message: Message) -> tuple[np.ndarray, np.ndarray]:
+        """Proprioception (p,) and state (s,) from the values under `key` of a message, None where it lacks them.
+        Numbers that the policy does not read are zero.
 
         Raises:
             UsageError: they are missing, too few, too many or not finite.
@@ -103,12 +105,12 @@ class Interface:
         return values
 
 
-def keys_of(message: Mapping[str, Any]) -> str:
+def keys_of(message: Message) -> str:
     """The first keys of a message, for an error."""
     return ", ".join(sorted(str(key)[:40] for key in message)[:8]) or "nothing"
 
 
-def text_of(value: Any, key: str) -> str:
+def text_of(value: object, key: str) -> str:
     """A text of a message. Raises UsageError: it is none."""
     if not isinstance(value, str):
         raise UsageError(f"{key} is {type(value).__name__}, a text is wanted")
@@ -126,8 +128,8 @@ class Session:
     """The episodes of one client.
 
     decoder: None before the first episode where it depends on the task. range: of the states that the policy may act
-    on; None: not known. holds: whether out of it the last action is executed once more, in place of an error. say:
-    writes into the log.
+    on; None: on all. holds: whether out of it the last action is executed once more, in place of an error. say: writes
+    into the log.
     """
 
     def __init__(

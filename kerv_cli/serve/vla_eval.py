@@ -1,8 +1,8 @@
 """vla-eval's protocol, version 1: a harness runs a benchmark and asks for an action at every control step.
 
 A message is a msgpack map of type, payload, seq and timestamp: hello, episode_start, observation, action, episode_end,
-error. Hello is answered by what the policy reads and sends (`specs`); an observation by one action, of a chunk that is
-decoded when the one before is used up. The package vla-eval is not needed here.
+error. Hello is answered by what the policy reads and sends (`dim_specs`); an observation by one action, of a chunk that
+is decoded when the one before is used up. The package vla-eval is not needed here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 import io
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -26,9 +26,9 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.served import path_of, write_served
 from kerv_cli.serve.policy import Policy
-from kerv_cli.serve.server import Reply
+from kerv_cli.serve.server import Conversation, Reply
 from kerv_cli.serve.session import LARGEST, Interface, Session, hand_of, keys_of, text_of
-from kerv_cli.serve.wire import array_of, packed_as, read_map
+from kerv_cli.serve.wire import Message, array_of, packed_as, read_map
 
 VERSION = 1
 """Of the protocol."""
@@ -36,9 +36,10 @@ _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
 """Name and size of a group of DoFs -> how vla-eval calls its format."""
 
 
-def specs(interface: Interface) -> dict[str, dict[str, dict[str, Any]]]:
+def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
     """What the policy sends (`action_spec`) and reads (`observation_spec`), as vla-eval's DimSpecs."""
-    actions, first = {}, 0
+    actions: dict[str, dict[str, object]] = {}
+    first = 0
     low, high = interface.converted(np.array([interface.actions.low, interface.actions.high]))
     for group in interface.actions.groups:
         part = slice(first, first + group.size)
@@ -47,14 +48,14 @@ def specs(interface: Interface) -> dict[str, dict[str, dict[str, Any]]]:
         ends = [float(np.minimum(low, high)[part].min()), float(np.maximum(low, high)[part].max())]
         actions[group.name] = {"name": group.name, "dims": group.size, "format": form, "range": ends}
         first += group.size
-    seen = {camera: {"name": "image", "dims": 0, "format": "rgb_hwc_uint8"} for camera in interface.cameras}
-    seen["language"] = {"name": "language", "dims": 0, "format": "language"}
+    inputs = {camera: {"name": "image", "dims": 0, "format": "rgb_hwc_uint8"} for camera in interface.cameras}
+    inputs["language"] = {"name": "language", "dims": 0, "format": "language"}
     space = interface.observation
     if space.state and not interface.images_alone:
         dims = space.state if interface.privileged else len(space.proprioception)
         form = f"privileged{dims}" if interface.privileged else "_".join(space.proprioception)
-        seen["state"] = {"name": "state", "dims": dims, "format": form}
-    return {"action_spec": actions, "observation_spec": seen}
+        inputs["state"] = {"name": "state", "dims": dims, "format": form}
+    return {"action_spec": actions, "observation_spec": inputs}
 
 
 def _gripper_format(interface: Interface) -> str:
@@ -62,7 +63,7 @@ def _gripper_format(interface: Interface) -> str:
     return {-1.0: "binary_close_negative", 1.0: "binary_close_positive"}.get(closes, "continuous_01")
 
 
-def wishes(interface: Interface) -> dict[str, Any]:
+def observation_params(interface: Interface) -> dict[str, object]:
     """Arguments that a benchmark of the policy's own environment takes over where its YAML does not say."""
     if not interface.grip or interface.images_alone:
         return {}
@@ -78,7 +79,7 @@ class _Episode:
 
     task: str
     seed: int
-    ids: Mapping[str, Any]
+    ids: Message
     started: str
     instruction: str = ""
     begun: bool = False
@@ -88,74 +89,68 @@ class _Episode:
     left: deque[np.ndarray] = field(default_factory=deque)
     path: list[np.ndarray] = field(default_factory=list)
 
+    @classmethod
+    def of(cls, payload: Message) -> _Episode:
+        """The episode that a message begins."""
+        task, ids = (value if isinstance(value, dict) else {} for value in map(payload.get, ("task", "recording")))
+        seed, index = (value if isinstance(value, int) else 0 for value in map(task.get, ("seed", "episode_idx")))
+        started = datetime.now(UTC).isoformat(timespec="seconds")
+        return cls(str(task.get("name", "")), max(0, seed + index), ids, started)
 
-class VlaEval:
+
+class VlaEval(Conversation):
     """One client, a shard of a benchmark. It is silent while it builds a world, and its pings wait as long: none are
     sent."""
 
     seats, ping_s, idle_s = 64, 0.0, 1800.0
 
     def __init__(self, policy: Policy, session: Session) -> None:
-        self.policy, self.session = policy, session
+        super().__init__(policy, session)
         self.episode: _Episode | None = None
         self.sequence = 0
 
-    def greeting(self) -> None:
-        """The client speaks first."""
-
     def answer(self, frame: bytes | str) -> Reply | None:
         """The answer to a message. Raises KervError: what is wrong with it."""
-        if not isinstance(frame, bytes):
-            raise UsageError("a text frame came, messages are binary (msgpack)")
         message = read_map(frame, _value)
         kind, payload, sequence = str(message.get("type")), message.get("payload"), message.get("seq")
         self.sequence = sequence if isinstance(sequence, int) else 0
         if kind not in _HANDLERS or not isinstance(payload, dict):
             raise UsageError(f"a message of type {kind[:40]}: {', '.join(_HANDLERS)} with a payload are known")
-        reply: Reply | None = _HANDLERS[kind](self, payload)
-        return reply
-
-    def took(self, milliseconds: float) -> None:
-        """The client does not ask."""
+        return _HANDLERS[kind](self, payload)
 
     def fault(self, line: str) -> bytes:
         """The message that ends the client's episode."""
         return self._message("error", {"error": line})
 
-    def _message(self, kind: str, payload: Mapping[str, Any]) -> bytes:
+    def _message(self, kind: str, payload: Mapping[str, object]) -> bytes:
         message = {"type": kind, "payload": payload, "seq": self.sequence, "timestamp": time.time()}
         return packed_as(message, _plain)
 
-    def _hello(self, payload: Mapping[str, Any]) -> Reply:
-        asked = payload.get("protocol_version")
-        if asked != VERSION:
-            raise UsageError(f"protocol version {str(asked)[:20]} is not known here: this server speaks {VERSION}")
+    def _hello(self, payload: Message) -> Reply:
+        number = payload.get("protocol_version")
+        if number != VERSION:
+            raise UsageError(f"protocol version {str(number)[:20]} is not known here: this server speaks {VERSION}")
+        params = observation_params(self.policy.interface)
         about = {
             "harness_version": f"kerv {version('kerv')}",
             "protocol_version": VERSION,
             "model_server": "kerv",
             "capabilities": {},
-            **specs(self.policy.interface),
+            **dim_specs(self.policy.interface),
             "kerv": self.policy.facts(),
+            **({"observation_params": params} if params else {}),
         }
-        wanted = wishes(self.policy.interface)
-        return Reply(self._message("hello", about | ({"observation_params": wanted} if wanted else {})))
+        return Reply(self._message("hello", about))
 
-    def _start(self, payload: Mapping[str, Any]) -> None:
+    def _start(self, payload: Message) -> None:
         """Notes the episode; it begins with its first observation, whose answer says what is wrong with it."""
-        task, ids = (value if isinstance(value, dict) else {} for value in map(payload.get, ("task", "recording")))
-        seed, index = (value if isinstance(value, int) else 0 for value in map(task.get, ("seed", "episode_idx")))
-        started = datetime.now(UTC).isoformat(timespec="seconds")
-        self.episode = _Episode(str(task.get("name", "")), max(0, seed + index), ids, started)
+        self.episode = _Episode.of(payload)
 
-    def _observe(self, payload: Mapping[str, Any]) -> Reply:
-        if self.episode is None:
-            self._start({})
-        episode = self.episode
-        assert episode is not None
+    def _observe(self, payload: Message) -> Reply:
+        episode = self.episode = self.episode or _Episode.of({})
         state = payload.get("state", payload.get("states"))
         numbers = self.policy.interface.numbers(state, "state", payload)
-        observe = functools.partial(self._observation, payload, numbers)
+        observe = functools.partial(self._observation, episode, payload, numbers)
         felt = Observation(*numbers)
         hand = hand_of(felt)
         if not episode.begun:
@@ -183,10 +178,10 @@ class VlaEval:
         sent = self.policy.interface.converted(action[None])[0].astype(np.float32)
         return Reply(self._message("action", {"actions": sent}), seconds)
 
-    def _look(self, episode: _Episode, observe: Any) -> float | None:
-        """Asks a method that looks at the world during a chunk -> seconds that it took; gives the rest of the chunk up
-        where it says so."""
-        watcher = self.session.decoder.watcher if hasattr(self.session.decoder, "watcher") else None
+    def _look(self, episode: _Episode, observe: Callable[[], Observation]) -> float | None:
+        """Lets a method that looks at the world during a chunk decide whether the rest of the chunk is executed ->
+        seconds that it took; None where it did not look."""
+        watcher = getattr(self.session.decoder, "watcher", None)
         step = len(episode.sent) - episode.decode_steps[-1] if episode.decode_steps else 0
         if watcher is None or not episode.left or not watcher.looks_at(step):
             return None
@@ -196,23 +191,26 @@ class VlaEval:
             episode.left.clear()
         return float(look.seconds)
 
-    def _observation(self, payload: Mapping[str, Any], numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
-        """The observation in a payload. Raises UsageError: an image is missing or of another size or type."""
-        images, interface = payload.get("images"), self.policy.interface
-        given = images if isinstance(images, dict) else {}
-        prompt = text_of(payload.get("task_description", ""), "task_description")
-        shown = {}
-        for camera in interface.cameras:
-            if camera not in given:
-                raise UsageError(f"no image of camera {camera}: the message has images of {keys_of(given)}")
-            image = given[camera]
-            shown[camera] = interface.image(image() if callable(image) else image, camera, f"images.{camera}")
-        if self.episode is not None:
-            self.episode.instruction = prompt
-        return Observation(*numbers, prompt, shown)
+    def _observation(self, episode: _Episode, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
+        """The observation in a payload, whose instruction the episode notes.
 
-    def _end(self, payload: Mapping[str, Any]) -> None:
-        """Tells the decoder how it ended, and keeps the episode where the harness records it."""
+        Raises:
+            UsageError: an image is missing or of another size or type.
+        """
+        images, interface = payload.get("images"), self.policy.interface
+        images = images if isinstance(images, dict) else {}
+        prompt = text_of(payload.get("task_description", ""), "task_description")
+        frames = {}
+        for camera in interface.cameras:
+            if camera not in images:
+                raise UsageError(f"no image of camera {camera}: the message has images of {keys_of(images)}")
+            image = images[camera]
+            frames[camera] = interface.image(image() if callable(image) else image, camera, f"images.{camera}")
+        episode.instruction = prompt
+        return Observation(*numbers, prompt, frames)
+
+    def _end(self, payload: Message) -> None:
+        """Tells the decoder whether the episode succeeded, and stores the episode if the harness records it."""
         episode, self.episode = self.episode, None
         metrics = payload.get("metrics")
         metrics = metrics if isinstance(metrics, dict) else {}
@@ -251,7 +249,7 @@ class VlaEval:
         )
 
 
-_HANDLERS: Mapping[str, Any] = {
+_HANDLERS: Mapping[str, Callable[[VlaEval, Message], Reply | None]] = {
     "hello": VlaEval._hello,
     "episode_start": VlaEval._start,
     "observation": VlaEval._observe,
@@ -259,7 +257,7 @@ _HANDLERS: Mapping[str, Any] = {
 }
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Numpy values as vla-eval writes them; never an image, the server sends none."""
     if isinstance(value, np.ndarray):
         return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
@@ -268,8 +266,8 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
-def _value(value: dict[Any, Any]) -> Any:
-    """An array of a message, or a function that reads its image: most are never looked at."""
+def _value(value: dict[Any, Any]) -> object:
+    """An array of a message, or a function that decodes its image: most images are never used."""
     if value.get("__image__"):
         if value.get("format") == "raw":
             return array_of(value.get("dtype"), value.get("shape"), value.get("data"))

@@ -7,7 +7,8 @@ data, dtype. Only plain numbers are accepted: nothing is unpickled, and no array
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,32 +16,36 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 
 KINDS = "biuf"  # booleans, integers, floats
+Message = Mapping[str, Any]
+"""A map that a client sent, as msgpack reads it: nothing in it is checked."""
 
 
-def packed(value: Any) -> bytes:
+def packed(value: object) -> bytes:
     """A message of dicts, lists, texts, numbers and numpy arrays, for openpi."""
     return packed_as(value, _plain)
 
 
-def unpacked(data: bytes) -> dict[str, Any]:
+def unpacked(frame: bytes | str) -> Message:
     """A message of openpi's; errors as `read_map`."""
-    return read_map(data, _array)
+    return read_map(frame, _array)
 
 
-def packed_as(value: Any, plain: Callable[[Any], Any]) -> bytes:
+def packed_as(value: object, plain: Callable[[object], object]) -> bytes:
     """A message. plain: a value that msgpack does not know -> one that it knows."""
     data: bytes = _msgpack().packb(value, default=plain)
     return data
 
 
-def read_map(data: bytes, special: Callable[[dict[Any, Any]], Any]) -> dict[str, Any]:
+def read_map(frame: bytes | str, special: Callable[[dict[Any, Any]], object]) -> Message:
     """A message that is a map with text keys. special: a map within it -> what it stands for.
 
     Raises:
         UsageError: it is not one, or holds an array that does not fit its bytes.
     """
+    if isinstance(frame, str):
+        raise UsageError("a text frame came, messages are binary (msgpack)")
     try:
-        value = _msgpack().unpackb(data, object_hook=special, strict_map_key=True)
+        value = _msgpack().unpackb(frame, object_hook=special, strict_map_key=True)
     except UsageError:
         raise
     except Exception as error:  # msgpack raises many kinds, which mean the same
@@ -50,7 +55,7 @@ def read_map(data: bytes, special: Callable[[dict[Any, Any]], Any]) -> dict[str,
     return value
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
     if isinstance(value, np.generic):
@@ -58,7 +63,7 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
-def _array(value: dict[Any, Any]) -> Any:
+def _array(value: dict[Any, Any]) -> object:
     if b"__ndarray__" in value:
         return array_of(value.get(b"dtype"), value.get(b"shape"), value.get(b"data"))
     if b"__npgeneric__" in value:
@@ -66,7 +71,7 @@ def _array(value: dict[Any, Any]) -> Any:
     return value
 
 
-def array_of(name: Any, shape: Any, data: Any) -> np.ndarray:
+def array_of(name: object, shape: object, data: object) -> np.ndarray:
     """The array of that type and shape in these bytes. Raises UsageError: they do not fit together."""
     dtype = _dtype(name)
     if not isinstance(shape, list) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
@@ -76,17 +81,17 @@ def array_of(name: Any, shape: Any, data: Any) -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape).copy()  # one that may be written to
 
 
-def _dtype(name: Any) -> np.dtype[Any]:
+def _dtype(name: object) -> np.dtype:
     try:
-        dtype = np.dtype(name)
+        dtype = np.dtype(name) if isinstance(name, str) else None
     except TypeError:
         dtype = None
-    if not isinstance(name, str) or dtype is None or dtype.kind not in KINDS:
+    if dtype is None or dtype.kind not in KINDS:
         raise UsageError(f"an array of type {str(name)[:40]}: booleans, integers and floats are accepted")
     return dtype
 
 
-def _msgpack() -> Any:
+def _msgpack() -> ModuleType:
     try:
         import msgpack
     except ImportError as error:

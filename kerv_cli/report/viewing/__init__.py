@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from kerv_cli.base.files import atomic_path
 from kerv_cli.engine.record import EpisodeRecord
 
 
-def save_recording(record: EpisodeRecord, path: Path, method: str, limits: Mapping[str, float]) -> None:
-    """Writes an episode as a recording, see `rerun_log.save_episode`. Picklable; the first call imports Rerun."""
-    from kerv_cli.report.viewing.rerun_log import save_episode
+def save_recording(record: EpisodeRecord, path: Path, method: str, limits: Mapping[str, float]) -> Path:
+    """Writes an episode as a recording that carries its own layout, atomically -> `path`. The first call imports Rerun.
 
-    save_episode(record, path, method=method, limits=limits)
+    Args:
+        record: without frames, the recording has no camera.
+        path: the .rrd file; its folder is created.
+        method: name of the method, for the summary; recordings of one method share their layout in the viewer.
+        limits: signal -> the limit that a decision compares it with, drawn as a line: F*, s_min.
+
+    Raises:
+        StorageError: the disk is full or read-only, or the folder may not be written to.
+    """
+    from kerv_cli.report.viewing.rerun_log import encode
+
+    content = encode(record, method, limits)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+    return path

@@ -1,11 +1,11 @@
-"""Layout of an episode's recording in the viewer: a pure function of the episode's properties."""
+"""Layout of an episode's recording in the viewer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import rerun.blueprint as rrb
+
+from kerv_cli.engine.record import EpisodeRecord
+from kerv_cli.report.viewing.token_outcomes import Chunks, acceptance, threshold_of
 
 STEP, TIME = "step", "time"
 """The timelines: control steps, and simulated time."""
@@ -30,35 +30,33 @@ SIGNALS = {
 LIMITS = {"metric": "F*", "similarity": "s_min"}
 """Signal -> name of the limit that a decision compares it with."""
 
-
-@dataclass(frozen=True)
-class EpisodeMeta:
-    """Properties of an episode that decide the layout."""
-
-    chunk_steps: int  # H
-    dofs: tuple[str, ...]  # names of the D degrees of freedom
-    frames: bool  # the episode has camera frames
-    drafted: bool  # some token was drafted, compensated or skipped
-    threshold: bool  # some acceptance rule had a threshold
-    signals: tuple[str, ...]  # keys of SIGNALS that some decode has
-    most: float  # the most forwards or the longest acceptance length of a decode
-    slowest: float  # milliseconds of the slowest decode
-    widest: int  # the largest threshold, bins
-    centre: tuple[float, float, float]  # middle of the end effector's path, metres
-    extent: float  # longest side of the path's bounding box, metres
+Parts = list[rrb.View | rrb.Container]
 
 
-def blueprint(meta: EpisodeMeta) -> rrb.Blueprint:
+def blueprint(record: EpisodeRecord, chunks: Chunks) -> rrb.Blueprint:
     """The layout: camera, path, summary and series per decode on the left; in the middle a lane per token, for which
-    the viewer takes 40 pixels; the current decode on the right."""
-    path, episode = _path(meta), _document("summary", "Episode")
-    series, shares = _per_decode(meta)
-    if meta.frames:
-        views: list[Any] = [rrb.Spatial2DView(origin="/camera", name="Camera"), rrb.Tabs(episode, path)]
-    else:
-        views = [path, episode]
+    the viewer takes 40 pixels; the current decode on the right. A method without drafts has two lanes, and room below
+    them for the series that stand on the right otherwise."""
+    path, episode = _path(record), _document("summary", "Episode")
+    series, shares = _per_decode(record)
+    views: Parts = [path, episode]
+    if record.frames:
+        views = [rrb.Spatial2DView(origin="/camera", name="Camera"), rrb.Tabs(episode, path)]
     left = rrb.Vertical(*views, *series, row_shares=[4.0, 3.6, *shares])
-    return paused(rrb.Horizontal(left, _over_time(meta), _current_decode(meta), column_shares=[3, 5, 4]))
+    always = [
+        _series("ms per decode", "decode/phases", top=1100 * max(decode.seconds for decode in record.decodes)),
+        _series("Actions", "actions", "gripper"),
+    ]
+    steps = len(chunks[0]) // record.space.dofs if chunks else 1
+    if any(token.kind not in ("target", "scripted", "dropped") for chunk in chunks for token in chunk):
+        lanes = "Decodes (shades alternate), mode, and what became of each token of the chunk"
+        middle = rrb.Vertical(_states(lanes, "/decodes", "/mode", "/tokens/**"))
+        right = _current_decode(record, steps, always)
+    else:
+        states = _states("Decodes and mode", "/decodes", "/mode")
+        middle = rrb.Vertical(states, *always, row_shares=[1.4, 2.2, 2.2])
+        right = _current_decode(record, steps, [])
+    return paused(rrb.Horizontal(left, middle, right, column_shares=[3, 5, 4]))
 
 
 def paused(views: rrb.Horizontal) -> rrb.Blueprint:
@@ -73,9 +71,11 @@ def paused(views: rrb.Horizontal) -> rrb.Blueprint:
     )
 
 
-def _path(meta: EpisodeMeta) -> rrb.Spatial3DView:
-    x, y, z = meta.centre
-    away = max(1.2 * meta.extent, 0.2)
+def _path(record: EpisodeRecord) -> rrb.Spatial3DView:
+    """The end effector's path, seen from a distance that shows all of it."""
+    low, high = record.path.min(axis=0), record.path.max(axis=0)
+    x, y, z = ((low + high) / 2).tolist()
+    away = max(1.2 * float((high - low).max()), 0.2)  # metres
     until_now = [
         rrb.VisibleTimeRange(
             timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
@@ -91,47 +91,36 @@ def _path(meta: EpisodeMeta) -> rrb.Spatial3DView:
     )
 
 
-def _per_decode(meta: EpisodeMeta) -> tuple[list[Any], list[float]]:
-    """Series with a number per decode, and their shares of the height; those of a method's own stand in one place."""
-    counts = ("decode/forwards", "decode/acceptance")
-    views: list[Any] = [_series("Per decode", *counts, top=meta.most + 0.5)]
-    own = [_series("Acceptance threshold r, bins", "decode/threshold", top=meta.widest + 1.0)] if meta.threshold else []
-    own += [_series(SIGNALS[signal], f"signals/{signal}") for signal in meta.signals]
-    return [*views, *([rrb.Tabs(*own)] if own else [])], [2.2, *([2.2] if own else [])]
+def _per_decode(record: EpisodeRecord) -> tuple[Parts, list[float]]:
+    """Series with a number per decode, and their shares of the height; those that only some methods have are tabs."""
+    decodes = record.decodes
+    most = max(max(d.forwards, acceptance(d.rounds)[0] if d.verifications else 0) for d in decodes)
+    views: Parts = [_series("Per decode", "decode/forwards", "decode/acceptance", top=most + 0.5)]
+    thresholds = [bins for d in decodes for bins in threshold_of(d)]
+    tabs = (
+        [_series("Acceptance threshold r, bins", "decode/threshold", top=max(thresholds) + 1.0)] if thresholds else []
+    )
+    tabs += [
+        _series(title, f"signals/{signal}")
+        for signal, title in SIGNALS.items()
+        if any(getattr(d, signal) is not None for d in decodes)
+    ]
+    return [*views, *([rrb.Tabs(*tabs)] if tabs else [])], [2.2, *([2.2] if tabs else [])]
 
 
-def _over_time(meta: EpisodeMeta) -> rrb.Vertical:
-    """The lanes; a method without drafts has two, and room for its series."""
-    if meta.drafted:
-        name = "Decodes (shades alternate), mode, and what became of each token of the chunk"
-        return rrb.Vertical(_states(name, "/decodes", "/mode", "/tokens/**"))
-    return rrb.Vertical(_states("Decodes and mode", "/decodes", "/mode"), *_always(meta), row_shares=[1.4, 2.2, 2.2])
-
-
-def _current_decode(meta: EpisodeMeta) -> rrb.Vertical:
-    wide = (len(meta.dofs) + 1.3 + 2 * KEY_WIDTH) * CELL_WIDTH
+def _current_decode(record: EpisodeRecord, steps: int, below: Parts) -> rrb.Vertical:
+    """The chunk of `steps` control steps in cells, the decode as a table, and the views below them."""
+    wide = (record.space.dofs + 1.3 + 2 * KEY_WIDTH) * CELL_WIDTH
     left, above = -0.75 * CELL_WIDTH, -0.8 * CELL_HEIGHT
-    high = (max(meta.chunk_steps, KEY_ROWS) + 0.9) * CELL_HEIGHT
+    high = (max(steps, KEY_ROWS) + 0.9) * CELL_HEIGHT
     chunk = rrb.Spatial2DView(
         origin="/chunk",
         name="Current chunk: draft → target token",
         background=[13, 16, 17],
         visual_bounds=rrb.VisualBounds2D(x_range=[left, left + wide], y_range=[above, above + high]),
     )
-    views: list[rrb.View] = [chunk, _document("decode/table", "Current decode")]
-    shares = [0.9 + 0.35 * max(meta.chunk_steps, KEY_ROWS), 5.2]
-    if meta.drafted:
-        views += _always(meta)
-        shares += [2.2, 2.2]
-    return rrb.Vertical(*views, row_shares=shares)
-
-
-def _always(meta: EpisodeMeta) -> list[rrb.View]:
-    """Phases and actions, the series of every method; placed in the middle or right column."""
-    return [
-        _series("ms per decode", "decode/phases", top=1.1 * meta.slowest),
-        _series("Actions", "actions", "gripper"),
-    ]
+    shares = [0.9 + 0.35 * max(steps, KEY_ROWS), 5.2, *(2.2 for _ in below)]
+    return rrb.Vertical(chunk, _document("decode/table", "Current decode"), *below, row_shares=shares)
 
 
 def _states(name: str, *contents: str) -> rrb.StateTimelineView:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, acceptance
@@ -16,10 +15,10 @@ def readable(text: str) -> str:
     return "".join(c if " " <= c <= "~" or "\xa1" <= c <= "ÿ" or c in _SHOWN_SYMBOLS else "?" for c in text)
 
 
-def facts_of(record: EpisodeRecord, method: str) -> dict[str, Any]:
+def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
     """The episode's totals, stored as properties of the recording."""
     rounds = [r for d in record.decodes for r in d.rounds if r.is_verification]
-    facts: dict[str, Any] = {
+    facts: dict[str, str | float] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
         "instruction": readable(record.instruction),
@@ -46,7 +45,7 @@ def summary(record: EpisodeRecord, method: str) -> str:
     facts = facts_of(record, method)
     modes = [d.mode for d in record.decodes]
     rows = {
-        "instruction": facts["instruction"],
+        "instruction": str(facts["instruction"]),
         "method, seed": f"{facts['method']}, {record.seed}",
         "control steps": f"{record.steps} ({record.steps / record.space.control_hz:.2f} s)",
         "decodes": ", ".join(f"{modes.count(m)} {readable(m)}" for m in dict.fromkeys(modes)),
@@ -55,8 +54,8 @@ def summary(record: EpisodeRecord, method: str) -> str:
     if "acceptance_length" in facts:
         rows["AL"] = f"{facts['acceptance_length']:.2f}"
         rows["accepted per round"] = f"{facts['accepted_per_round']:.2f}"
-    rows["compensated tokens"] = facts["compensated_tokens"]
-    rows["decodes without verification"] = facts["skipped_decodes"]
+    rows["compensated tokens"] = str(facts["compensated_tokens"])
+    rows["decodes without verification"] = str(facts["skipped_decodes"])
     rows["inference per step"] = f"{facts['ms_per_step']:.2f} ms"
     key = {f"{style.symbol} {name}": style.meaning for name, style in OUTCOMES.items()}
     outcome = "SUCCESS" if record.success else "FAILURE"
@@ -64,5 +63,5 @@ def summary(record: EpisodeRecord, method: str) -> str:
     return "\n".join([*lines, "", "| token | outcome |", "|:--|:--|", *_table_rows(key)])
 
 
-def _table_rows(rows: Mapping[str, Any]) -> list[str]:
+def _table_rows(rows: Mapping[str, object]) -> list[str]:
     return [f"| {name} | {value} |" for name, value in rows.items()]

@@ -1,4 +1,4 @@
-"""Writes an EpisodeRecord as an .rrd file for the Rerun viewer.
+"""Encodes an EpisodeRecord as an .rrd file for the Rerun viewer.
 
 The recording is encoded in memory and written atomically: Rerun's file sink waits forever on a full disk. Timelines:
 `step` (control steps) and `time` (simulated seconds). A row of an entity belongs to a control step, or to a decode, at
@@ -11,8 +11,6 @@ import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -20,7 +18,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from rerun.error_utils import catch_and_log_exceptions
 
-from kerv_cli.base.files import atomic_path
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord
 from kerv_cli.report.viewing.blueprint import (
@@ -32,17 +29,17 @@ from kerv_cli.report.viewing.blueprint import (
     SIGNALS,
     STEP,
     TIME,
-    EpisodeMeta,
     blueprint,
 )
 from kerv_cli.report.viewing.facts import facts_of, readable, summary
 from kerv_cli.report.viewing.token_outcomes import (
     OUTCOMES,
-    TokenOutcome,
+    Chunks,
     acceptance,
     chunk_size,
     decode_table,
     outcomes_of,
+    threshold_of,
 )
 
 JPEG_QUALITY = 85
@@ -53,41 +50,20 @@ _PLACE_COLORS = (0xE15759FF, 0x59A14FFF, 0xF0E442FF)
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 _CELL = np.array([CELL_WIDTH, CELL_HEIGHT])
 
-Chunks = Sequence[Sequence[TokenOutcome]]
-"""Outcomes of the tokens of each decode's chunk."""
-
 
 @dataclass(frozen=True)
 class Entity:
     """The data of one entity of the recording."""
 
     path: str
-    static: tuple[rr.AsComponents, ...] = ()
+    static: tuple[rr.AsComponents, ...]
     steps: NDArray[np.int64] | None = None  # (rows,) control steps
-    columns: Iterable[Any] = ()  # rerun columns of as many rows
+    columns: Iterable[rr.ComponentColumn] = ()  # of as many rows
 
 
-def save_episode(record: EpisodeRecord, path: Path, *, method: str, limits: Mapping[str, float] | None = None) -> Path:
-    """Writes an episode as a recording that carries its own layout, atomically -> `path`.
-
-    Args:
-        record: without frames, the recording has no camera.
-        path: the .rrd file; its folder is created.
-        method: name of the method, for the summary; recordings of one method share their layout in the viewer.
-        limits: signal -> the limit that a decision compares it with, drawn as a line: F*, s_min.
-
-    Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to.
-    """
-    with catch_and_log_exceptions(strict=True):  # rerun would turn exceptions into warnings and missing views
-        content = _encode(record, method, limits or {})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-    return path
-
-
-def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:
-    """The .rrd file's bytes."""
+@catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
+def encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> bytes:
+    """The .rrd file's bytes of an episode; arguments as `save_recording`."""
     recording = rr.RecordingStream("kerv_" + re.sub(r"\W+", "_", method, flags=re.ASCII))
     memory = recording.memory_recording()
     recording.set_log_time_enabled(False)
@@ -102,27 +78,8 @@ def _encode(record: EpisodeRecord, method: str, limits: Mapping[str, float]) -> 
             recording.log(entity.path, archetype, static=True)
         if entity.steps is not None and len(entity.steps):
             recording.send_columns(entity.path, _times(entity.steps, record.space.control_hz), entity.columns)
-    recording.send_blueprint(blueprint(meta_of(record, chunks)))
+    recording.send_blueprint(blueprint(record, chunks))
     return bytes(memory.drain_as_bytes())
-
-
-def meta_of(record: EpisodeRecord, chunks: Chunks) -> EpisodeMeta:
-    """The properties of the episode that decide its layout."""
-    low, high = record.path.min(axis=0), record.path.max(axis=0)
-    x, y, z = ((low + high) / 2).tolist()
-    return EpisodeMeta(
-        chunk_steps=len(chunks[0]) // record.space.dofs if chunks else 1,
-        dofs=record.space.names,
-        frames=bool(record.frames),
-        drafted=any(o.kind not in ("target", "scripted", "dropped") for chunk in chunks for o in chunk),
-        threshold=any(_threshold(d) for d in record.decodes),
-        signals=tuple(s for s in SIGNALS if any(getattr(d, s) is not None for d in record.decodes)),
-        most=max(max(d.forwards, acceptance(d.rounds)[0] if d.verifications else 0) for d in record.decodes),
-        slowest=1000 * max(d.seconds for d in record.decodes),
-        widest=max((max(_threshold(d), default=0) for d in record.decodes), default=0),
-        centre=(x, y, z),
-        extent=float((high - low).max()),
-    )
 
 
 def _times(steps: NDArray[np.int64], control_hz: float) -> list[rr.TimeColumn]:
@@ -134,7 +91,7 @@ def _entities(record: EpisodeRecord, method: str, chunks: Chunks, limits: Mappin
     starts = np.asarray(record.decode_steps, dtype=np.int64)
     names = record.space.names
     return [
-        Entity("summary", (_markdown(summary(record, method)),)),
+        Entity("summary", (rr.TextDocument(summary(record, method), media_type="text/markdown"),)),
         *_camera(record),
         *_world(record),
         *_actions(record),
@@ -314,56 +271,35 @@ def _series_per_decode(record: EpisodeRecord, starts: NDArray[np.int64], bounds:
     decodes = record.decodes
     limits, limit_names = _thresholds(decodes, record.space.names)
     phases = [p for p in PHASES if any(d.phases.get(p) for d in decodes)]
-    series = [
-        Series("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0x8C99A6FF]),
-        Series(
-            "decode/acceptance",
-            ["AL, tokens per verification", "drafts accepted per verification"],
-            [acceptance(d.rounds) if d.verifications else () for d in decodes],
-            [0x56B4E9FF, 0x009E73FF],
-        ),
-        Series("decode/threshold", limit_names, limits, [0xE69F00FF, *_DOF_COLORS]),
-        Series(
-            "decode/phases",
-            ["total", *phases],
-            [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes],
-            [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF],
-        ),
-    ]
+    entities = []
+
+    def add(path: str, names: Sequence[str], values: Sequence[Sequence[float]], colors: Sequence[int] | None) -> None:
+        """A series, each of whose values is held until the next one. values: per decode a number per name, or none."""
+        rows = [i for i, value in enumerate(values) if value]
+        if rows:
+            style = _named(names, colors, held=True)
+            entities.append(Entity(path, (style,), starts[rows], _rows(np.array([values[i] for i in rows]))))
+
+    add("decode/forwards", ["forwards"], [(d.forwards,) for d in decodes], [0x8C99A6FF])
+    lengths = [acceptance(d.rounds) if d.verifications else () for d in decodes]
+    names = ["AL, tokens per verification", "drafts accepted per verification"]
+    add("decode/acceptance", names, lengths, [0x56B4E9FF, 0x009E73FF])
+    add("decode/threshold", limit_names, limits, [0xE69F00FF, *_DOF_COLORS])
+    times = [(1000 * d.seconds, *(1000 * d.phases.get(p, 0.0) for p in phases)) for d in decodes]
+    add("decode/phases", ["total", *phases], times, [0x8C99A6FF, *_DOF_COLORS, 0xB07AA1FF])
     for signal, name in SIGNALS.items():
         values = [getattr(d, signal) for d in decodes]
         if signal in bounds:
             both = [() if x is None else (x, bounds[signal]) for x in values]
-            series.append(Series(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF]))
+            add(f"signals/{signal}", [name, LIMITS[signal]], both, [0x56B4E9FF, 0xE69F00FF])
         else:
-            series.append(Series(f"signals/{signal}", [name], [() if x is None else (x,) for x in values]))
-    return [s.entity(starts) for s in series if any(s.values)]
-
-
-@dataclass(frozen=True)
-class Series:
-    """Named numbers per decode, each held until the next one."""
-
-    path: str
-    names: Sequence[str]
-    values: Sequence[Sequence[float]]  # per decode: one number per name, or nothing
-    colors: Sequence[int] | None = None
-
-    def entity(self, starts: NDArray[np.int64]) -> Entity:
-        """The entity, with a row for every decode that has values. starts (decodes,): control steps."""
-        rows = [i for i, value in enumerate(self.values) if value]
-        style = _named(self.names, self.colors, held=True)
-        return Entity(self.path, (style,), starts[rows], _rows(np.array([self.values[i] for i in rows])))
-
-
-def _threshold(decode: DecodeRecord) -> tuple[int, ...]:
-    """r per DoF of a decode, in bins; empty without an acceptance rule that has a threshold."""
-    return next((r.threshold for r in decode.rounds if r.threshold), ())
+            add(f"signals/{signal}", [name], [() if x is None else (x,) for x in values], None)
+    return entities
 
 
 def _thresholds(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> tuple[list[tuple[int, ...]], list[str]]:
     """r of every decode, one number per set of DoFs with equal r in all decodes, and the sets' names. dofs: D names."""
-    limits = [_threshold(d) for d in decodes]
+    limits = [threshold_of(d) for d in decodes]
     groups: dict[tuple[int, ...], list[int]] = {}  # a DoF's r over the episode -> the DoFs that have it
     for dof in range(len(dofs)):
         groups.setdefault(tuple(r[dof % len(r)] for r in limits if r), []).append(dof)
@@ -378,10 +314,6 @@ def _named(names: Sequence[str], colors: Sequence[int] | None = None, held: bool
     return rr.SeriesLines(names=list(names), colors=colored, interpolation_mode="StepAfter" if held else None)
 
 
-def _rows(values: NDArray[Any]) -> Iterable[Any]:
+def _rows(values: np.ndarray) -> rr.ComponentColumnList:
     """(rows, k) -> a column of k scalars per row."""
     return rr.Scalars.columns(scalars=values.astype(np.float64).ravel()).partition([values.shape[1]] * len(values))
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")

@@ -13,7 +13,7 @@ from rerun.error_utils import catch_and_log_exceptions
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import atomic_path
 from kerv_cli.report.viewing.blueprint import paused
-from kerv_cli.report.viewing.viewer import chunks_of, read_back
+from kerv_cli.report.viewing.viewer import chunks_of, read_recording
 
 SIDES = ("left", "right")
 
@@ -27,7 +27,7 @@ def save_together(paths: Sequence[Path], folder: Path) -> Path:
     """
     if len(paths) != len(SIDES):
         raise UsageError(f"--together shows two recordings, not {len(paths)}: name two .rrd files")
-    contents = [read_back(path) for path in paths]
+    contents = [read_recording(path) for path in paths]
     for key in ("task", "seed"):
         first, second = (content["episode"].get(key) for content in contents)
         if first != second:
@@ -60,7 +60,7 @@ def _encode(paths: Sequence[Path], contents: Sequence[dict[str, Any]]) -> bytes:
 
 def _column(side: str, method: str, content: dict[str, Any]) -> rrb.Vertical:
     """One method's views: camera and path, outcomes of the tokens, forwards, time, the current decode. content: of its
-    recording, see `read_back`."""
+    recording, see `read_recording`."""
     entities, facts = content["entities"], content["episode"]
     outcome = "success" if facts.get("success") else "failure"
     top: list[rrb.View] = [rrb.Spatial3DView(origin=f"/{side}/world", name="End effector")]

@@ -51,6 +51,15 @@ class TokenOutcome:
         return OUTCOMES[self.kind].symbol if token is None else str(token)
 
 
+Chunks = Sequence[Sequence[TokenOutcome]]
+"""Outcomes of the tokens of each decode's chunk."""
+
+
+def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
+    """r per DoF of a decode, in bins; empty without an acceptance rule that has a threshold."""
+    return next((r.threshold for r in decode.rounds if r.threshold), ())
+
+
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
     """N, the tokens of a chunk; at least what any decode judged, committed or executed, in whole control steps."""
     most = 1

@@ -19,7 +19,7 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import regular
 
 if TYPE_CHECKING:
-    from rerun.chunk import RrdReader
+    from rerun.chunk import Chunk, RrdReader
 
 MOST_OPENED = 16
 """Largest number of recordings that one command opens; more would fill the viewer's memory."""
@@ -60,18 +60,15 @@ def open_recording(paths: Sequence[Path]) -> str:
     """Opens recordings in the Rerun viewer without waiting for it; without a display, names the commands that do.
 
     Args:
-        paths: recordings, the newest first; at most MOST_OPENED are opened.
+        paths: one recording or more, the newest first; at most MOST_OPENED are opened.
 
     Returns:
         A sentence about what was opened, or the commands to type.
 
     Raises:
-        UsageError: no paths.
         KervError: a recording is damaged, or the viewer did not start.
     """
-    if not paths:
-        raise UsageError("no recording to open")
-    chosen = list(paths)[:MOST_OPENED]
+    chosen = paths[:MOST_OPENED]
     for path in chosen:
         _reader(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
@@ -165,7 +162,7 @@ def _start(command: list[str]) -> None:
             raise KervError(f"the Rerun viewer ended at once: {_last_line(log.read(), status)}")
 
 
-def read_back(path: Path) -> dict[str, Any]:
+def read_recording(path: Path) -> dict[str, Any]:
     """The contents of a recording, read chunk by chunk.
 
     Returns:
@@ -209,8 +206,8 @@ def read_back(path: Path) -> dict[str, Any]:
 
 
 def read_summary(path: Path) -> str:
-    """`read_back` as text; errors as there."""
-    contents = read_back(path)
+    """`read_recording` as text; errors as there."""
+    contents = read_recording(path)
     lines = [f"{path}: {contents['name'] or contents['recording']}, {contents['bytes'] / 1e6:.2f} MB"]
     if "step" in contents["timelines"]:
         first, last = contents["timelines"]["step"]
@@ -221,7 +218,7 @@ def read_summary(path: Path) -> str:
     return "\n".join(lines)
 
 
-def _figure(value: Any) -> str:
+def _figure(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -247,12 +244,12 @@ def _reader(path: Path) -> RrdReader:
     return reader
 
 
-def chunks_of(path: Path) -> list[Any]:
+def chunks_of(path: Path) -> list[Chunk]:
     """Every chunk of a recording. KervError: it is missing or damaged."""
     return _chunks(_reader(path), path)
 
 
-def _chunks(reader: RrdReader, path: Path) -> list[Any]:
+def _chunks(reader: RrdReader, path: Path) -> list[Chunk]:
     try:
         return list(reader.stream())
     except (RuntimeError, OSError, ValueError) as error:
