@@ -68,6 +68,23 @@ def test_an_episode_begins_with_a_verification() -> None:
     assert modes(decoder, 3) == "vsv"
 
 
+@torch.inference_mode()
+def test_trust_that_is_kept_outlasts_the_episode_of_its_task_alone() -> None:
+    target = MockTarget()
+    source = near(target)
+    decoder = decoder_of(source, target, keeps=True, tolerance=0.0)
+    begun = [modes(decoder, 5)]
+    for task in ("t", "other", "t"):
+        decoder.finish(True)
+        decoder.reset(task, 1, np.zeros(3))
+        begun.append(modes(decoder, 6))
+    assert begun == ["vsvss", "ssvsss", "vsvssv", "ssssvs"]
+    source.drafted = near(target, bins=1).drafted
+    assert modes(decoder, 9) == "sssssssvv"
+    decoder.reset("t", 2, np.zeros(3))
+    assert modes(decoder, 2) == "vv"
+
+
 class ByPlace(MockTarget):
     """A target whose tokens depend on their places alone, so that what it says behind a rejected token is known."""
 

@@ -119,12 +119,12 @@ def complete_settings(settings: Plain) -> dict[str, Any]:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Whether an episode's result depends on the episodes before it in its cell: a proposer that remembers them, or a
-    skip level that feedback moves."""
+    """Whether an episode's result depends on the episodes before it in its cell: a proposer that remembers them, a
+    streak that keeps its trust, or a skip level that feedback moves."""
     skip, drafts = settings.get("skip", {}), [settings.get(kind, {}) for kind in ("proposer", "prefill_draft")]
     names = [name for d in drafts for name in (d.get("kind"), *d.get("sources", ()), *d.get("fallback", ()))]
     remembers = {name for name in parts("proposer") if part_of("proposer", name).traits.get("remembers")}
-    return bool(skip.get("up") or skip.get("down") or remembers.intersection(names))
+    return any(skip.get(name) for name in ("up", "down", "keeps")) or bool(remembers.intersection(names))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:
