@@ -139,7 +139,7 @@ def assert_same(
 
     before, after = (made("retrieval" if seed % 2 else "early", 1) if inside else None), made("drafter", 0)
     relaxed, sequence = Relaxed(space, strict_dofs), ByGroup(space, GROUP_LIMIT, TOKEN_LIMIT)
-    rules = {"relaxed": relaxed, "sequence": sequence, "hybrid": ByProposer(sequence, relaxed)}
+    rules = {"relaxed": relaxed, "sequence": sequence, "hybrid": ByProposer(space, strict_dofs, retrieved=sequence)}
     acceptance = rules.get(kind)  # none: strict
     parts = Parts(acceptance, Fixed(r), prefill_draft=before, proposer=after)
     result = Decoder(target, parts).decode_prompt(prompt)

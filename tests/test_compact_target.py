@@ -64,10 +64,10 @@ def test_metaworlds_columns_are_what_the_shipped_weights_were_trained_on() -> No
     velocity = ((states[:, :18] - states[:, 18:36]) / 0.01).clamp(-3, 3)
     beyond = [states[:, 7:18], velocity, *relative(second - hand), *relative(goal - second)]
     space = SPEC.observation
-    found = scene_features(states[:, :4], places_of(states, space), torch.tensor(space.centre))
-    assert torch.equal(found, torch.cat([*absolute, *vectors], 1))
+    features = scene_features(states[:, :4], places_of(states, space), torch.tensor(space.centre))
+    assert torch.equal(features, torch.cat([*absolute, *vectors], 1))
     assert torch.equal(privileged_features(states[:, :4], states, space), torch.cat(beyond, 1))
-    assert found.shape[1] + torch.cat(beyond, 1).shape[1] == 69
+    assert features.shape[1] + torch.cat(beyond, 1).shape[1] == 69
 
 
 @given(felt=st.integers(3, 9), places=st.integers(1, 5), seed=st.integers(0, 1000))
@@ -248,16 +248,16 @@ def test_a_padded_bucket_computes_its_tokens(tokens: int) -> None:
     trunk = Trunk(32, 2, 2, 48).eval()
     x, positions = torch.randn(1, 20 + tokens, 32), torch.arange(20 + tokens)
     with torch.inference_mode():
-        wanted = trunk.run_layers(x, positions, None, None)[:, 20:]
+        uncached = trunk.run_layers(x, positions, None, None)[:, 20:]
         cache = trunk.new_cache(1, 60, fixed=True)
         assert isinstance(cache, CapturedCache)
         for first, last in ((0, 20), (20, 20 + tokens)):
             mask = attention_mask(None, last - first, cache, x)
             assert mask is not None
-            found = cache.run(trunk.compute, x[:, first:last], positions[first:last], mask)
+            in_buckets = cache.run(trunk.compute, x[:, first:last], positions[first:last], mask)
             cache.length = last
     assert cache.steps.keys() == {32, bucket(tokens)}
-    assert torch.allclose(found, wanted, atol=1e-5)
+    assert torch.allclose(in_buckets, uncached, atol=1e-5)
 
 
 def test_buckets_hold_their_tokens() -> None:

@@ -26,21 +26,21 @@ def test_a_captured_graph_computes_what_eager_forwards_do() -> None:
     with torch.inference_mode():
         for fixed in (True, False):
             cache = trunk.new_cache(1, 48, fixed)
-            found = []
+            hidden = []
             for first, last in ((0, 20), (20, 21), (21, 22), (22, 40)):
-                found.append(trunk(x[:, first:last], torch.arange(first, last, device="cuda"), cache))
+                hidden.append(trunk(x[:, first:last], torch.arange(first, last, device="cuda"), cache))
             assert isinstance(cache, CapturedCache) == fixed
             assert not fixed or cache.steps
-            outputs.append(torch.cat(found, 1))
+            outputs.append(torch.cat(hidden, 1))
     assert torch.allclose(*outputs, atol=1e-4)
 
 
 def test_strict_methods_decode_the_baselines_tokens() -> None:
     model = open_model(BenchSettings(model="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
-    wanted = Decoder(model.target).decode(model.observation)
-    assert sum(wanted.phases.values()) == pytest.approx(wanted.seconds, rel=0.2)
+    autoregressive = Decoder(model.target).decode(model.observation)
+    assert sum(autoregressive.phases.values()) == pytest.approx(autoregressive.seconds, rel=0.2)
     for proposer in (JacobiProposer(), DrafterProposer(model.drafter, model.target, 5, 3, 12)):
-        assert Decoder(model.target, Parts(proposer=proposer)).decode(model.observation).tokens == wanted.tokens
+        assert Decoder(model.target, Parts(proposer=proposer)).decode(model.observation).tokens == autoregressive.tokens
 
 
 def test_a_round_waits_once() -> None:

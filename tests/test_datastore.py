@@ -145,11 +145,11 @@ def test_the_search_is_brute_force_with_ties_in_stored_order(seed: int, n: int, 
         ranked = [row for row in range(before, before + n) if without is None or seeds[row] != without]
         ranked = sorted(ranked, key=lambda row: -sum(int(a) * int(b) for a, b in zip(vectors[row], key, strict=True)))
         ranked = ranked[:k]
-        found = store.query(key, "b", k, without)
-        assert found.steps.tolist() == ranked
-        assert found.similarity.dtype == np.float32
-        assert found.similarity.tolist() == [float(vectors[row] @ key) for row in ranked]
-        assert found.chunks.tolist() == [[row % 251, row // 251] for row in ranked]
+        neighbours = store.query(key, "b", k, without)
+        assert neighbours.steps.tolist() == ranked
+        assert neighbours.similarity.dtype == np.float32
+        assert neighbours.similarity.tolist() == [float(vectors[row] @ key) for row in ranked]
+        assert neighbours.chunks.tolist() == [[row % 251, row // 251] for row in ranked]
 
 
 @pytest.mark.bits
@@ -164,10 +164,10 @@ def test_the_search_is_exact_at_real_size_and_duplicates_keep_their_order() -> N
         for key in vectors[[1, 3, rows // 3]]:
             twins = [row for row in store.query(key, "a", rows).steps.tolist() if row in copies]
             assert twins == copies
-            found = store.query(key, "a", 5)
+            neighbours = store.query(key, "a", 5)
             exact = (vectors.astype(np.float64) @ key.astype(np.float64)).astype(np.float32)
-            assert found.steps.tolist() == np.argsort(-exact, kind="stable")[:5].tolist()
-            assert found.similarity == pytest.approx(exact[found.steps], abs=1e-6)
+            assert neighbours.steps.tolist() == np.argsort(-exact, kind="stable")[:5].tolist()
+            assert neighbours.similarity == pytest.approx(exact[neighbours.steps], abs=1e-6)
 
 
 @pytest.mark.bits
@@ -210,9 +210,9 @@ def test_every_backend_opens_a_datastore(results: Path, name: str) -> None:
         for task, shard in store.shards.items():
             for row in range(shard.start, shard.stop):
                 asked_for = (store.vectors[row], task, 3, int(store.seeds[row]) if row % 2 else None)
-                expected, found = store.query(*asked_for), other.query(*asked_for)
+                expected, neighbours = store.query(*asked_for), other.query(*asked_for)
                 for field in ("similarity", "chunks", "seeds", "steps", "left"):
-                    assert np.array_equal(getattr(found, field), getattr(expected, field))
+                    assert np.array_equal(getattr(neighbours, field), getattr(expected, field))
 
 
 def test_a_task_that_is_not_there_gets_one_line(results: Path) -> None:
@@ -252,11 +252,11 @@ def test_an_entry_is_found_by_its_own_observation(results: Path, name: str) -> N
         for step in (0, 4):
             state, images = shown.states[step], dict.fromkeys(target.cameras, shown.frames[step // 2])
             prompt = target.encode(Observation(state[:4], state, instruction, images))
-            found = store.query(store.key_of(store.pooled(prompt, target).numpy()), "reach-v3", 3)
-            assert (found.seeds[0], found.steps[0], found.left[0]) == (1, step, LENGTHS[1] - step)
-            assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
-            assert (np.diff(found.similarity) <= 0).all()
-            assert (found.chunks.shape, found.chunks.dtype) == ((3, 16), np.int64)
+            neighbours = store.query(store.key_of(store.pooled(prompt, target).numpy()), "reach-v3", 3)
+            assert (neighbours.seeds[0], neighbours.steps[0], neighbours.left[0]) == (1, step, LENGTHS[1] - step)
+            assert neighbours.similarity[0] == pytest.approx(1.0, abs=1e-5)
+            assert (np.diff(neighbours.similarity) <= 0).all()
+            assert (neighbours.chunks.shape, neighbours.chunks.dtype) == ((3, 16), np.int64)
 
 
 def test_the_key_pools_the_named_parts_of_the_prompt(results: Path) -> None:
@@ -308,11 +308,11 @@ def test_the_directions_hold_the_keys_squared_length() -> None:
     """Against the singular vectors of the keys."""
     rng = np.random.default_rng(0)
     keys = (rng.normal(size=(400, 6)) * [9, 7, 5, 0.2, 0.1, 0.1]) @ np.linalg.qr(rng.normal(size=(6, 6)))[0]
-    found = directions(keys.astype(np.float32), 3)
-    assert (found.shape, found.dtype) == ((6, 3), np.float32)
-    wanted = np.linalg.svd(keys, full_matrices=False)[2][:3].T
-    assert np.abs((found * wanted).sum(0)) == pytest.approx(np.ones(3), abs=1e-5)
-    assert found.T @ found == pytest.approx(np.eye(3), abs=1e-6)
+    basis = directions(keys.astype(np.float32), 3)
+    assert (basis.shape, basis.dtype) == ((6, 3), np.float32)
+    expected = np.linalg.svd(keys, full_matrices=False)[2][:3].T
+    assert np.abs((basis * expected).sum(0)) == pytest.approx(np.ones(3), abs=1e-5)
+    assert basis.T @ basis == pytest.approx(np.eye(3), abs=1e-6)
 
 
 def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(copy: Path) -> None:
@@ -339,9 +339,9 @@ def test_projected_keys_find_nearly_always_the_same_neighbour_in_a_smaller_file(
     shown, instruction = smooth("reach-v3", 1, LENGTHS[1], TAIL, 96), SPEC.task("reach").instruction
     with torch.inference_mode():  # what is looked up while decoding is projected, too
         prompt = target.encode(Observation(shown.states[2][:4], shown.states[2], instruction))
-    found = short.query(short.key_of(short.pooled(prompt, target).numpy()), "reach-v3", 1)
-    assert (found.seeds[0], found.steps[0]) == (1, 2)
-    assert found.similarity[0] == pytest.approx(1.0, abs=1e-5)
+    neighbours = short.query(short.key_of(short.pooled(prompt, target).numpy()), "reach-v3", 1)
+    assert (neighbours.seeds[0], neighbours.steps[0]) == (1, 2)
+    assert neighbours.similarity[0] == pytest.approx(1.0, abs=1e-5)
 
 
 def test_a_projection_that_was_changed_is_refused(copy: Path) -> None:
@@ -577,15 +577,15 @@ def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
 
 def combinations(chunks: np.ndarray, cuts: list[tuple[int, int, bool]]) -> set[tuple[int, ...]]:
     """docs/methods.md §4.2: one neighbour per group; a strict group from one that gave the group before it."""
-    found = set()
+    paths = set()
     for owners in product(range(len(chunks)), repeat=len(cuts)):
         parts = [tuple(chunks[i, a:b].tolist()) for i, (a, b, _) in zip(owners, cuts, strict=True)]
         if all(
             not gripper or n == 0 or tuple(chunks[owners[n], slice(*cuts[n - 1][:2])].tolist()) == parts[n - 1]
             for n, (_, _, gripper) in enumerate(cuts)
         ):
-            found.add(tuple(token for part in parts for token in part))
-    return found
+            paths.add(tuple(token for part in parts for token in part))
+    return paths
 
 
 @settings(deadline=None)

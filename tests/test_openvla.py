@@ -45,8 +45,8 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def imported(checkpoint: Path, results: Path, **chosen: Any) -> Path:
-    wanted = {"prompt_tokens": 120, **chosen}
-    return import_checkpoint(BuildTargetSettings(checkpoint=str(checkpoint), results=str(results), **wanted))[0]
+    options = {"prompt_tokens": 120, **chosen}
+    return import_checkpoint(BuildTargetSettings(checkpoint=str(checkpoint), results=str(results), **options))[0]
 
 
 def loaded(folder: Path, dtype: torch.dtype = torch.float32) -> OpenVLATarget:
@@ -233,12 +233,12 @@ class Composed:
     def generate(self, pixels: torch.Tensor, ids: list[int], count: int) -> tuple[list[int], torch.Tensor]:
         """Greedy over *all* ids -> `count` ids and the logits before each (count, ids)."""
         words = self.llama.model.embed_tokens(torch.tensor([ids]))
-        x, found, logits = torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1), [], []
+        x, tokens, logits = torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1), [], []
         for _ in range(count):
             logits.append(self.llama(inputs_embeds=x).logits[0, -1])
-            found.append(int(logits[-1].argmax()))
-            x = torch.cat([x, self.llama.model.embed_tokens(torch.tensor([found[-1:]]))], 1)
-        return found, torch.stack(logits)
+            tokens.append(int(logits[-1].argmax()))
+            x = torch.cat([x, self.llama.model.embed_tokens(torch.tensor([tokens[-1:]]))], 1)
+        return tokens, torch.stack(logits)
 
 
 def reference_pixels(image: np.ndarray, size: int) -> torch.Tensor:
@@ -324,17 +324,17 @@ def lanczos(pixels: np.ndarray, size: int) -> np.ndarray:
 def test_a_frame_is_prepared_as_in_openvlas_evaluation_on_libero() -> None:
     smooth = np.linspace(40, 200, 64)[:, None, None] + np.array([0.0, 20.0, -30.0]) + np.zeros((64, 64, 3))
     image = smooth.round().astype(np.uint8)
-    wanted = lanczos(lanczos(smooth, 56).swapaxes(0, 1), 56).swapaxes(0, 1)
+    expected = lanczos(lanczos(smooth, 56).swapaxes(0, 1), 56).swapaxes(0, 1)
     prepared = as_in_libero(image, 56)
     assert prepared.shape == (56, 56, 3)
-    assert np.abs(prepared - wanted).max() < 4  # JPEG's own error on a smooth frame
+    assert np.abs(prepared - expected).max() < 4  # JPEG's own error on a smooth frame
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8)
     file = io.BytesIO()
     Image.fromarray(noise).save(file, "JPEG", quality=95, subsampling=2)
     read = np.asarray(Image.open(file)).astype(float)
     assert np.abs(read - noise).mean() > 10  # colour at half resolution does not survive as noise
-    wanted = np.clip(lanczos(lanczos(read, 56).swapaxes(0, 1), 56).swapaxes(0, 1).round(), 0, 255)
-    assert np.abs(as_in_libero(noise, 56) - wanted).max() <= 1
+    expected = np.clip(lanczos(lanczos(read, 56).swapaxes(0, 1), 56).swapaxes(0, 1).round(), 0, 255)
+    assert np.abs(as_in_libero(noise, 56) - expected).max() <= 1
 
 
 def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
@@ -343,10 +343,10 @@ def test_the_crop_is_tensorflows(target: OpenVLATarget) -> None:
     axis = torch.linspace(-side, side, 56)  # of grid_sample: −1 and 1 are the centres of the outermost pixels
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)[None]
     floats = torch.from_numpy(image).permute(2, 0, 1)[None] / 255
-    wanted = torch.nn.functional.grid_sample(floats, grid, align_corners=True)[0].permute(1, 2, 0)
-    wanted = (wanted.clamp(0, 1) * 255.5).floor().clamp(0, 255).numpy()
-    assert np.abs(cropped(image, 56).astype(float) - wanted).max() <= 1  # a sum at the edge of a grey level
-    assert (cropped(image, 56) == wanted).mean() > 0.999
+    expected = torch.nn.functional.grid_sample(floats, grid, align_corners=True)[0].permute(1, 2, 0)
+    expected = (expected.clamp(0, 1) * 255.5).floor().clamp(0, 255).numpy()
+    assert np.abs(cropped(image, 56).astype(float) - expected).max() <= 1  # a sum at the edge of a grey level
+    assert (cropped(image, 56) == expected).mean() > 0.999
     whole, part = (pixels_of(image, TINY, target.normalisations, crop) for crop in (False, True))
     assert whole.shape == part.shape == (1, 6, 56, 56)
     assert not torch.allclose(whole, part)

@@ -37,17 +37,17 @@ def run(trunk: Trunk, x: torch.Tensor, tree: Draft) -> list[torch.Tensor]:
     """A prefill, a tree, its commit, two single tokens, a batch of two; then the tree in the prefill."""
     prompt, x = 20, x.to(trunk.norm.weight.dtype)
     cache = trunk.new_cache(1, 64)
-    found = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
+    hidden = [trunk(x[:, :prompt], torch.arange(prompt), cache)]
     positions = tree.positions(prompt, 1, x.device)
     drafted = x[:, prompt : prompt + 1 + len(tree)]
-    found.append(trunk(drafted, positions, cache, tree.visible(1)))
+    hidden.append(trunk(drafted, positions, cache, tree.visible(1)))
     cache.compact(prompt, torch.tensor([prompt, prompt + 2, prompt + 4]))
-    found += [trunk(x[:, -i][:, None], torch.tensor([prompt + i]), cache) for i in (3, 4)]
+    hidden += [trunk(x[:, -i][:, None], torch.tensor([prompt + i]), cache) for i in (3, 4)]
     cache.length = 0
     whole = tree.positions(0, prompt, x.device)
-    found.append(trunk(x[:, : prompt + len(tree)], whole, cache, tree.visible(prompt)))
-    found.append(trunk(x[:, :10].view(2, 5, -1), torch.arange(5)))
-    return found
+    hidden.append(trunk(x[:, : prompt + len(tree)], whole, cache, tree.visible(prompt)))
+    hidden.append(trunk(x[:, :10].view(2, 5, -1), torch.arange(5)))
+    return hidden
 
 
 def test_the_packed_trunk_is_the_trunk(trunks: tuple[Trunk, Trunk]) -> None:

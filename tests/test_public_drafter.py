@@ -83,8 +83,8 @@ def test_it_computes_what_the_public_layer_does(target: OpenVLATarget) -> None:
     mask = torch.full((9, 9), -torch.inf).triu(1)[None, None]
     turned = LlamaRotaryEmbedding(config)(x, positions[None])
     out = layer(x, attention_mask=mask, position_ids=positions[None], position_embeddings=turned)
-    wanted = out[0] if isinstance(out, tuple) else out
-    torch.testing.assert_close(drafter(following, hidden, positions), wanted.view(1, 9, 64), atol=1e-5, rtol=1e-5)
+    reference = out[0] if isinstance(out, tuple) else out
+    torch.testing.assert_close(drafter(following, hidden, positions), reference.view(1, 9, 64), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.bits

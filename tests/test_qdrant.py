@@ -82,11 +82,11 @@ def test_the_neighbours_are_those_of_exact_search(searched: Open, kind: str, wid
     for key in keys:
         for task in ROWS:
             for k, without in ((1, None), (5, None), (5, 2), (17, 0), (1000, None), (1000, 3)):
-                expected, found = exact.query(key, task, k, without), qdrant.query(key, task, k, without)
-                assert found.steps.tolist() == expected.steps.tolist(), (task, k, without)
-                assert found.similarity.tolist() == expected.similarity.tolist()
-                assert found.chunks.tolist() == expected.chunks.tolist()
-                assert without is None or without not in found.seeds
+                expected, actual = exact.query(key, task, k, without), qdrant.query(key, task, k, without)
+                assert actual.steps.tolist() == expected.steps.tolist(), (task, k, without)
+                assert actual.similarity.tolist() == expected.similarity.tolist()
+                assert actual.chunks.tolist() == expected.chunks.tolist()
+                assert without is None or without not in actual.seeds
 
 
 def test_a_server_keeps_a_datastore_and_completes_one_that_was_cut(local_server: Any) -> None:

@@ -29,7 +29,7 @@ HOST_PHASES = ("propose", *_HOST)
 """Phases of a recorded decode whose seconds do not depend on the target's size, where the drafter does not draft."""
 READ_PHASES = ("vision", *HOST_PHASES)
 """Phases whose recorded seconds the model reads: of vision only whether there were any."""
-_UNSAID = (1.0, *[0.0] * len(HOST_PHASES))  # of a record that names no such phase: it encoded
+_ABSENT = (1.0, *[0.0] * len(HOST_PHASES))  # of `READ_PHASES` that a record lacks: it encoded, the rest took no time
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Profile:
     """Seconds of every forward by its rows, and of drafts. Between measured rows times are interpolated, behind the
     last ones continued in a straight line.
 
-    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks; 0: not said. about: target,
-    machine, versions.
+    prompt: P. phases: kind -> (rows, seconds), rows increasing. tokens: N of the chunks; 0: not recorded. about:
+    target, machine, versions.
     """
 
     prompt: int
@@ -154,31 +154,31 @@ def work_of(
         phases: (decodes,) seconds of each of `READ_PHASES`.
         looked_up: (decodes,) bool: something was retrieved.
         size: N.
-        drafter: the proposer's `depth` and `top_k`; None: not known, a draft of many nodes is a tree.
+        drafter: the proposer's `depth` and `top_k`; None: not recorded, a draft of many nodes is then a tree.
     """
-    decodes, every = len(counts), np.repeat(np.arange(len(counts)), counts)
+    decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer = rounds["mode"], rounds["proposer"]
     drafts, parallel = (rounds["tree_size"] > 0) & (proposer == DRAFTER), mode == PARALLEL
-    has_drafter = np.bincount(every, drafts, decodes) > 0
+    has_drafter = np.bincount(decode, drafts, decodes) > 0
     nodes = np.where(parallel, size, rounds["tree_size"])
     depth, top_k = drafter or (_LEVELS, 0)
     tree = drafts & ((nodes >= _WIDE) if drafter is None else top_k > 1)
     levels = np.where(tree, np.minimum(depth, size - rounds["start"] - 1), nodes) * drafts
     host, propose = sum(phases[name] for name in _HOST), np.where(has_drafter, 0.0, phases["propose"])
     kinds = {kind: [name for name, of in _SOURCES.items() if of == kind] for kind in set(_SOURCES.values())}
-    others = {kind: np.bincount(every, np.isin(proposer, names), decodes) > 0 for kind, names in kinds.items()}
+    others = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in kinds.items()}
     others["retrieval"] |= looked_up
-    last = np.diff(every, append=decodes) > 0
+    last = np.diff(decode, append=decodes) > 0
     forward = mode != "skip"
     accepted = np.where(parallel, 0, rounds["accepted"])
     return Work(
-        decode=every[forward],
+        decode=decode[forward],
         prefill=(rounds["start"] == 0)[forward],
         nodes=nodes[forward],
         accepted=accepted[forward],
         levels=levels[forward],
         tree=tree[forward],
-        feeds=(has_drafter[every] & ~last)[forward],
+        feeds=(has_drafter[decode] & ~last)[forward],
         host=np.asarray(host),
         encoded=phases["vision"] != 0,
         propose=propose,
@@ -192,7 +192,7 @@ def work_of_record(decode: DecodeRecord) -> Work:
     return work_of(
         {name: np.array([getattr(one, name) for one in decode.rounds]) for name in names},
         np.array([len(decode.rounds)]),
-        {name: np.array([decode.phases.get(name, unsaid)]) for name, unsaid in zip(READ_PHASES, _UNSAID, strict=True)},
+        {name: np.array([decode.phases.get(name, absent)]) for name, absent in zip(READ_PHASES, _ABSENT, strict=True)},
         np.array([decode.similarity is not None]),
         decode.size or len(decode.tokens),
     )

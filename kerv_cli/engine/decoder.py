@@ -127,10 +127,10 @@ class Decoder:
         return record_of(chunk, actions, seconds, clock.phases, predicted)
 
     def _encoding(self, observation: Observation, clock: Clock) -> Callable[[], Tensor]:
-        """What encodes the observation's prompt, when it is first read."""
+        """A function that encodes the observation; its seconds are added to the phase `vision`."""
 
         def encode() -> Tensor:
-            clock.lap("propose")  # whoever asks first drafts from it
+            clock.lap("propose")  # the first part that reads the prompt drafts from it
             prompt = self.target.encode(observation)
             clock.lap("vision")
             return prompt
@@ -262,8 +262,8 @@ class Decoder:
         """Forwards the last committed token and the draft's n rows -> hidden (1, 1 + n, E), and the draft with its
         target tokens on the host."""
         tokens = draft.tokens_behind(chunk.tokens[-1], self.target.device)
-        at = chunk.prompt_length + len(chunk.tokens) - 1
-        hidden = self.forward(self.target.embed(tokens[None]), draft, at, 1, chunk)
+        start = chunk.prompt_length + len(chunk.tokens) - 1
+        hidden = self.forward(self.target.embed(tokens[None]), draft, start, 1, chunk)
         return hidden, self.read(chunk, draft, self.target.head(hidden)[0].argmax(-1))
 
     def forward(self, x: Tensor, draft: Draft, start: int, before: int, chunk: Chunk) -> Tensor:

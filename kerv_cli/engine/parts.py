@@ -72,7 +72,8 @@ class Boundary(Protocol):
 
 
 class Skip(ABC):
-    """Decides, before the target verifies anything, whether a chunk is executed as it is. phase: of its time."""
+    """Decides, before the target verifies anything, whether a chunk is executed without a verification. phase: of
+    `PHASES`, the one that the time of `take` is added to."""
 
     phase = "propose"
 
@@ -87,7 +88,7 @@ class Skip(ABC):
         """Completes the chunk, if it may be executed unverified -> whether it did."""
 
     def verified(self, chunk: Chunk) -> None:  # noqa: B027
-        """Told when the prefill of a chunk that was not taken has judged the in-prefill draft."""
+        """The prefill of a chunk that was not taken has judged the in-prefill draft."""
 
 
 @runtime_checkable

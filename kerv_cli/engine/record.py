@@ -70,8 +70,8 @@ class Delay:
 
 @dataclass(frozen=True)
 class Look:
-    """A look at the world while a chunk is executed. keeps: whether the rest of the chunk is. seconds, phases: of
-    inference, as in `DecodeRecord`."""
+    """A look at the world while a chunk is executed. keeps: whether the rest of the chunk is executed too. seconds,
+    phases: of inference, as in `DecodeRecord`."""
 
     keeps: bool
     seconds: float
@@ -98,8 +98,8 @@ class DecodeRecord:
     reason: str | None = None  # why a skip rule executed the draft unverified or had it verified, where it says so
     deviation: float | None = None  # mean abs difference to AR's chunk from the same observation, where sampled
     delay: Delay | None = None  # None: the world waited
-    looks: int = 0  # at the world while the chunk was executed; their time is in `seconds` and `phases`
-    abandoned: int = 0  # control steps of the chunk that were given up after the last of them
+    looks: int = 0  # looks at the world while the chunk was executed; their time is in `seconds` and `phases`
+    abandoned: int = 0  # control steps of the chunk that were given up after the last look
 
     def with_look(self, look: Look, left: int) -> DecodeRecord:
         """After a look, before which `left` control steps of the chunk were not yet executed."""

@@ -53,11 +53,6 @@ class Method:
         return {kind: part_of(kind, self.settings[kind].kind) for kind in METHOD_KINDS}
 
     @property
-    def names(self) -> dict[str, str]:
-        """Kind -> name of the part."""
-        return {kind: self.settings[kind].kind for kind in METHOD_KINDS}
-
-    @property
     def needs(self) -> tuple[str, ...]:
         """The kinds of artifacts that its parts read, each once, in the order of its parts."""
         kinds = (need for kind, part in self.parts.items() for need in part.needs(self.settings[kind]))
@@ -105,9 +100,10 @@ class Method:
             )
         if parallel and not has_pass:
             raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
-        idle = [kind for kind in ("prefill_draft", "proposer") if self.names[kind] != "none"]
+        drafts = {kind: self.parts[kind].name for kind in ("prefill_draft", "proposer")}
+        idle = [f"{kind}={name}" for kind, name in drafts.items() if name != "none"]
         if has_pass and idle:
-            raise UsageError(f"skip=parallel with {idle[0]}={self.names[idle[0]]}: nothing is drafted, leave it out")
+            raise UsageError(f"skip=parallel with {idle[0]}: nothing is drafted, leave it out")
 
     def _check_skip(self) -> None:
         """What executes drafts unverified has one source that drafts whole chunks before the prefill."""
@@ -123,7 +119,7 @@ class Method:
         """Several episodes at a time go through the same forwards."""
         if batch == 1:
             return
-        names = self.names
+        names = {kind: part.name for kind, part in self.parts.items()}
         if (names["prefill_draft"], names["proposer"], names["skip"]) not in _BATCHED:
             *others, last = _BATCHED.values()
             raise UsageError(

@@ -30,12 +30,12 @@ TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
 
 
 @torch.inference_mode()
-def check_target(target: Target, observation: Observation, seed: int = 0) -> list[Finding]:
+def check_target(target: Target, observation: Observation) -> list[Finding]:
     """One finding per check. observation: one that the target can encode."""
     findings = run([("members", lambda: _members(target))])
     if not findings[0].ok:
         return findings
-    trial = Trial(target, observation, seed)
+    trial = Trial(target, observation)
     findings += run([("encode", trial.encode), ("embed and head", trial.embed_and_head)])
     if not all(finding.ok for finding in findings):
         return findings
@@ -46,9 +46,9 @@ def check_target(target: Target, observation: Observation, seed: int = 0) -> lis
         ("tree attention", trial.tree),
         ("commit of a path", trial.commit),
         ("draft in the prefill", trial.prefill_draft),
-        ("cache used again", trial.again),
+        ("cache used again", trial.reused_cache),
         ("batch", trial.batch),
-        ("greedy chunk", trial.chunk),
+        ("greedy chunk", trial.greedy_chunk),
     ]
     return findings + run(checks)
 
@@ -75,11 +75,10 @@ class Trial:
 
     target: Target
     observation: Observation
-    seed: int
 
     def __post_init__(self) -> None:
         self.worst = 0.0
-        self.random = torch.Generator().manual_seed(self.seed)
+        self.random = torch.Generator().manual_seed(0)
         size = max(len(TREE), self.target.chunk * self.target.actions.dofs) + 2
         self.capacity = self.target.max_prompt + size + len(TREE)
 
@@ -120,7 +119,7 @@ class Trial:
         x = torch.cat([self.prompt, self.target.embed(tokens)], 1) if tokens.shape[1] else self.prompt
         return self.target.forward(x, torch.arange(x.shape[1], device=x.device))
 
-    def same(self, hidden: Tensor, expected: Tensor, what: str) -> None:
+    def compare(self, hidden: Tensor, expected: Tensor, what: str) -> None:
         """Compares hidden states (…, E) by their logits.
 
         Raises:
@@ -132,16 +131,16 @@ class Trial:
         if not gap <= TOLERANCE.get(self.prompt.dtype, 2e-4):
             raise Failed(f"{what}: logits differ by {gap:.2g} of their spread, rounding explains less")
 
-    def says(self) -> str:
-        """The largest difference so far."""
+    def largest_gap(self) -> str:
+        """The largest difference of logits so far, in words."""
         return f"logits within {self.worst:.1g} of their spread"
 
     def causality(self) -> str:
         """A token must not see what comes after it."""
         length = self.prompt.shape[1]
         whole = self.plain(self.tokens)
-        self.same(self.plain(self.tokens[:, :4])[:, : length + 4], whole[:, : length + 4], "a token sees later ones")
-        return self.says()
+        self.compare(self.plain(self.tokens[:, :4])[:, : length + 4], whole[:, : length + 4], "a token sees later ones")
+        return self.largest_gap()
 
     def cached(self, lengths: Sequence[int]) -> tuple[Cache, list[Tensor]]:
         """Prompt, then the tokens in pieces of these lengths -> the cache and the pieces' hidden states."""
@@ -163,37 +162,37 @@ class Trial:
         """Tokens behind a cache, in pieces as decoding and verifying forward them, equal one forward."""
         _, hidden = self.cached(lengths)
         size = sum(lengths)
-        self.same(torch.cat(hidden, 1), self.plain(self.tokens[:, :size])[:, -size:], f"{what} behind a cache")
-        return self.says()
+        self.compare(torch.cat(hidden, 1), self.plain(self.tokens[:, :size])[:, -size:], f"{what} behind a cache")
+        return self.largest_gap()
 
-    def drafted(self) -> Tensor:
-        """Tokens (1, n) of a tree's nodes."""
+    def draw_tokens(self) -> Tensor:
+        """Random tokens (1, n) for the nodes of TREE."""
         drawn = torch.randint(self.target.actions.tokens, (1, len(TREE)), generator=self.random)
         return drawn.to(self.prompt.device)
 
-    def grown(self, cache: Cache, start: int, before: int) -> tuple[Tensor, Tensor]:
-        """Forwards the token at `start` and a tree behind it -> the tree's tokens (1, n), hidden (1, 1 + n, E). before:
-        tokens that were forwarded."""
-        drafted, at = self.drafted(), self.prompt.shape[1] + before
-        positions = TREE.positions(at, 1, self.prompt.device)
-        x = self.target.embed(torch.cat([self.tokens[:, start : start + 1], drafted], 1))
+    def forward_tree(self, cache: Cache) -> tuple[Tensor, Tensor]:
+        """Forwards the third token, behind two cached ones, and a tree behind it -> the tree's tokens (1, n), hidden
+        (1, 1 + n, E)."""
+        drafted = self.draw_tokens()
+        positions = TREE.positions(self.prompt.shape[1] + 2, 1, self.prompt.device)
+        x = self.target.embed(torch.cat([self.tokens[:, 2:3], drafted], 1))
         return drafted, self.target.forward(x, positions, cache, TREE.visible(1))
 
     def tree(self) -> str:
         """Every node of a tree equals the last token of its own path, forwarded alone."""
         cache, _ = self.cached([1, 1])
-        drafted, hidden = self.grown(cache, 2, 2)
+        drafted, hidden = self.forward_tree(cache)
         for node in range(len(TREE)):
             tokens = torch.cat([self.tokens[:, :3], drafted[:, TREE.tree.path_to(node)]], 1)
-            self.same(
+            self.compare(
                 hidden[:, node + 1], self.plain(tokens)[:, -1], f"node {node} of a tree sees others than its ancestors"
             )
-        return self.says()
+        return self.largest_gap()
 
     def commit(self) -> str:
         """Decoding goes on behind a committed path."""
         cache, _ = self.cached([1, 1])
-        drafted, _ = self.grown(cache, 2, 2)
+        drafted, _ = self.forward_tree(cache)
         path = TREE.tree.path_to(6)
         start = self.prompt.shape[1] + 2
         slots = torch.tensor([start, *(start + 1 + node for node in path)], device=self.prompt.device)
@@ -203,28 +202,30 @@ class Trial:
         position = torch.tensor([cache.length], device=self.prompt.device)
         hidden = self.target.forward(self.target.embed(self.tokens[:, 3:4]), position, cache)
         tokens = torch.cat([self.tokens[:, :3], drafted[:, path], self.tokens[:, 3:4]], 1)
-        self.same(hidden, self.plain(tokens)[:, -1:], "a token behind a committed path")
-        return self.says()
+        self.compare(hidden, self.plain(tokens)[:, -1:], "a token behind a committed path")
+        return self.largest_gap()
 
     def prefill_draft(self) -> str:
         """Prompt and a tree in one forward, as methods that draft before the prefill do."""
-        length, drafted = self.prompt.shape[1], self.drafted()
+        length, drafted = self.prompt.shape[1], self.draw_tokens()
         visible = TREE.visible(length)
         positions = TREE.positions(0, length, self.prompt.device)
         x = torch.cat([self.prompt, self.target.embed(drafted)], 1)
         hidden = self.target.forward(x, positions, self.target.new_cache(1, self.capacity), visible)
         for node in (1, 3, 6):
             expected = self.plain(drafted[:, TREE.tree.path_to(node)])[:, -1]
-            self.same(hidden[:, length + node], expected, f"node {node} of a tree in the prefill")
-        return self.says()
+            self.compare(hidden[:, length + node], expected, f"node {node} of a tree in the prefill")
+        return self.largest_gap()
 
-    def again(self) -> str:
+    def reused_cache(self) -> str:
         """A cache that is set back to length 0 holds nothing of before."""
         cache, _ = self.cached([5])
         cache.length = 0
         positions = torch.arange(self.prompt.shape[1], device=self.prompt.device)
-        self.same(self.target.forward(self.prompt, positions, cache), self.plain(self.tokens[:, :0]), "a reused cache")
-        return self.says()
+        self.compare(
+            self.target.forward(self.prompt, positions, cache), self.plain(self.tokens[:, :0]), "a reused cache"
+        )
+        return self.largest_gap()
 
     def batch(self) -> str:
         """Two prompts at once, as training a drafter does."""
@@ -232,10 +233,12 @@ class Trial:
         positions = torch.arange(prompts.shape[1], device=prompts.device)
         hidden = self.target.forward(prompts, positions, self.target.new_cache(2, self.capacity))
         for row in range(2):
-            self.same(hidden[row : row + 1], self.target.forward(prompts[row : row + 1], positions), "a batch of two")
-        return self.says()
+            self.compare(
+                hidden[row : row + 1], self.target.forward(prompts[row : row + 1], positions), "a batch of two"
+            )
+        return self.largest_gap()
 
-    def chunk(self) -> str:
+    def greedy_chunk(self) -> str:
         """Greedy decoding with a cache gives the tokens of greedy decoding without."""
         size, device = self.target.chunk * self.target.actions.dofs, self.prompt.device
         tokens = torch.zeros(1, 0, dtype=torch.long, device=device)

@@ -18,32 +18,31 @@ import numpy as np
 MOST = 0.75  # share of the wealth that a bet can lose
 
 
-def bets(values: np.ndarray, bound: float, delta: float, planned: int = 0) -> np.ndarray:
-    """(n,) bets per unit of bound − value, each from the values in front of it. planned: number of values for
-    which the bets are best; 0: n, which only a sample whose size is settled beforehand may use."""
+def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
+    """(n,) bets per unit of bound − value, each from the values in front of it and from n, which has to be settled
+    before the first value is seen."""
     count = np.arange(1, len(values) + 1)
     mean = (0.5 + np.cumsum(values)) / (count + 1)
     variance = (0.25 + np.cumsum((values - mean) ** 2)) / (count + 1)
     before = np.concatenate([[0.25], variance])[:-1]
-    aim = 2 * math.log(1 / delta) / (planned or max(1, len(values)))
+    aim = 2 * math.log(1 / delta) / max(1, len(values))
     return np.minimum(np.sqrt(aim / before), MOST / (1 - bound))
 
 
-def wealth(values: np.ndarray, bound: float, delta: float, planned: int = 0) -> np.ndarray:
+def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
     """(n,) e-value of "the mean is below the bound" behind every value.
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: in (0, 1).
         delta: the level that the bets aim at; the path is valid at every other.
-        planned: as in `bets`.
     """
-    return np.exp(np.cumsum(np.log1p(bets(values, bound, delta, planned) * (bound - values))))
+    return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 
 
-def p_value(values: np.ndarray, bound: float, delta: float, planned: int = 0) -> float:
+def p_value(values: np.ndarray, bound: float, delta: float) -> float:
     """Of the hypothesis that the mean is `bound` or more, however often it was looked at; 1 without values."""
-    return float(1 / max(1.0, wealth(values, bound, delta, planned).max(initial=1.0)))
+    return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))
 
 
 def more_to_decide(values: np.ndarray, bound: float, delta: float) -> float:

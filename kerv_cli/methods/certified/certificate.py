@@ -29,7 +29,7 @@ class Candidate:
     """One rule of the fixed order. skip, draft: settings of its skip rule and of its in-prefill draft. pairs: episodes
     paired with AR's on the same seeds, of which AR solved `ar`, the rule `successes`; lost, won: pairs that only one of
     both solved. p: of the hypothesis that the rule loses more than the margin; None: not tested, because one before it
-    was not shown."""
+    was not certified."""
 
     label: str
     skip: dict[str, Any]
@@ -39,7 +39,7 @@ class Candidate:
     lost: int
     won: int
     p: float | None
-    needed: int = 0  # pairs more that would show it at these rates; 0: none, −1: never
+    needed: int = 0  # pairs more that would certify it at these rates; 0: none, −1: never
     draft: dict[str, Any] = field(default_factory=lambda: {"kind": "scout"})  # the only one of the first certificates
 
     @property
@@ -87,7 +87,7 @@ class Certificate:
 
     @property
     def certified(self) -> Candidate | None:
-        """The boldest rule that was shown; None: none was."""
+        """The boldest rule of those that were certified; None: none was."""
         return None if self.chosen is None else self.candidates[self.chosen]
 
     def longest(self, task: str, share: float) -> float:
@@ -225,6 +225,6 @@ class Guarded(Skip):
         return self.decodes <= self.longest and self.rule.take(chunk)
 
     def verified(self, chunk: Chunk) -> None:
-        """Told on to the rule while it decides."""
+        """The prefill judged the draft; told to the rule as long as it decides."""
         if self.decodes <= self.longest:
             self.rule.verified(chunk)

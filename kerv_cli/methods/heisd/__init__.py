@@ -79,7 +79,7 @@ class HybridAcceptanceSettings:
 
 
 add("acceptance", "sequence", _RULES + "ByGroup.build", SequenceAcceptanceSettings)
-add("acceptance", "hybrid", _RULES + "ByProposer.build", HybridAcceptanceSettings)
+add("acceptance", "hybrid", _RULES + "by_proposer", HybridAcceptanceSettings)
 
 
 # --- which side of the hybrid proposer drafts (§4.4)

@@ -177,14 +177,14 @@ class Outline:
         outline = np.vstack([inside.T, rest])
         return cls(vectors, np.ascontiguousarray(directions), outline, length_of_longest(vectors))
 
-    def candidates(self, key: np.ndarray, k: int, passed: np.ndarray | None) -> np.ndarray:
-        """Rows, ascending, among which are the k best for key (d,). passed: (n,) bool, rows passed over."""
+    def candidates(self, key: np.ndarray, k: int, excluded: np.ndarray | None) -> np.ndarray:
+        """Rows, ascending, among which are the k best for key (d,). excluded: (n,) bool, rows that are left out."""
         inside = key @ self.directions
         rest = key - self.directions @ inside
         bounds = np.concatenate((inside, [math.sqrt(rest @ rest)]), dtype=np.float32) @ self.outline
-        if passed is not None:
-            bounds[passed] = -np.inf
-        if k >= len(bounds) - (0 if passed is None else np.count_nonzero(passed)):
+        if excluded is not None:
+            bounds[excluded] = -np.inf
+        if k >= len(bounds) - (0 if excluded is None else np.count_nonzero(excluded)):
             return np.flatnonzero(bounds > -np.inf)
         first = (bounds >= np.partition(bounds, -k)[-k]).nonzero()[0]
         least = (self.vectors[first] @ key).min()  # k rows score this much
@@ -214,8 +214,8 @@ class ExactIndex:
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """See `Index`; from the task's outline."""
         shard = self.shards[task]
-        passed = None if without is None else self.seeds[shard] == without
-        return self.outlines[task].candidates(key, k, passed) + shard.start
+        excluded = None if without is None else self.seeds[shard] == without
+        return self.outlines[task].candidates(key, k, excluded) + shard.start
 
 
 @dataclass(frozen=True)
@@ -294,8 +294,9 @@ class Datastore:
             raise UnknownName("task of the datastore", task, self.shards)
         assert self.index is not None
         key = np.asarray(key, dtype=np.float32)
-        at, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
-        return Neighbours(similarity, self.tokens[at].astype(np.int64), self.seeds[at], self.steps[at], self.left[at])
+        rows, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
+        chunks = self.tokens[rows].astype(np.int64)
+        return Neighbours(similarity, chunks, self.seeds[rows], self.steps[rows], self.left[rows])
 
 
 def _arrays(folder: Path, manifest: Manifest) -> dict[str, Any]:

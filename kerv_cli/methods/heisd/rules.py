@@ -246,30 +246,22 @@ class ByGroup(Strict):
         return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
 
 
-@dataclass(frozen=True)
-class ByProposer:
-    """Retrieved drafts by group, all others by distance."""
+@dataclass(frozen=True, kw_only=True)
+class ByProposer(Relaxed):
+    """Retrieved drafts by group, all others within one radius, as `Relaxed`."""
 
     retrieved: ByGroup
-    others: Relaxed
-
-    @classmethod
-    def build(cls, settings: HybridAcceptanceSettings, context: Context) -> ByProposer:
-        """acceptance=hybrid."""
-        space = context.target.actions
-        return cls(ByGroup(space, settings.group_limit, settings.token_limit), Relaxed(space, settings.strict_dofs))
 
     def of_drafts_from(self, proposer: str) -> Acceptance:
         """The rule for drafts of `proposer`."""
-        return self.retrieved if proposer == "retrieval" else self.others
+        return self.retrieved if proposer == "retrieval" else self
 
-    def limits(self, r: int) -> tuple[int, ...]:
-        """Largest accepted distance per DoF of drafts that are not retrieved, bins (D,)."""
-        return self.others.limits(r)
 
-    def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """The longest accepted path of a draft that is not retrieved."""
-        return self.others.judge(tree, target_tokens, start, r)
+def by_proposer(settings: HybridAcceptanceSettings, context: Context) -> ByProposer:
+    """acceptance=hybrid."""
+    space = context.target.actions
+    by_group = ByGroup(space, settings.group_limit, settings.token_limit)
+    return ByProposer(space, settings.strict_dofs, retrieved=by_group)
 
 
 class VerifySkip(Skip):

@@ -53,9 +53,9 @@ class Noise:
             raise UsageError("kinematics: damping must lie between 0 and 1")
 
     @classmethod
-    def uniform(cls, dofs: int, q: float, r: float = 1.0, damping: float = 1.0) -> Noise:
-        """One q, r and damping for all DoFs."""
-        return cls((q,) * dofs, (r,) * dofs, (damping,) * dofs)
+    def uniform(cls, dofs: int, q: float) -> Noise:
+        """One q for all DoFs, r = 1, no damping."""
+        return cls((q,) * dofs, (1.0,) * dofs, (1.0,) * dofs)
 
 
 def motion_model(order: int, damping: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

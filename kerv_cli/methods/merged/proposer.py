@@ -28,8 +28,8 @@ class MergedProposer(Proposer):
     """
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
-        every = [*sources, *fallback]
-        self.name = every[0].name if len(every) == 1 else "merged"
+        together = [*sources, *fallback]
+        self.name = together[0].name if len(together) == 1 else "merged"
         self.sources, self.fallback, self.nodes = sources, fallback, nodes
 
     @classmethod

@@ -21,7 +21,7 @@ from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.targets.compact.features import hand_features, scene_features, scene_width
+from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
 
@@ -52,13 +52,7 @@ class Scout(nn.Module):
         self.cells = nn.Linear(s.cell_width, s.cell_features)
         self.words = nn.Embedding(words, s.word_width)
         p, places = len(observation.proprioception), len(observation.places)
-        self.locate = nn.Sequential(
-            nn.Linear(2 * s.keypoints * views + p + s.word_width, 128),
-            nn.SiLU(),
-            nn.Linear(128, 64),
-            nn.SiLU(),
-            nn.Linear(64, 3 * places),
-        )
+        self.locate = mlp(2 * s.keypoints * views + p + s.word_width, 128, 64, 3 * places)
         of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
         self.drafter = EarlyDrafter(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 

@@ -87,4 +87,4 @@ class SelfCacheProposer(ChainProposer):
 def target_tokens(rounds: Sequence[Round]) -> list[int]:
     """The target's own tokens at the committed places of a chunk's rounds: fewer than the chunk has where some were
     never verified."""
-    return [token for played in rounds if played.mode != "skip" for token in played.target_tokens[: played.committed]]
+    return [token for record in rounds if record.mode != "skip" for token in record.target_tokens[: record.committed]]

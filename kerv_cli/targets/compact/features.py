@@ -1,14 +1,15 @@
-"""Features of the scene and of the privileged state, as numbers of order one.
+"""Features of the scene and of the privileged state, as numbers of order one, and the layers that read them.
 
 Shapes: B batch, p numbers of proprioception, K places, s numbers of privileged state.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ObservationSpace, Place
 
@@ -16,6 +17,14 @@ COARSE, FINE = 0.1, 0.02  # metres per unit of the linear and of the saturating 
 STEP = 0.01  # metres (or units of the state) per control step that count as a velocity of one
 
 Saturate = Callable[[Tensor], Tensor]
+
+
+def mlp(*widths: int) -> nn.Sequential:
+    """Linear layers from each width to the next, with SiLU between them."""
+    parts: list[nn.Module] = []
+    for inputs, outputs in itertools.pairwise(widths):
+        parts += [nn.Linear(inputs, outputs), nn.SiLU()]
+    return nn.Sequential(*parts[:-1])
 
 
 def relative(vector: Tensor, saturate: Saturate = torch.tanh) -> Tensor:
@@ -57,8 +66,8 @@ def privileged_features(proprioception: Tensor, states: Tensor, space: Observati
         velocity = (states[:, :count] - states[:, first : first + count]) / STEP
         parts.append(velocity.clamp(-3, 3))
     for place in space.extra_places:
-        at = position(states, place)
-        parts += [relative(at - hand), relative(last - at)]
+        extra = position(states, place)
+        parts += [relative(extra - hand), relative(last - extra)]
     return torch.cat(parts, -1)
 
 

@@ -27,10 +27,9 @@ def save_target(
 ) -> str:
     """Writes the folder of a target -> sha256 of its weights. environment: that of its demonstrations. stored: as in
     `save_module`. state_range: as in `TargetDescription`."""
-    fields = target_fields(
-        *("compact", asdict(target.settings), environment, target.actions, target.observation),
-        *(target.cameras, target.words.words, provenance),
-    )
+    settings, words = asdict(target.settings), target.words.words
+    spaces = target.actions, target.observation
+    fields = target_fields("compact", settings, environment, *spaces, target.cameras, words, provenance)
     measured = {"state_range": state_range} if state_range else {}
     return save_module(folder, "target", target, {**fields, **measured}, stored)
 

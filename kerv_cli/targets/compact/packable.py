@@ -1,4 +1,4 @@
-"""The hook of packed weights: what a module says of itself, without knowing them (`packed.py` does)."""
+"""The bases of packed weights and of modules that can have them; `packed.py` makes them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Packable(nn.Module):
     packed: Any = None
 
     def pack_weights(self) -> Packed | None:
-        """Packed weights of this module, which is frozen on a CPU; None where they would not be faster. `pack` asks for
-        those of types that it does not know."""
+        """Packed weights of this module, which is frozen on a CPU; None where they would not be faster. `pack` calls it
+        for types that `packed_weights` does not name."""
         return None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

@@ -27,6 +27,7 @@ from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.compact.features import (
     hand_features,
+    mlp,
     places_of,
     privileged_features,
     privileged_width,
@@ -86,21 +87,13 @@ class CompactTarget(Packable):
         self.word_embedding = nn.Embedding(words.size, s.width)
         nn.init.normal_(self.word_embedding.weight, std=0.02)
         features = scene_width(observation) + (privileged_width(observation) if s.observation == "state" else 0)
-        self.scene = nn.Sequential(
-            nn.Linear(features, 2 * s.width), nn.SiLU(), nn.Linear(2 * s.width, s.scene_tokens * s.width)
-        )
-        self.proprioception = nn.Sequential(nn.Linear(p, s.width), nn.SiLU(), nn.Linear(s.width, s.width))
+        self.scene = mlp(features, 2 * s.width, s.scene_tokens * s.width)
+        self.proprioception = mlp(p, s.width, s.width)
         if s.observation == "vision":
             shapes = s.image_size, s.grid, s.keypoints, s.channels, s.width
             self.vision = VisionEncoder(*shapes)
             self.further_views = nn.ModuleList(VisionEncoder(*shapes) for _ in range(views - 1))
-            self.locate = nn.Sequential(
-                nn.Linear(2 * s.keypoints * views + p + s.width, 256),
-                nn.SiLU(),
-                nn.Linear(256, 128),
-                nn.SiLU(),
-                nn.Linear(128, 3 * places),
-            )
+            self.locate = mlp(2 * s.keypoints * views + p + s.width, 256, 128, 3 * places)
         self.trunk = Trunk(s.width, s.layers, s.heads, s.feed_forward)
         self.head = nn.Linear(s.width, actions.tokens, bias=False)
         nn.init.normal_(self.head.weight, std=0.02)

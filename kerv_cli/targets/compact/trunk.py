@@ -20,6 +20,8 @@ from kerv_cli.targets.attention import Cache, Slots, attention_mask, rotate, wri
 from kerv_cli.targets.compact.captured import CapturedCache
 from kerv_cli.targets.compact.packable import Packable, Packed, wants_gradient
 
+POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding
+
 
 class Rotary(nn.Module):
     """Rotary position embedding, half-split layout; tables are computed once in float32."""
@@ -27,10 +29,10 @@ class Rotary(nn.Module):
     cos: Tensor
     sin: Tensor
 
-    def __init__(self, channels: int, positions: int = 1024, base: float = 10_000.0) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        frequencies = base ** (-torch.arange(0, channels, 2, dtype=torch.float32) / channels)
-        angles = torch.arange(positions, dtype=torch.float32)[:, None] * frequencies
+        frequencies = BASE ** (-torch.arange(0, channels, 2, dtype=torch.float32) / channels)
+        angles = torch.arange(POSITIONS, dtype=torch.float32)[:, None] * frequencies
         self.register_buffer("cos", torch.cat([angles.cos(), angles.cos()], -1), persistent=False)
         # the sign of the swapped half is folded into the table: x·cos + swap(x)·sin
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)

@@ -84,20 +84,20 @@ def check_image(image: np.ndarray, camera: str) -> np.ndarray:
     return image
 
 
-def cropped(image: np.ndarray, size: int, area: float = CROPPED_AREA) -> np.ndarray:
-    """image (h, w, 3) uint8 -> its central `area`, sampled bilinearly at size × size points, the outermost on the
+def cropped(image: np.ndarray, size: int) -> np.ndarray:
+    """image (h, w, 3) uint8 -> its central CROPPED_AREA, sampled bilinearly at size × size points, the outermost on the
     crop's edges (TensorFlow's crop_and_resize), uint8."""
-    side = math.sqrt(area)
+    side = math.sqrt(CROPPED_AREA)
     rows, columns = ((n - 1) * ((1 - side) / 2 + side * np.linspace(0, 1, size)) for n in image.shape[:2])
     pixels = image.astype(np.float32) / 255
     pixels = _interpolated(_interpolated(pixels, rows).swapaxes(0, 1), columns).swapaxes(0, 1)
     return np.clip(np.floor(np.clip(pixels, 0, 1) * 255.5), 0, 255).astype(np.uint8)
 
 
-def _interpolated(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """rows (n, …) at the fractional indices `at` (m,) -> (m, …)."""
-    below = np.clip(np.floor(at).astype(int), 0, len(rows) - 2)
-    share = (at - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
+def _interpolated(rows: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """rows (n, …) at fractional `indices` (m,) -> (m, …)."""
+    below = np.clip(np.floor(indices).astype(int), 0, len(rows) - 2)
+    share = (indices - below).astype(np.float32).reshape(-1, *[1] * (rows.ndim - 1))
     return rows[below] * (1 - share) + rows[below + 1] * share
 
 

@@ -20,7 +20,7 @@ from kerv_cli.targets.openvla.loading import check_finite, check_layout, digest_
 from kerv_cli.targets.openvla.prompt import PROMPTS, Prompter
 from kerv_cli.targets.openvla.target import OpenVLASettings
 
-SEES_NOTHING_ELSE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
+NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
 
 
 def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
@@ -59,8 +59,11 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     origin = {"command": "kerv build target", "settings": asdict(settings), "files": hashes, "parameters": parameters}
     folder = artifact(settings.results, "target", settings.name)
     fields = target_fields(
-        *("openvla", asdict(target_settings), spec.name if spec else "none", actions),
-        spec.observation if spec else SEES_NOTHING_ELSE,
+        "openvla",
+        asdict(target_settings),
+        spec.name if spec else "none",
+        actions,
+        spec.observation if spec else NO_STATE,
         cameras=[spec.camera_name(settings.camera) if spec else settings.camera or "primary"],
         provenance={**origin, **provenance(settings.runtime.device)},
     )

@@ -26,7 +26,7 @@ from kerv_cli.targets.openvla.vision import Block, PoolingHead, Projector, Visio
 Sizes = tuple[int, ...]
 INDEX, SINGLE = "model.safetensors.index.json", "model.safetensors"
 PICKLED = ("*.bin", "*.pt", "*.pth", "*.ckpt")
-SHOWN = 3  # names of each kind in a message
+LISTED = 3  # names of each kind in a message
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ def _text(sizes: Sizes) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return ", ".join(names[:LISTED]) + more
 
 
 class OpenVLAModel(nn.Module):

@@ -50,7 +50,7 @@ class OpenVLASettings:
 
 
 class OpenVLATarget:
-    """The policy in a folder of published files. cameras: the one whose image it is shown."""
+    """The policy in a folder of published files. cameras: the one whose image it reads."""
 
     def __init__(
         self,
