@@ -111,10 +111,10 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
     return f"No such option: {typed}: {question(near) or f'{error.ctx.command_path} --help lists them'}"
 
 
-_MOST_SHOWN = 2000
+_LONGEST = 2000
 """Letters of a message."""
 _QUOTED = re.compile(r"(['`])kerv ((?:train |build |runs )?[a-z]+)((?: [^'`]*)?)\1")
-_CARRIED = {
+_SHARED = {
     "results": None,  # None: every command takes it
     "policy": ("rollout", "sweep", "calibrate", "build datastore", "train drafter", "prepare"),
     "demos": ("train target", "train drafter", "calibrate", "build datastore", "prepare"),
@@ -129,18 +129,18 @@ def runnable(message: str, words: Sequence[str]) -> str:
 
     def completed(match: re.Match[str]) -> str:
         quote, name, rest = match.groups()
-        # what a rollout's method needs
-        given = [re.sub("^method=", "for=", word) for word in words] if name == "prepare" else words
+        # `prepare for=METHOD` makes what a rollout's method needs
+        line = [re.sub("^method=", "for=", word) for word in words] if name == "prepare" else words
         keys = {word.split("=", 1)[0] for word in shlex.split(rest)}
-        carried = [shlex.quote(word) for word in given if _carries(word, name) and word.split("=", 1)[0] not in keys]
-        return f"{quote}{' '.join([kerv_command(), name, *rest.split(), *carried])}{quote}"
+        shared = [shlex.quote(word) for word in line if _is_shared(word, name) and word.split("=", 1)[0] not in keys]
+        return f"{quote}{' '.join([kerv_command(), name, *rest.split(), *shared])}{quote}"
 
     return _QUOTED.sub(completed, message)
 
 
-def _carries(word: str, command: str) -> bool:
+def _is_shared(word: str, command: str) -> bool:
     key = word.split("=", 1)[0].split(".", 1)[0]
-    takers = _CARRIED.get(key, ())
+    takers = _SHARED.get(key, ())
     return takers is None or command in takers
 
 
@@ -156,8 +156,8 @@ def _refuse(message: str, code: int, error: BaseException | None) -> None:
         # objects in the making cannot clean up behind themselves, e.g. a GL context: no news to the user
         sys.unraisablehook = lambda unraisable: None
     message = " ".join(message.split())
-    if len(message) > _MOST_SHOWN:  # a word of the command line, which the user has seen
-        message = f"{message[: _MOST_SHOWN // 2]} … {message[-_MOST_SHOWN // 2 :]}"
+    if len(message) > _LONGEST:  # a word of the command line, which the user has seen
+        message = f"{message[: _LONGEST // 2]} … {message[-_LONGEST // 2 :]}"
     typer.echo(f"kerv: {message}", err=True)
     raise typer.Exit(code)
 

@@ -156,7 +156,8 @@ def _bound(margin: float) -> float:
 
 
 def _values(both: np.ndarray) -> np.ndarray:
-    """(n, 2) success of AR and of the rule -> v (n,) = (1 + AR − rule) / 2, in an order that no task decides."""
+    """(n, 2) success of AR and of the rule -> v (n,) = (1 + AR − rule) / 2, in an order that has nothing to do with the
+    tasks."""
     values = (1 + both[:, 0] - both[:, 1]) / 2
     seed = int.from_bytes(hashlib.sha256(str(len(values)).encode()).digest()[:4], "big")
     return np.random.default_rng(seed).permutation(values)

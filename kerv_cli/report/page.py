@@ -48,13 +48,13 @@ def render(
     Args:
         figures: HTML elements.
         files: the study's tables and plots; the page links the tables.
-        priced: `repriced_table` of the machines that the report was asked for.
+        priced: `repriced_table` of the profiles in `on`.
         loss: points of success that the verdict allows.
     """
     template = Environment(
         loader=PackageLoader("kerv_cli.report", "."), autoescape=True, undefined=StrictUndefined
     ).get_template("report.html.j2")
-    stopped = read_verdicts(store.root)
+    decisions = read_verdicts(store.root)
     answer, is_shown = verdict(data.table, loss)
     return template.render(
         name=store.name,
@@ -71,7 +71,7 @@ def render(
         suite=_suite(data.table, priced),
         motion=motion_frame(data.table),
         reasons=differences(rows_of(data.table, MICRO)),
-        stopped=[] if stopped is None else rows_of(stopped),
+        decisions=[] if decisions is None else rows_of(decisions),
         figures=figures,
         sections=sections,
         tasks=_by_task(data.per_task),

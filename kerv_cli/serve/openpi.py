@@ -57,8 +57,8 @@ def observation_of(interface: Interface, message: Message) -> Observation:
 class OpenPi(Conversation):
     """One client. A robot executes what it is sent, so that there is one at a time, and silence means that it is gone.
 
-    last: the actions (H, D) of the last decode, environment units. at: the end effector's position (3,) at that decode,
-    metres. before: milliseconds that the last answer took.
+    last: the actions (H, D) of the last decode, environment units. last_hand: the end effector's position (3,) at that
+    decode, metres. last_ms: milliseconds that the last answer took.
     """
 
     seats, ping_s, idle_s = 1, 10.0, 120.0
@@ -66,9 +66,9 @@ class OpenPi(Conversation):
     def __init__(self, policy: Policy, session: Session) -> None:
         super().__init__(policy, session)
         self.last: np.ndarray = np.zeros((0, 0))
-        self.at = np.zeros(3)
+        self.last_hand = np.zeros(3)
         self.decodes, self.begun = 0, False
-        self.before: float | None = None
+        self.last_ms: float | None = None
 
     def greeting(self) -> bytes:
         """The metadata."""
@@ -97,24 +97,24 @@ class OpenPi(Conversation):
             self.begun = True
         else:
             for step, action in enumerate(executed, 1):
-                decoder.observe(action, self.at + (hand - self.at) * step / len(executed))
+                decoder.observe(action, self.last_hand + (hand - self.last_hand) * step / len(executed))
         if self.session.is_held(observation, len(self.last) > 0):
             record = DecodeRecord((), self.last[-1:], 0, (), HOLD, 0.0, {})
         else:
             record = self.session.decode(observation)
-        self.last, self.at = record.actions, hand
+        self.last, self.last_hand = record.actions, hand
         self.decodes += 1
         timing = {"infer_ms": 1000 * record.seconds}
         return {
             "actions": interface.converted(record.actions),
             "policy_timing": timing,
             "decode": {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode},
-            "server_timing": timing | ({"prev_total_ms": self.before} if self.before is not None else {}),
+            "server_timing": timing | ({"prev_total_ms": self.last_ms} if self.last_ms is not None else {}),
         }
 
     def note_latency(self, milliseconds: float) -> None:
         """The last answer took so long as a whole; the client is told with the next one."""
-        self.before = milliseconds
+        self.last_ms = milliseconds
 
     def fault(self, line: str) -> str:
         """The frame that says what was wrong."""

@@ -97,15 +97,15 @@ def _per_decode(record: EpisodeRecord) -> tuple[Parts, list[float]]:
     most = max(max(d.forwards, acceptance(d.rounds)[0] if d.verifications else 0) for d in decodes)
     views: Parts = [_series("Per decode", "decode/forwards", "decode/acceptance", top=most + 0.5)]
     thresholds = [bins for d in decodes for bins in threshold_of(d)]
-    tabs = (
-        [_series("Acceptance threshold r, bins", "decode/threshold", top=max(thresholds) + 1.0)] if thresholds else []
-    )
-    tabs += [
-        _series(title, f"signals/{signal}")
-        for signal, title in SIGNALS.items()
-        if any(getattr(d, signal) is not None for d in decodes)
-    ]
-    return [*views, *([rrb.Tabs(*tabs)] if tabs else [])], [2.2, *([2.2] if tabs else [])]
+    tabs: Parts = []
+    if thresholds:
+        tabs.append(_series("Acceptance threshold r, bins", "decode/threshold", top=max(thresholds) + 1.0))
+    for signal, title in SIGNALS.items():
+        if any(getattr(d, signal) is not None for d in decodes):
+            tabs.append(_series(title, f"signals/{signal}"))
+    if tabs:
+        return [*views, rrb.Tabs(*tabs)], [2.2, 2.2]
+    return views, [2.2]
 
 
 def _current_decode(record: EpisodeRecord, steps: int, below: Parts) -> rrb.Vertical:
