@@ -13,7 +13,7 @@
 # SCALE    shape of the prices                            (openvla-7b)
 # EPISODES per task and setting in the shipped policy's study (2)
 # TRAIN    settings of the training, which goes on from the shipped policy of fifty tasks
-#          (train=mt50 train.init=mt50-vision train.scene_steps=0 train.batch=256)
+#          (train=mt50 train.init=mt50-vision train.scene_steps=0 train.batch=256 world.camera.name=corner4+gripperPOV:75)
 # LIMIT    seconds for all of it                          (1500)
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -26,7 +26,8 @@ DEMOS=${DEMOS:-results/artifacts/demos/mt50}
 SHAPES=${SHAPES:-vla-150m smolvla openvla-7b}
 SCALE=${SCALE:-openvla-7b}
 EPISODES=${EPISODES:-2}
-TRAIN=${TRAIN:-train=mt50 train.init=mt50-vision train.scene_steps=0 train.batch=256}
+VIEWS=world.camera.name=corner4+gripperPOV:75
+TRAIN=${TRAIN:-train=mt50 train.init=mt50-vision train.scene_steps=0 train.batch=256 $VIEWS}
 LIMIT=${LIMIT:-1500}
 DEVICE=${DEVICE:-cuda}
 export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
@@ -100,7 +101,7 @@ if [ -d "$DEMOS" ]; then
     # shellcheck disable=SC2086
     kerv train "$(left)" train target name=mt50-vision-gpu task=MT50 demos=mt50 $TRAIN
 else
-    skip train "no demonstrations in $DEMOS: run 'kerv demos task=MT50 name=mt50', or set DEMOS"
+    skip train "no demonstrations in $DEMOS: run 'kerv demos task=MT50 name=mt50 $VIEWS', or set DEMOS"
 fi
 echo "results and logs: $OUT"
 [ "$failures" -eq 0 ]
