@@ -30,7 +30,14 @@ from kerv_cli.methods.kinematics.prediction import (
 
 DOFS = 4
 HELD = (False, False, False, True)
-NOISE = {name: Noise.uniform(DOFS, 5.0, 0.5, 0.8 if name == "damped" else 1.0) for name in FILTERS}
+
+
+def noise_of(q: float, r: float, damping: float) -> Noise:
+    """The same for all DoFs."""
+    return Noise((q,) * DOFS, (r,) * DOFS, (damping,) * DOFS)
+
+
+NOISE = {name: noise_of(5.0, 0.5, 0.8 if name == "damped" else 1.0) for name in FILTERS}
 
 
 @functools.cache
@@ -212,7 +219,7 @@ def test_a_damaged_action_is_refused(action: np.ndarray) -> None:
 )
 def test_impossible_noise_is_refused(q: float, r: float, damping: float) -> None:
     with pytest.raises(UsageError, match="kinematics"):
-        Noise.uniform(DOFS, q, r, damping)
+        noise_of(q, r, damping)
 
 
 def test_wrong_requests() -> None:

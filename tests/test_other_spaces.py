@@ -42,7 +42,7 @@ def results(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for task, name in (("drawer-close-v3", "drawer"), ("insert-peg", "pegs")):
         record(DemoConfig((task,), 4, frame_stride=16, workers=1), results / "artifacts/demos" / name)
     target, described = load_target(results / "artifacts/target/nano-state")
-    early = EarlyDrafter.beside(EarlySettings(layers=1, width=16, rank=4, history=2), target)
+    early = EarlyDrafter.beside(EarlySettings(layers=1, width=16, rank=4), target)
     folder, own = results / "artifacts/early/nano-state", {"settings": asdict(early.settings)}
     EarlyArtifact().save(folder, early, MadeFor.of(described), {}, **own)
     common = [TARGET, "task=drawer-close", "demos=drawer", f"results={results}"]

@@ -40,7 +40,7 @@ class KnownDraft:
         self.odds = random.random()
         self.tokens = [t if random.random() < 0.8 else (t + 7) % 255 for t in truth]
 
-    def draft(self, features: torch.Tensor, histories: list[np.ndarray], radius: int) -> torch.Tensor:
+    def draft(self, features: torch.Tensor, radius: int) -> torch.Tensor:
         return torch.tensor([[*self.tokens, self.odds]], dtype=torch.float64)
 
 

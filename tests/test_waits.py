@@ -52,7 +52,7 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
     retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 24)
     torch.manual_seed(1)
     drafter = Drafter.beside(DrafterSettings(), target).eval().requires_grad_(False)
-    network = EarlyDrafter.beside(EarlySettings(width=16, layers=1, history=2, rank=4), target).eval()
+    network = EarlyDrafter.beside(EarlySettings(width=16, layers=1, rank=4), target).eval()
     chain, tree = (DrafterProposer(drafter, target, *sizes) for sizes in ((5, 1, 5), (3, 4, 9)))
     early = EarlyProposer(network.requires_grad_(False), target)
     hold = PredictionProposer(Hold(HELD, minimum=1, horizon=CHUNK))
