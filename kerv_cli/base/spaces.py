@@ -173,8 +173,8 @@ class ActionSpace:
         return self.unnormalise(self.values_of(tokens))
 
     def fitted(self, actions: np.ndarray) -> ActionSpace:
-        """This space, normalised by the 1st and 99th percentile of actions (n, D) in environment units, `limits_of`."""
-        low, high = limits_of(*np.percentile(actions, [1, 99], axis=0))
+        """This space, normalised by the 1st and 99th percentile of actions (n, D) in environment units."""
+        low, high = action_limits(*np.percentile(actions, [1, 99], axis=0))
         return replace(self, low=low, high=high)
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
@@ -197,7 +197,7 @@ class ActionSpace:
                 )
 
 
-def limits_of(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def action_limits(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """The limits of an ActionSpace from `low` and `high` (D,) of its actions: a DoF that never moves gets a unit to
     either side of its value."""
     still = high - low < 1e-6

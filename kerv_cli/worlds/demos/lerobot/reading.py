@@ -18,7 +18,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageE
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.places import as_path
 from kerv_cli.base.settings import DemosImportSettings
-from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, limits_of
+from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, entry_of, episode_path, totals
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, save_episode
 from kerv_cli.worlds.demos.lerobot import layout
@@ -219,7 +219,7 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
     unknown = [name for name in strict if name not in names]
     if unknown:
         raise UnknownName("strict DoF", unknown[0], names)
-    low, high = limits_of(actions.min(0).astype(float), actions.max(0).astype(float))
+    low, high = action_limits(actions.min(0).astype(float), actions.max(0).astype(float))
     return ActionSpace(names, _groups(names, strict), strict, float(source.info["fps"]), low, high)
 
 
