@@ -150,12 +150,13 @@ def test_both_layouts_of_a_weight_give_its_product(rows: int) -> None:
     grid=st.sampled_from([1, 2, 3]),
     keypoints=st.integers(1, 9),
     channels=st.sampled_from([8, 24]),
+    norm=st.sampled_from(["group", "instance"]),
     space=st.sampled_from([OBSERVATION, ALONE, THREE]),
 )
 def test_the_packed_prompt_is_the_prompt(
-    seed: int, grid: int, keypoints: int, channels: int, space: ObservationSpace
+    seed: int, grid: int, keypoints: int, channels: int, norm: str, space: ObservationSpace
 ) -> None:
-    plain, packed = both_targets("vision", seed, space, grid=grid, keypoints=keypoints, channels=channels)
+    plain, packed = both_targets("vision", seed, space, grid=grid, keypoints=keypoints, channels=channels, norm=norm)
     assert (packed.vision.packed is not None) == has_blocked_layouts()
     random = np.random.default_rng(seed)
     frame = random.integers(0, 256, (48, 48, 3), dtype=np.uint8)

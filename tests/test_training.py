@@ -28,7 +28,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.imitation import soft_labels, token_loss, vocabulary
+from kerv_cli.training.imitation import lit, soft_labels, token_loss, vocabulary
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -257,6 +257,18 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
 
 
 @pytest.mark.bits
+def test_light_is_of_the_sample_and_the_step_alone_and_moves_nothing() -> None:
+    images = torch.randint(30, 60, (4, 3, 16, 32), dtype=torch.uint8)
+    images[:, :, 5, 7] = 200  # a marker
+    indices = torch.arange(4)
+    changed = lit(images, indices, 3, 0.3)
+    assert torch.equal(changed[2:], lit(images[2:], indices[2:], 3, 0.3))  # whatever the batch
+    assert not torch.equal(changed, lit(images, indices, 4, 0.3))
+    assert (changed != images).flatten(1).any(1).all()
+    assert changed.flatten(2).argmax(-1).eq(5 * 32 + 7).all()
+    assert torch.equal(lit(images, indices, 3, 0.0), images)
+
+
 def test_batched_greedy_decoding_is_the_decoders() -> None:
     from kerv_cli.engine.decoder import Decoder
 

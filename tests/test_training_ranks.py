@@ -94,9 +94,10 @@ def test_balanced_tasks_are_drawn_alike() -> None:
     assert share(0.5) == pytest.approx(0.25, abs=0.02)  # 1 : 3, the root of 1 : 9
 
 
-def test_runs_from_before_balance_are_the_same_runs() -> None:
-    assert "balance" not in run_settings(TrainSettings())
+def test_runs_from_before_a_setting_are_the_same_runs() -> None:
+    assert not {"balance", "colour"} & run_settings(TrainSettings()).keys()
     assert run_settings(TrainSettings(balance=0.5))["balance"] == 0.5
+    assert run_settings(TrainSettings(colour=0.5))["colour"] == 0.5
 
 
 def test_datasets_add_up(results: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -190,6 +191,7 @@ def test_training_goes_on_only_with_views_behind_those_it_has() -> None:
     described = type("D", (), {"settings": vars(one.settings), "cameras": one.cameras})()
     for camera in ("corner4", HAND, PAST):
         check_init(one.settings, camera, described, Path("x"))
+    check_init(replace(one.settings, norm="instance"), HAND, described, Path("x"))  # its weights have the same shapes
     for camera in ("corner", "gripperPOV+corner4", "corner4:60"):
         with pytest.raises(UsageError, match="sees corner4"):
             check_init(one.settings, camera, described, Path("x"))

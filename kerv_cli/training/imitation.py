@@ -94,6 +94,17 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
     return -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1).mean()
 
 
+def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
+    """images (B, 3, h, w) uint8 under random light: each colour is multiplied by the exponential of a smooth field,
+    whose standard deviation is drawn from 0 to `spread` per image. The field depends on the sample's index (B,) and the
+    step alone, so that the number of processes changes nothing. Places in the image stay where they are."""
+    draws = [np.random.default_rng((step, index)) for index in indices.tolist()]
+    fields = np.stack([spread * r.uniform() * r.normal(size=(3, 3, 3)) for r in draws])
+    factors = torch.from_numpy(fields).float().to(images.device).exp()
+    light = F.interpolate(factors, images.shape[-2:], mode="bilinear", align_corners=True)
+    return (images * light).round_().clamp_(0, 255).to(torch.uint8)
+
+
 class Imitation:
     """Losses and metrics of one training run. closed_loop: a target's success in [0, 1], which then dominates the
     score; None: not measured."""
@@ -130,6 +141,8 @@ class Imitation:
         """Token loss and weighted position loss at `indices` (B,); in the first `scene_steps` the position
         loss alone."""
         inputs = self.training.inputs(indices, self.device)
+        if self.settings.colour and inputs.images is not None:
+            inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
         scene = self.settings.scene_weight if self.module.cameras else 0.0
         with self.precision():
             places = places_of(inputs.states, self.module.observation)
@@ -199,15 +212,15 @@ def new_target(
 
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
     """Checks that the target in `folder`, with this description, can be fine-tuned to `settings` and to frames of
-    `camera`. All settings but the chunk length, on which no weight depends, and `parallel`, whose queries begin fresh,
-    must agree; views may be added behind its own.
+    `camera`. All settings but the chunk length and the norm, on which no weight's shape depends, and `parallel`, whose
+    queries begin fresh, must agree; views may be added behind its own.
 
     Raises:
         UsageError: the first shape that differs.
     """
     for name, value in asdict(settings).items():
         stored = description.settings.get(name)
-        if name not in ("size", "chunk", "parallel") and stored != value:
+        if name not in ("size", "chunk", "parallel", "norm") and stored != value:
             raise UsageError(
                 f"train.init: the target in {folder} has {name}={stored}, the run target.{name}={value}: set both alike"
             )

@@ -56,7 +56,8 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     """The optimisation settings that identify a run. Steps and the interval of validations may change on resuming, and
     `init` is identified by the hash of its weights instead of its name."""
     free = ("steps", "validate_every", "init", "stored")
-    later = {"balance": 0.0, "closed_loop": False}  # settings that older runs lack -> the values that they ran with
+    # settings that older runs lack -> the values that they ran with
+    later = {"balance": 0.0, "closed_loop": False, "colour": 0.0}
     settings = {k: v for k, v in asdict(train).items() if k not in free}
     settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
     return {k: v for k, v in settings.items() if k not in later or v != later[k]}
@@ -216,7 +217,8 @@ class TargetRun(Run):
 
     def identity(self) -> dict[str, Any]:
         """Shapes, tasks and the weights to begin with."""
-        return {"target": asdict(self.settings.target), "tasks": self.tasks, **self.init_hash}
+        shapes = {k: v for k, v in asdict(self.settings.target).items() if (k, v) != ("norm", "group")}  # as before it
+        return {"target": shapes, "tasks": self.tasks, **self.init_hash}
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
@@ -262,6 +264,8 @@ class DrafterRun(Run):
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
+        if settings.train.colour:
+            raise UsageError(f"train.colour={settings.train.colour}: only 'kerv train target' changes the light")
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)

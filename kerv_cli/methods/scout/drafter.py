@@ -47,7 +47,7 @@ class Scout(nn.Module):
         self.observation, self.size = observation, size
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.stems = nn.ModuleList(
-            VisionEncoder(size, s.grid, s.keypoints, s.channels, s.cell_width, single=True) for _ in range(views)
+            VisionEncoder(size, s.grid, s.keypoints, s.channels, s.cell_width, "instance") for _ in range(views)
         )
         self.cells = nn.Linear(s.cell_width, s.cell_features)
         self.words = nn.Embedding(words, s.word_width)

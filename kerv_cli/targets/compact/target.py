@@ -90,7 +90,7 @@ class CompactTarget(Packable):
         self.scene = mlp(features, 2 * s.width, s.scene_tokens * s.width)
         self.proprioception = mlp(p, s.width, s.width)
         if s.observation == "vision":
-            shapes = s.image_size, s.grid, s.keypoints, s.channels, s.width
+            shapes = s.image_size, s.grid, s.keypoints, s.channels, s.width, s.norm
             self.vision = VisionEncoder(*shapes)
             self.further_views = nn.ModuleList(VisionEncoder(*shapes) for _ in range(views - 1))
             self.locate = mlp(2 * s.keypoints * views + p + s.width, 256, 128, 3 * places)

@@ -17,11 +17,12 @@ from kerv_cli.targets.compact.packable import Packable
 
 
 class Residual(nn.Module):
-    """Residual block: group norm and two 3 × 3 convolutions. groups: of channels that are normalised together."""
+    """Residual block: a norm and two 3 × 3 convolutions. norm: instance (every channel is normalised by itself, which
+    light and colour change least) or group (eight groups of channels); the weights have the same shapes."""
 
-    def __init__(self, channels: int, groups: int = 8) -> None:
+    def __init__(self, channels: int, norm: str = "group") -> None:
         super().__init__()
-        self.norm = nn.GroupNorm(groups, channels)
+        self.norm = nn.GroupNorm(channels if norm == "instance" else 8, channels)
         self.first = nn.Conv2d(channels, channels, 3, padding=1)
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
@@ -32,24 +33,19 @@ class Residual(nn.Module):
 
 class VisionEncoder(Packable):
     """The convolutional stem. size: of a view, pixels. grid: vision tokens per side. keypoints: K. channels: of the
-    first stage. width: E. single: every channel is normalised by itself, which light changes least (docs/stress.md).
-    Raises ValueError where size and grid do not fit."""
+    first stage. width: E. norm: of its residual blocks. Raises ValueError where size and grid do not fit."""
 
     columns: Tensor
     packed: Callable[[Tensor], tuple[Tensor, Tensor]] | None
 
-    def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int, single: bool = False) -> None:
+    def __init__(self, size: int, grid: int, keypoints: int, channels: int, width: int, norm: str = "group") -> None:
         super().__init__()
         c, coarse = channels, size // 8
         if size % 8 or coarse % grid:
             raise ValueError(f"image size {size} must be a multiple of 8 and {size} / 8 a multiple of the grid {grid}")
-        self.fine = nn.Sequential(nn.Conv2d(3, c, 5, stride=2, padding=2), Residual(c, c if single else 8))
-        self.middle = nn.Sequential(
-            nn.Conv2d(c, 2 * c, 3, stride=2, padding=1), Residual(2 * c, 2 * c if single else 8)
-        )
-        self.coarse = nn.Sequential(
-            nn.Conv2d(2 * c, 4 * c, 3, stride=2, padding=1), Residual(4 * c, 4 * c if single else 8)
-        )
+        self.fine = nn.Sequential(nn.Conv2d(3, c, 5, stride=2, padding=2), Residual(c, norm))
+        self.middle = nn.Sequential(nn.Conv2d(c, 2 * c, 3, stride=2, padding=1), Residual(2 * c, norm))
+        self.coarse = nn.Sequential(nn.Conv2d(2 * c, 4 * c, 3, stride=2, padding=1), Residual(4 * c, norm))
         self.heat_fine = nn.Conv2d(c, keypoints, 3, padding=1)
         self.heat_middle = nn.Conv2d(2 * c, keypoints, 1)
         self.heat_coarse = nn.Conv2d(4 * c, keypoints, 1)
