@@ -223,11 +223,24 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     assert done.exit_code == 0, done.output
     path = results / "artifacts/target/nano-vision"  # beside the target
     assert "0/2" in done.stdout
+    assert "this study proposer=none: to deploy its certificate add 'proposer=none'" in done.stderr
     written = next(results.rglob("certificate.json"))
     assert written.is_file(), path
     serve = ["serve", "--plan", "policy.target=nano-vision", f"results={results}", "port=0"]
     serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
     assert CliRunner().invoke(app, serve).exit_code == 0
+    deploy = [
+        "rollout",
+        "--plan",
+        "method=one_pass_certified",
+        "prefill_draft.outside=hold",
+        "policy.target=nano-vision",
+    ]
+    deploy += [f"task={TASK}", "threshold.r=9", "world.horizon=8", f"results={results}"]
+    other = CliRunner().invoke(app, deploy)
+    assert other.exit_code == 2  # before anything runs
+    assert "with proposer.kind=drafter: the certificate is of none" in other.stderr
+    assert CliRunner().invoke(app, [*deploy, "proposer=none"]).exit_code == 0
     issued = written.read_text()
     written.write_text(issued.replace('"environment": "metaworld"', '"environment": "elsewhere"'))
     refused = CliRunner().invoke(app, serve)

@@ -136,7 +136,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     from kerv_cli.base.config import compose, to_yaml
     from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve
-    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, write
+    from kerv_cli.report.certificate import candidate_rows, certify, deployment_note, folder_of, write
 
     of_test = [word for word in words if word.split("=")[0] in OF_TEST]
     of_study = [word for word in words if word not in of_test]
@@ -151,6 +151,9 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
         print_settings(resolved)
         return
     folder = folder_of(resolved, settings.name)
+    note = deployment_note(resolved)
+    if note:
+        typer.echo(f"note: {note}", err=True)
     store, covered = covered_cells(resolved, of_study)
     if plan:
         print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)

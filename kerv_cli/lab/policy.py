@@ -69,7 +69,10 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     hashes = artifacts.check(method.needs)
     method.check_levels(tasks, artifacts.load)
     if "certificate" in method.needs:
-        artifacts.load("certificate").check_world(dataclasses.asdict(settings.world))
+        certificate = artifacts.load("certificate")
+        certificate.check_world(dataclasses.asdict(settings.world))
+        if certificate.certified is not None and not set(tasks).isdisjoint(certificate.tasks):
+            certificate.check_method(settings.parts(), settings.runtime.dtype)
     # every row of a table has it, so that a privileged policy is recognised
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation

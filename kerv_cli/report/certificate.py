@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.provenance import provenance
@@ -53,6 +54,17 @@ def folder_of(resolved: ResolvedStudy, name: str | None) -> Path:
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     artifacts = artifacts_of(first)
     return CertificateArtifact().path(first.results, name or first.policy.certificate, artifacts.folder)
+
+
+def deployment_note(resolved: ResolvedStudy) -> str:
+    """One sentence where method=one_pass_certified decodes otherwise than the study's settings, with the words that
+    change that; else empty."""
+    deployed, first = compose("rollout", ["method=one_pass_certified"], RolloutSettings).parts(), _settings(resolved)[1]
+    other = [kind for kind, part in first.parts().items() if kind not in _VARIED and part != deployed[kind]]
+    if not other:
+        return ""
+    was, words = (" ".join(f"{kind}={parts[kind].kind}" for kind in other) for parts in (deployed, first.parts()))
+    return f"method=one_pass_certified has {was}, this study {words}: to deploy its certificate add '{words}'"
 
 
 def certify(
