@@ -54,8 +54,7 @@ class Cell:
 
     def again(self, names: Collection[str]) -> Cell:
         """This cell with the first id that is not among the names: `<id>-2`, `<id>-3`, …"""
-        first = self.part(self.seeds).id
-        return replace(self, id=next(n for n in (f"{first}-{i}" for i in range(2, 10_000)) if n not in names))
+        return replace(self, id=next(n for n in (f"{self.id}-{i}" for i in range(2, 10_000)) if n not in names))
 
 
 @dataclass(frozen=True)

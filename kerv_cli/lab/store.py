@@ -74,7 +74,6 @@ class NewerCell(CheckpointError):
 class StoredCell:
     """A complete cell, read from its folder."""
 
-    id: str
     folder: Path
     config: dict[str, Any]  # the study's name and the fields of Cell
     status: dict[str, Any]  # provenance, run, seconds, sums
@@ -135,9 +134,9 @@ class StudyStore:
         self.claims = self.root / "claims"
         self.jobs = self.root / "jobs"  # an executor's own files
 
-    def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
-        """Writes plan.yaml -> the written plan. Cells of the stored plan are kept if they have the new plan's settings
-        and seeds and a task that it does not name.
+    def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> None:
+        """Writes plan.yaml. Cells of the stored plan are kept if they have the new plan's settings and seeds and a task
+        that it does not name.
 
         So sweeps of one study over different tasks end in one report, and changed settings or seeds replace old cells.
 
@@ -150,7 +149,6 @@ class StudyStore:
                 new = merge_plans(self.read_plan(), new)
             with atomic_path(self.plan_path) as temporary:
                 temporary.write_text(plan_text(new), encoding="utf-8")
-        return new
 
     def begin(self, study: StudySettings, cells: Sequence[Cell], arguments: Sequence[str]) -> None:
         """Writes the plan and notes the command. The folder of a new run appears with both in it.
@@ -385,7 +383,7 @@ class StudyStore:
                 raise self._damaged(folder, error) from error
             described.append((folder, config, _interned(status)))
         frames = rows.frames_of(tables)
-        return [StoredCell(one[0].name, *one, frame) for one, frame in zip(described, frames, strict=True)]
+        return [StoredCell(*one, frame) for one, frame in zip(described, frames, strict=True)]
 
     def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
         """The complete ones of these cells by id, and those that are absent.
