@@ -151,7 +151,7 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, words: list[str]) -> 
         Interrupted: Ctrl-C.
     """
     from kerv_cli.cli.running import running
-    from kerv_cli.lab.reuse import Stock, disagreements, take_over
+    from kerv_cli.lab.reuse import NEVER, Stock, disagreements, take_over
 
     store, cells = covered.store, covered.cells
     take_over(covered)
@@ -162,7 +162,7 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, words: list[str]) -> 
         outcome = _run_until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
     if not outcome.failed:
         store.note_finished()
-    if resolved.sweep.rerun != "never":
+    if resolved.sweep.rerun != NEVER:
         _warn(disagreements(outcome.done, Stock(store, others=False)))
     return outcome
 

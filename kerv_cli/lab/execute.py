@@ -330,10 +330,10 @@ class _Turn:
         self.seconds += seconds
         if len(self.episodes) < len(self.cell.seeds):
             return None
-        status = {**stamp(self.device), **self.work.status, "run": self.work.run, "pid": os.getpid()}
-        status |= {"seconds": self.seconds}
+        work = self.work
+        status = {**stamp(self.device), **work.status, "run": work.run, "pid": os.getpid(), "seconds": self.seconds}
         records, circumstances = zip(*sorted(self.episodes, key=lambda episode: episode[0].seed), strict=True)
-        if not self.work.store.write_cell(self.cell, records, status, circumstances):
+        if not work.store.write_cell(self.cell, records, status, circumstances):
             return CellEnd(self.cell, reused=True)
         return CellEnd(self.cell, len(records), sum(record.success for record in records), self.seconds)
 

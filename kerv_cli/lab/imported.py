@@ -175,11 +175,6 @@ class Side:
     label: str
     evaluations: list[Evaluation] = field(default_factory=list)
 
-    @property
-    def facts(self) -> dict[str, Any]:
-        """See `Evaluation.facts`."""
-        return self.evaluations[0].facts
-
     def takes(self, one: Evaluation) -> bool:
         """Whether an evaluation of another benchmark is of the same server."""
         servers = [(each.name, each.facts, each.server.get("action_spec")) for each in (self.evaluations[0], one)]
@@ -328,16 +323,16 @@ def _status(one: Evaluation, episodes: Sequence[Episode], seconds: float, run: s
 
 def _settings(side: Side) -> dict[str, Any]:
     """Plain settings of a rollout that say what ran: those of kerv's server, else defaults with the server's name."""
-    stored = side.facts.get("settings")
-    plain = as_plain(RolloutSettings()) | {"method": side.evaluations[0].name}
+    first = side.evaluations[0]
+    stored = first.facts.get("settings")
+    plain = as_plain(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
         try:
             plain = as_plain(settings_from(stored, tolerant=True))
         except KervError:  # a part that is not registered here
             plain |= stored
-    config = side.evaluations[0].config
-    if str(config.get("benchmark", "")).startswith("kerv_cli."):
-        params = dict(config.get("params") or {})
+    if str(first.config.get("benchmark", "")).startswith("kerv_cli."):
+        params = dict(first.config.get("params") or {})
         for name, key in _WORLD.items():
             at, last = plain["world"], key.split(".")
             for part in last[:-1]:
@@ -350,7 +345,7 @@ def _identity(side: Side) -> dict[str, str]:
     """Hashes of the weights where kerv served, and of what was recorded: no rollout means the same."""
     recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in side.evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
-    hashes = {str(k): str(v) for k, v in dict(side.facts.get("identity") or {}).items()}
+    hashes = {str(k): str(v) for k, v in dict(side.evaluations[0].facts.get("identity") or {}).items()}
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
 
 

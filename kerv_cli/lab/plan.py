@@ -112,13 +112,7 @@ class Block:
 
 
 def make_cell(
-    label: str,
-    overrides: str,
-    settings: Plain,
-    identity: Identity,
-    task: str,
-    seeds: Sequence[int],
-    repeat: int = 0,
+    label: str, overrides: str, settings: Plain, identity: Identity, task: str, seeds: Sequence[int], repeat: int = 0
 ) -> Cell:
     """The cell of one setting (plain RolloutSettings) on one task and some seeds.
 

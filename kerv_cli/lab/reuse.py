@@ -266,8 +266,8 @@ def disagreements(cells: Iterable[Cell], stock: Stock) -> list[str]:
     """A sentence for every cell that was measured twice with other results: other tokens of the same work."""
     sentences = []
     for cell in unique_cells(cells):
-        for other in (entry.cell.id for entry in stock.of(cell) if entry.store.name == stock.store.name):
-            differ = _differ(stock.store, cell, other) if other != cell.id else []
+        for other in (e.cell.id for e in stock.of(cell) if e.store.name == stock.store.name and e.cell.id != cell.id):
+            differ = _differ(stock.store, cell, other)
             if differ:
                 sentences.append(
                     f"cells {other} and {cell.id} are the same work ({cell.label} on {cell.task}) and differ in "

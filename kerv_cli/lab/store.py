@@ -260,12 +260,8 @@ class StudyStore:
         except NewerCell:
             raise
         except (CheckpointError, KeyError, TypeError, AttributeError) as error:
-            raise self._damaged(folder, error) from error
+            raise _damaged(folder, error) from error
         return status
-
-    def _damaged(self, folder: Path, error: Exception) -> CheckpointError:
-        why = str(error).replace(f"{folder}/", "")
-        return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
 
     def folders(self) -> list[Path]:
         """Folders of its cells, damaged ones among them; none that is being written or removed."""
@@ -282,7 +278,7 @@ class StudyStore:
             config = _read_config(read_text(folder / "config.yaml"))
             return config, read_mapping(folder / _STATUS)
         except (OSError, ValueError, CheckpointError) as error:
-            raise self._damaged(folder, error) from error
+            raise _damaged(folder, error) from error
 
     def set_aside(self, name: str) -> Path:
         """Moves a damaged cell out of the way -> where it lies now. The next sweep computes it again.
@@ -380,7 +376,7 @@ class StudyStore:
                 config = _read_config(read_text(folder / "config.yaml"))
                 tables.append(rows.read_tables(folder))
             except (OSError, ValueError, pa.ArrowException) as error:
-                raise self._damaged(folder, error) from error
+                raise _damaged(folder, error) from error
             described.append((folder, config, _interned(status)))
         frames = rows.frames_of(tables)
         return [StoredCell(*one, frame) for one, frame in zip(described, frames, strict=True)]
@@ -424,6 +420,11 @@ class StudyStore:
         with contextlib.suppress(OSError):
             (self.failures / f"{name}.txt").unlink(missing_ok=True)
             self.failures.rmdir()  # refused where others are left
+
+
+def _damaged(folder: Path, error: Exception) -> DamagedCell:
+    why = str(error).replace(f"{folder}/", "")
+    return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
 
 
 def _plan_of(study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
