@@ -184,10 +184,10 @@ def _run_until_decided(
     total = Outcome()
     open_labels = [label for label in resolved.settings if label != study.baseline]
     for look, block in enumerate(blocks, 1):
-        undecided = [cell for cell in block if cell.label in (study.baseline, *open_labels)]
-        planned += undecided
+        to_run = [cell for cell in block if cell.label in (study.baseline, *open_labels)]
+        planned += to_run
         store.write_plan(study, planned)
-        outcome = run(undecided)
+        outcome = run(to_run)
         lists = total.done + outcome.done, total.reused + outcome.reused, total.failed + outcome.failed
         total = Outcome(*lists, total.seconds + outcome.seconds)
         if outcome.failed:

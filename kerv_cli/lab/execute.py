@@ -34,7 +34,7 @@ from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Block, Cell, blocks_of
 from kerv_cli.lab.rows import Circumstances
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import StudyStore, new_run_id
 
 _POLL_SECONDS = 1.0  # between two looks at blocks that another sweep computes
 
@@ -93,7 +93,7 @@ class _Sweep:
         self.prepare, self.store, self.runtime, self.on_event, self.gauge = prepare, store, runtime, on_event, gauge
         self.options = check_executor(runtime)
         self.outcome = Outcome()
-        self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+        self.run_id = new_run_id()
         self.status = {
             "workers": runtime.workers,
             "executor": runtime.executor,

@@ -12,11 +12,9 @@ import hashlib
 import json
 import math
 import re
-import secrets
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,7 @@ from kerv_cli.lab.identity import ENGINE, OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
 from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row
 from kerv_cli.lab.served import Served, path_of, read_served
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import StudyStore, new_run_id
 
 _ELSEWHERE = "elsewhere"
 """Mode of the one decode that stands for those of a server which is not kerv."""
@@ -210,12 +208,12 @@ def _check_same_episodes(first: Side, other: Side) -> None:
         names = (", ".join(one.benchmark for one in side.evaluations) for side in (first, other))
         raise UsageError(f"{first.label} and {other.label} are of other benchmarks: {' and '.join(names)}")
     for a, b in shared:
-        ours, theirs = _conditions(a.config), _conditions(b.config)
-        for key in sorted(ours.keys() | theirs.keys()):
-            if ours.get(key) != theirs.get(key):
+        left, right = _conditions(a.config), _conditions(b.config)
+        for key in sorted(left.keys() | right.keys()):
+            if left.get(key) != right.get(key):
                 raise UsageError(
                     f"{first.label} and {other.label} are of other episodes of {a.benchmark}: {key} is "
-                    f"{ours.get(key)} and {theirs.get(key)}"
+                    f"{left.get(key)} and {right.get(key)}"
                 )
     episodes = [{(a.benchmark, one.task, one.seed) for one in a.episodes} for a, _ in shared]
     if not set().union(*episodes) & {(b.benchmark, one.task, one.seed) for _, b in shared for one in b.episodes}:
@@ -244,7 +242,7 @@ def write_study(results: Path, name: str, sides: Sequence[Side], baseline: str, 
     if baseline not in labels:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(labels)}")
     benchmarks = list(dict.fromkeys(one.benchmark for side in sides for one in side.evaluations))
-    run = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+    run = new_run_id()
     planned = [cell for side in sides for cell in _planned(side, len(benchmarks) > 1)]
     notes = [line for side in sides for one in side.evaluations for line in _notes(side.label, one)]
     study = StudySettings(

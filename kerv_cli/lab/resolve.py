@@ -23,8 +23,6 @@ from kerv_cli.worlds import resolve_tasks, settled, spec_of
 EPISODES_PER_CELL = 1
 """Of a rollout: Ctrl-C loses at most the episode that runs."""
 
-_OF_THE_SWEEP = ("study", "results", "until", "loss", "rerun")
-
 
 @dataclass(frozen=True)
 class ResolvedStudy:
@@ -59,7 +57,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     """
     check_once(overrides, ["study"])
     file = next((o for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))), None)
-    of_sweep = [o for o in overrides if o != file and _key(o).split(".", 1)[0] in _OF_THE_SWEEP]
+    of_sweep = [o for o in overrides if o != file and _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
     of_settings = [o for o in overrides if o != file and (o not in of_sweep or o.startswith("results="))]
     sweep = compose("sweep", of_sweep, SweepSettings)
     if file is not None:

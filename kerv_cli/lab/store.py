@@ -463,6 +463,11 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
+def new_run_id() -> str:
+    """The id of a run that begins now, which its cells name: `20260301T142530Z-0f1e2d`."""
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+
+
 def _seal(status: Mapping[str, Any]) -> str:
     """Hash of all entries of a status but its own."""
     text = json.dumps({key: value for key, value in status.items() if key != "sha256"}, sort_keys=True)
