@@ -223,11 +223,11 @@ def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     """
     if table.schema.equals(schema):
         return table
-    present, names = set(table.column_names), list(schema.names)
-    for field in (field for field in schema if field.name not in present):
-        table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    further = [name for name in table.column_names if name not in set(names)]
-    table = table.select([*names, *further])
+    for field in schema:
+        if field.name not in table.column_names:
+            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    further = [name for name in table.column_names if name not in schema.names]
+    table = table.select([*schema.names, *further])
     return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
 
 
