@@ -66,8 +66,7 @@ def rollout(
         else:
             typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, about {3 * total} s (a guess)")
         return
-    arguments = ["rollout", *(["-m"] if multirun else []), *words]
-    store = run_cells(resolved, cells, arguments)
+    store = run_cells(resolved, cells, ["rollout", *(["-m"] if multirun else []), *words])
     _print_rollout(store, as_json, results_word(words))
 
 

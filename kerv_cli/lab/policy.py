@@ -201,8 +201,7 @@ def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
         UsageError, CheckpointError: as `check`.
     """
     artifacts = artifacts_of(settings)
-    decoder = Method.of(settings).decoder(artifacts.target, artifacts.load)
-    return BatchDecoder(decoder, settings.deviation_every)
+    return BatchDecoder(Method.of(settings).decoder(artifacts.target, artifacts.load), settings.deviation_every)
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:

@@ -123,12 +123,11 @@ def cover(planned: Sequence[Cell], stock: Stock, rerun: str = NEVER, since: str 
     for cell in planned:
         groups.setdefault((cell.task, cell.seeds, cell.repeat), []).append(cell)
     splits: dict[int, tuple[Pieces, list[tuple[int, ...]]]] = {}
-    code = code_hash() if rerun == CHANGED else ""
 
     def accepts(entry: StockEntry) -> bool:
         if rerun == ALL:
             return bool(since) and entry.started >= since
-        return rerun != CHANGED or entry.code == code
+        return rerun != CHANGED or entry.code == code_hash()
 
     for group in groups.values():
         pieces = _pieces(group, stock, accepts)
