@@ -117,12 +117,12 @@ def sweep(study: str | Path, *words: str, **settings: object) -> Study:
     """
     overrides = as_words(f"study={study}", *words, **settings)
     resolved = resolve(overrides)
-    store, covered = covered_cells(resolved, overrides)
-    failed = run_covered(resolved, covered, store, overrides).failed
+    covered = covered_cells(resolved, overrides)
+    failed = run_covered(resolved, covered, overrides).failed
     if failed:
         cell, reason = failed[0].cell, failed[0].reason
         raise KervError(f"{len(failed)} of {len(covered.cells)} cells failed, {cell.label} on {cell.task}: {reason}")
-    return Study(store)
+    return Study(covered.store)
 
 
 def load_study(name: str, results: str | Path = "results") -> Study:

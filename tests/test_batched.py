@@ -196,13 +196,13 @@ def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs:
     decoder.sizes = []
     requests = [Request((task, seed), task, seed) for task in ("a", "b", "c") for seed in range(1, 7)]
     ended = list(run_together(decoder, requests, 4, stubs))
-    assert sorted(one.request.key for one in ended) == sorted(one.key for one in requests)
-    for one in ended:
-        assert isinstance(one.result, EpisodeRecord)
-        assert (one.result.task, one.result.seed) == one.request.key
-        assert one.result.steps == one.request.seed
-        assert not one.result.timed
-        assert one.result.wall_seconds > 0
+    assert sorted(request.key for request, _ in ended) == sorted(one.key for one in requests)
+    for request, record in ended:
+        assert isinstance(record, EpisodeRecord)
+        assert (record.task, record.seed) == request.key
+        assert record.steps == request.seed
+        assert not record.timed
+        assert record.wall_seconds > 0
     assert sum(decoder.sizes) == 3 * sum(range(1, 7))
     assert decoder.sizes[:10] == [4] * 10
     assert sorted(decoder.sizes, reverse=True) == decoder.sizes  # full until nothing waits
@@ -213,7 +213,7 @@ def test_the_next_episode_begins_where_one_ends_and_every_world_is_closed(stubs:
 def test_a_world_that_fails_ends_its_own_episode(stubs: type[Stub]) -> None:
     requests = [Request(seed, "a", seed) for seed in (10, 11, 12, 13, 15)]
     decoder = BatchDecoder(Decoder(target(), chunk=1))
-    ended = {one.request.key: one.result for one in run_together(decoder, requests, 2, stubs)}
+    ended = {request.key: result for request, result in run_together(decoder, requests, 2, stubs)}
     assert str(ended.pop(13)) == "the table broke"
     assert {seed: record.steps for seed, record in ended.items()} == {10: 3, 11: 4, 12: 5, 15: 1}
     assert sorted(stubs.opened) == sorted(stubs.closed)
@@ -240,7 +240,7 @@ def test_a_batch_of_real_episodes_is_what_they_are_one_by_one(policies: Path, po
         for record in map(run.Runner(settings(policies, *words), task).episode, seeds)
     }
     requests = [Request(None, task, seed) for task in tasks for seed in seeds]
-    together = [ended.result for ended in run.run_batch(settings(policies, *words, "rollout.batch=3"), requests)]
+    together = [record for _, record in run.run_batch(settings(policies, *words, "rollout.batch=3"), requests)]
     assert len(together) == len(alone)
     for record in together:
         assert isinstance(record, EpisodeRecord)

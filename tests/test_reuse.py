@@ -44,7 +44,7 @@ def to_run(covered: Covered) -> dict[tuple[str, tuple[int, ...]], str]:
 
 def swept(store: StudyStore, cells: list[Cell], rerun: str = "never") -> Covered:
     covered = cover(cells, Stock(store), rerun)
-    take_over(store, covered)
+    take_over(covered)
     store.write_plan(threshold_settings(), covered.cells)
     assert not execute(covered.cells, prepare, store).failed
     return covered

@@ -262,12 +262,12 @@ def test_workers_of_a_killed_sweep_end_and_complete_cells_stay(store: StudyStore
 
 def test_estimates_say_what_they_rest_on(store: StudyStore) -> None:
     cells = threshold_study(["reach-v3", "push-v3"])
-    guess = estimate(cover(cells, Stock(store)), store, 1, 10.0)
+    guess = estimate(cover(cells, Stock(store)), 1, 10.0)
     assert (guess.seconds, guess.to_run, guess.reused) == (8 * 4 * 10.0, 8, 0)
     assert "guess" in guess.source
     execute(cells[:2], prepare, store)
     wall = {c.label: store.read_cell(c.id).episodes["wall_seconds"].mean() for c in cells[:2]}
-    found = estimate(cover(cells, Stock(store)), store, 2, 10.0)
+    found = estimate(cover(cells, Stock(store)), 2, 10.0)
     mean = (wall["ar"] + wall["naive_sd"]) / 2
     assert found.seconds == pytest.approx((4 * wall["ar"] + 4 * wall["naive_sd"] + 16 * mean) / 2)
     assert (found.to_run, found.reused) == (6, 2)

@@ -39,15 +39,14 @@ def cells_again(run: RunEntry, results: str) -> list[Cell]:
 
 
 def _again(cell: Cell, results: str) -> Cell:
-    settings = settings_from({**cell.settings, "results": results, "episodes": 1, "seed": cell.seeds[0]})
-    identity = check(settings)
+    stored = {**cell.settings, "results": results}
+    identity = check(settings_from({**stored, "episodes": 1, "seed": cell.seeds[0]}))
     for kind in cell.identity.keys() | identity.keys():
         was, now = cell.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and was != now:
             raise CheckpointError(
                 f"the {kind} of {cell.label} was {was[:12]} and is {now[:12]} now: it cannot run again"
             )
-    stored = {**cell.settings, "results": results}
     return make_cell(cell.label, cell.overrides, stored, identity, cell.task, cell.seeds, cell.repeat)
 
 
@@ -74,8 +73,7 @@ def run_again(run: RunEntry, store: StudyStore, cells: list[Cell]) -> RunEntry:
         KervError: a cell failed. Interrupted: Ctrl-C.
     """
     plan = store_of(run).read_plan()
-    study = StudySettings(store.name, plan.title, plan.baseline, axis=plan.axis)
-    store.begin(study, cells, _words(run))
+    store.begin(StudySettings(store.name, plan.title, plan.baseline, axis=plan.axis), cells, _words(run))
     with running(store, cells, RuntimeSettings()) as execute:
         failed = execute(cells).failed
     if failed:

@@ -154,14 +154,14 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
     note = deployment_note(resolved)
     if note:
         typer.echo(f"note: {note}", err=True)
-    store, covered = covered_cells(resolved, of_study)
+    covered = covered_cells(resolved, of_study)
     if plan:
-        print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
+        print_sweep_plan(covered, resolved.first.runtime.workers, as_json)
         return
-    outcome = run_covered(resolved, covered, store, of_study)
+    outcome = run_covered(resolved, covered, of_study)
     if outcome.failed:
         raise typer.Exit(1)
-    certificate = certify(resolved, store, covered.cells, settings.margin, settings.delta)
+    certificate = certify(resolved, covered.store, covered.cells, settings.margin, settings.delta)
     path = write(folder, certificate)
     rows = candidate_rows(certificate)
     if as_json:

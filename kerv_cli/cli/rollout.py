@@ -49,7 +49,6 @@ def rollout(
     from kerv_cli.base.config import to_yaml
     from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
-    from kerv_cli.worlds import resolve_tasks
 
     resolved = resolve_rollout(words, multirun)
     if cfg:
@@ -61,15 +60,14 @@ def rollout(
     if plan:
         total = sum(len(cell.seeds) for cell in cells)
         names = ", ".join(f"{label}{_stressed(asdict(settings))}" for label, settings in resolved.settings.items())
-        tasks = resolve_tasks(resolved.first.task)
+        tasks = resolved.tasks
         if as_json:
             print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
         else:
             typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, about {3 * total} s (a guess)")
         return
-    arguments = ["rollout", *(["-m"] if multirun else []), *words]
-    store = run_cells(resolved, cells, arguments)
-    _print_rollout(store, cells, as_json, results_word(words))
+    store = run_cells(resolved, cells, ["rollout", *(["-m"] if multirun else []), *words])
+    _print_rollout(store, as_json, results_word(words))
 
 
 def _stressed(settings: Plain) -> str:
@@ -85,38 +83,23 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
     episodes, and the tasks that a policy was not trained on, to standard error."""
     from kerv_cli.lab.executors import check_executor
     from kerv_cli.lab.resolve import unseen_tasks
-    from kerv_cli.worlds import resolve_tasks
 
-    study, first = resolved.study, resolved.first
+    settings, first, tasks = resolved.settings, resolved.first, resolved.tasks
     check_executor(first.runtime)
     check_writable(first.results)
-    tasks = resolve_tasks(first.task)
     # before anything heavy loads
-    what = next(iter(resolved.settings)) if len(resolved.settings) == 1 else f"{len(resolved.settings)} settings"
+    what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     where = ", ".join(tasks) if len(tasks) < 4 else f"{len(tasks)} tasks"
-    count = len(resolved.settings) * len(tasks) * first.episodes * study.repeats
+    count = len(settings) * len(tasks) * first.episodes * resolved.study.repeats
     typer.echo(f"{what} of {first.policy.target} on {where}: {count} episodes", err=True)
     with at_work("loading the policy"):
-        from kerv_cli.base.runtime import set_up
-        from kerv_cli.lab.plan import plan
-        from kerv_cli.lab.policy import check
+        from kerv_cli.lab.policy import cells_of
 
-        identities = {label: check(settings) for label, settings in resolved.settings.items()}
-        for settings in resolved.settings.values():
-            settings.runtime.device, _ = set_up(settings.runtime)
-    unseen = dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in resolved.settings.values())
-    for target, names in unseen:
+        cells = cells_of(resolved)
+    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
-    return plan(
-        resolved.settings,
-        tasks,
-        identities.__getitem__,
-        baseline=study.baseline,
-        overrides=resolved.overrides,
-        block=study.block,
-        repeats=study.repeats,
-    )
+    return cells
 
 
 def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) -> StudyStore:
@@ -126,18 +109,19 @@ def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) 
         Interrupted: Ctrl-C. KervError: an episode failed.
     """
     from kerv_cli.cli.running import running
-    from kerv_cli.lab.reuse import rollout_store
+    from kerv_cli.lab.reuse import cover_rollout
 
-    store, cells, done = rollout_store(resolved.first.results, cells)
+    covered = cover_rollout(resolved.first.results, cells)
+    store, done = covered.store, len(covered.complete)
     if done:
-        typer.echo(f"resuming {store.name}: {done} of {len(cells)} episodes are there", err=True)
-    store.begin(resolved.study, cells, arguments)
-    with running(store, cells, resolved.first.runtime) as run:
-        run(cells)
+        typer.echo(f"resuming {store.name}: {done} of {len(covered.cells)} episodes are there", err=True)
+    store.begin(resolved.study, covered.cells, arguments)
+    with running(store, covered.cells, resolved.first.runtime) as run:
+        run(covered.cells)
     return store
 
 
-def _print_rollout(store: StudyStore, cells: list[Cell], as_json: bool, where: str) -> None:
+def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
     from kerv_cli.report.measures import MICRO
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of

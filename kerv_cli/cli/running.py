@@ -28,7 +28,6 @@ def running(
         Interrupted: Ctrl-C. KervError: a rollout's episode failed. StorageError: the disk refused.
     """
     is_study = store.family == STUDIES
-    here = runtime.executor == "local" and runtime.workers == 1
     with ProgressDisplay(console(stderr=True)) as display:
 
         def on_event(event: Event) -> None:
@@ -36,7 +35,7 @@ def running(
                 raise event.error or KervError(event.reason)
             display(event)
 
-        on_step = display.on_step if here else None
+        on_step = display.on_step if runtime.executor == "local" and runtime.workers == 1 else None
         runner = CellRunner(store.rollouts, save_recording, keep=not is_study, on_step=on_step)
         try:
             yield lambda part: execute(part, runner, store, runtime, on_event, reference_decode)

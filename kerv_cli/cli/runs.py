@@ -181,7 +181,10 @@ def rerun(
     results, (name,) = settings.results, _run_names(names)
     run = find_run(results, name)
     if run.is_training:
-        _train_again(run, results, plan, as_json)
+        from kerv_cli.cli.again import training_again
+        from kerv_cli.cli.train import run_training
+
+        run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
         return
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: the command that makes it goes on where it is unfinished")
@@ -203,13 +206,6 @@ def rerun(
         return
     typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
     typer.echo(f"both side by side: {kerv_command()} runs compare {run.id} {entry.id}{results_word(words)}")
-
-
-def _train_again(run: RunEntry, results: str, plan: bool, as_json: bool) -> None:
-    from kerv_cli.cli.again import training_again
-    from kerv_cli.cli.train import run_training
-
-    run_training(training_again(run, results), plan, as_json, "reading what it needs", "training again")
 
 
 @_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")

@@ -58,12 +58,12 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
     if cfg:
         print_settings(resolved)
         return
-    store, covered = covered_cells(resolved, words)
+    covered = covered_cells(resolved, words)
     if plan:
-        print_sweep_plan(covered, store, resolved.first.runtime.workers, as_json)
+        print_sweep_plan(covered, resolved.first.runtime.workers, as_json)
         return
-    outcome = run_covered(resolved, covered, store, words)
-    _print_outcome(outcome, resolved, covered.cells, store, words, as_json)
+    outcome = run_covered(resolved, covered, words)
+    _print_outcome(outcome, resolved, covered, words, as_json)
     if outcome.failed:
         raise typer.Exit(1)
 
@@ -77,10 +77,9 @@ def print_settings(resolved: ResolvedStudy) -> None:
         typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
 
 
-def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore, Covered]:
-    """The study's store, and its cells: those on disk and those to run. Everything that can be refused before an
-    episode runs is refused here. Prints which overrides have no effect and which cells disagree. words: of the
-    command."""
+def covered_cells(resolved: ResolvedStudy, words: list[str]) -> Covered:
+    """The study's cells: those on disk and those to run. Everything that can be refused before an episode runs is
+    refused here. Prints which overrides have no effect and which cells disagree. words: of the command."""
     from kerv_cli.cli.rollout import planned_cells
     from kerv_cli.lab.resolve import idle_overrides
     from kerv_cli.lab.reuse import Stock, cover, disagreements
@@ -91,8 +90,8 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> tuple[StudyStore
     store = StudyStore(resolved.first.results, resolved.study.name)
     stock = Stock(store)
     covered = cover(cells, stock, resolved.sweep.rerun, store.interrupted_since(["sweep", *words]))
-    _warn(disagreements((cell for cell in covered.cells if cell.id not in covered.reasons), stock))
-    return store, covered
+    _warn(disagreements(covered.complete, stock))
+    return covered
 
 
 def _list_studies(as_json: bool) -> None:
@@ -119,7 +118,7 @@ def _warn(lines: Iterable[str]) -> None:
         typer.echo(f"kerv: warning: {line}", err=True)
 
 
-def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json: bool) -> None:
+def print_sweep_plan(covered: Covered, workers: int, as_json: bool) -> None:
     """Prints which cells would be run, why, and how long that takes."""
     from kerv_cli.lab.plan import seeds_text
     from kerv_cli.lab.reuse import estimate
@@ -135,7 +134,7 @@ def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json:
         tasks, repeats = len({cell.task for cell in cells}), len({cell.repeat for cell in cells})
         why = "; ".join(dict.fromkeys(covered.reasons[cell.id] for cell in to_run))
         rows.append((label, len(to_run), len(cells) - len(to_run), tasks, seeds, repeats, why))
-    time = estimate(covered, store, workers, SECONDS_PER_EPISODE)
+    store, time = covered.store, estimate(covered, workers, SECONDS_PER_EPISODE)
     if as_json:
         settings = [dict(zip(columns, row, strict=True)) for row in rows]
         print_json({"study": store.name, "folder": store.root, "settings": settings, "to run": time.to_run,
@@ -145,17 +144,17 @@ def print_sweep_plan(covered: Covered, store: StudyStore, workers: int, as_json:
     typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
 
 
-def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, words: list[str]) -> Outcome:
+def run_covered(resolved: ResolvedStudy, covered: Covered, words: list[str]) -> Outcome:
     """Runs the cells that are not complete; warns of results that differ from earlier ones.
 
     Raises:
         Interrupted: Ctrl-C.
     """
     from kerv_cli.cli.running import running
-    from kerv_cli.lab.reuse import Stock, disagreements, take_over
+    from kerv_cli.lab.reuse import NEVER, Stock, disagreements, take_over
 
-    cells = covered.cells
-    take_over(store, covered)
+    store, cells = covered.store, covered.cells
+    take_over(covered)
     if resolved.sweep.until == "done":
         store.write_plan(resolved.study, cells)
     store.note_command(["sweep", *words])
@@ -163,7 +162,7 @@ def run_covered(resolved: ResolvedStudy, covered: Covered, store: StudyStore, wo
         outcome = _run_until_decided(resolved, cells, store, run) if resolved.sweep.until == "decided" else run(cells)
     if not outcome.failed:
         store.note_finished()
-    if resolved.sweep.rerun != "never":
+    if resolved.sweep.rerun != NEVER:
         _warn(disagreements(outcome.done, Stock(store, others=False)))
     return outcome
 
@@ -185,9 +184,10 @@ def _run_until_decided(
     total = Outcome()
     open_labels = [label for label in resolved.settings if label != study.baseline]
     for look, block in enumerate(blocks, 1):
-        planned += [cell for cell in block if cell.label in (study.baseline, *open_labels)]
+        to_run = [cell for cell in block if cell.label in (study.baseline, *open_labels)]
+        planned += to_run
         store.write_plan(study, planned)
-        outcome = run([cell for cell in block if cell.label in (study.baseline, *open_labels)])
+        outcome = run(to_run)
         lists = total.done + outcome.done, total.reused + outcome.reused, total.failed + outcome.failed
         total = Outcome(*lists, total.seconds + outcome.seconds)
         if outcome.failed:
@@ -234,12 +234,12 @@ def print_verdict(table: DataFrame, store: StudyStore, loss: float) -> None:
 
 
 def _print_outcome(
-    outcome: Outcome, resolved: ResolvedStudy, cells: list[Cell], store: StudyStore, words: list[str], as_json: bool
+    outcome: Outcome, resolved: ResolvedStudy, covered: Covered, words: list[str], as_json: bool
 ) -> None:
     from kerv_cli.report.tables import load_study, rows_of
 
-    complete = {cell.id for cell in [*outcome.done, *outcome.reused]}
-    data = load_study(store, [cell for cell in cells if cell.id in complete]) if complete else None
+    store, complete = covered.store, {cell.id for cell in [*outcome.done, *outcome.reused]}
+    data = load_study(store, [cell for cell in covered.cells if cell.id in complete]) if complete else None
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(outcome.failed)}
     if as_json:
         rows = [] if data is None else rows_of(data.table)

@@ -175,8 +175,7 @@ def _study(store: StudyStore) -> RunEntry:
 
 def _weights(cells: Sequence[Cell]) -> dict[str, str]:
     """Kind -> hash of the artifacts that a study reads; of several targets the first one's."""
-    identities = [cell.identity for cell in cells]
-    pairs = [(kind, value) for one in identities for kind, value in one.items() if kind != OBSERVATION and value]
+    pairs = [pair for cell in cells for pair in cell.identity.items() if pair[0] != OBSERVATION and pair[1]]
     return dict(reversed(pairs))
 
 

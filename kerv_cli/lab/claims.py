@@ -44,12 +44,12 @@ def claim(folder: Path, cells: Sequence[Cell], run: str, block: str) -> bool:
     Raises:
         StorageError: the disk refused.
     """
-    mine = Claim(run, block, socket.gethostname(), os.getpid(), datetime.now(UTC).isoformat(timespec="seconds"))
+    holder = Claim(run, block, socket.gethostname(), os.getpid(), datetime.now(UTC).isoformat(timespec="seconds"))
     with write_lock(folder):
         if any(is_claimed(folder, cell) for cell in cells):
             return False
         for cell in cells:
-            write_json(folder / f"{cell.id}.json", asdict(mine))
+            write_json(folder / f"{cell.id}.json", asdict(holder))
     return True
 
 

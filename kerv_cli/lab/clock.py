@@ -94,12 +94,13 @@ class RealClock:
         return Delay(seconds, steps, observed)
 
     def chunk(self, decode: DecodeRecord, history: Sequence[np.ndarray]) -> np.ndarray:
-        """The actions (n, D) to execute from now on, environment units: those of the decode, whose `delay` is known,
+        """The actions (n, D) to execute from now on, environment units: those of the decode, which has a `delay`,
         without the dropped ones, and predicted ones behind them. history: actions that were executed up to its
         observation, oldest first."""
         actions, delay = decode.actions, decode.delay
-        if delay is None or not delay.predicted or self.stream is None:
-            return actions[delay.dropped :] if delay is not None else actions
+        assert delay is not None
+        if self.stream is None or not delay.predicted:
+            return actions[delay.dropped :]
         recent = self.space.normalise(np.array([*history[-self.stream.window :], *actions]))
         first = delay.steps + 1 - delay.predicted  # steps ahead of the chunk's end of the first predicted action
         ahead = np.minimum(np.arange(first, delay.steps + 1), AHEAD) - 1
@@ -112,8 +113,7 @@ class RealClock:
 
 def predictor(kind: str, held: np.ndarray) -> Predictor:
     """KERV's predictor of that kind (§3.1), up to `AHEAD` steps ahead: hold, linear, or kalman with q = 10 r."""
-    noise = Noise.uniform(len(held), q=_RATIO)
-    return build_predictor(kind, held, {"kalman": noise}, _LEAST[kind], horizon=AHEAD)
+    return build_predictor(kind, held, {"kalman": Noise.uniform(len(held), q=_RATIO)}, _LEAST[kind], horizon=AHEAD)
 
 
 def displacement(motion: Predictor, path: np.ndarray, steps: int) -> np.ndarray:

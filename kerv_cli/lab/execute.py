@@ -15,7 +15,7 @@ import secrets
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -34,7 +34,7 @@ from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Block, Cell, blocks_of
 from kerv_cli.lab.rows import Circumstances
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import StudyStore, new_run_id
 
 _POLL_SECONDS = 1.0  # between two looks at blocks that another sweep computes
 
@@ -93,7 +93,7 @@ class _Sweep:
         self.prepare, self.store, self.runtime, self.on_event, self.gauge = prepare, store, runtime, on_event, gauge
         self.options = check_executor(runtime)
         self.outcome = Outcome()
-        self.run_id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+        self.run_id = new_run_id()
         self.status = {
             "workers": runtime.workers,
             "executor": runtime.executor,
@@ -110,10 +110,10 @@ class _Sweep:
         clock = time.perf_counter()
         clean(self.store.cells)
         clean_void(self.store.claims)
-        damaged = self._damaged(cells)
+        blocks = blocks_of(cells, self.runtime.workers)
+        damaged = self._damaged(cell for block in blocks for cell in block.cells)
         settled = {*damaged, *(cell.id for cell in self.outcome.reused)}
-        blocks = (block.without(settled) for block in blocks_of(cells, self.runtime.workers))
-        self.waiting.extend(block for block in blocks if block is not None)
+        self.waiting.extend(rest for block in blocks if (rest := block.without(settled)) is not None)
         executor: Executor | None = None
         if self.waiting:
             threads = max(cell.settings["runtime"]["threads"] for cell in cells)
@@ -128,11 +128,11 @@ class _Sweep:
             self._run_blocks(executor)
         return dataclasses.replace(self.outcome, seconds=time.perf_counter() - clock)
 
-    def _damaged(self, cells: Sequence[Cell]) -> Ends:
+    def _damaged(self, cells: Iterable[Cell]) -> Ends:
         """The damaged cells by id; complete ones are added to the outcome, and what a command that was killed has left
         of their failed attempts is removed."""
         damaged, failed = {}, self.store.failures.is_dir()
-        for cell in (cell for block in blocks_of(cells) for cell in block.cells):
+        for cell in cells:
             try:
                 if self.store.has_cell(cell.id):
                     self.outcome.reused.append(cell)
@@ -202,8 +202,8 @@ class _Sweep:
             return
         blocks, self.elsewhere = self.elsewhere, []
         for block in blocks:
-            theirs = any(is_claimed(self.store.claims, cell) for cell in block.cells)
-            (self.elsewhere if theirs else self.waiting).append(block)
+            claimed = any(is_claimed(self.store.claims, cell) for cell in block.cells)
+            (self.elsewhere if claimed else self.waiting).append(block)
         if not self.waiting:
             time.sleep(_POLL_SECONDS)
 
@@ -330,10 +330,10 @@ class _Turn:
         self.seconds += seconds
         if len(self.episodes) < len(self.cell.seeds):
             return None
-        status = {**stamp(self.device), **self.work.status, "run": self.work.run, "pid": os.getpid()}
-        status |= {"seconds": self.seconds}
+        work = self.work
+        status = {**stamp(self.device), **work.status, "run": work.run, "pid": os.getpid(), "seconds": self.seconds}
         records, circumstances = zip(*sorted(self.episodes, key=lambda episode: episode[0].seed), strict=True)
-        if not self.work.store.write_cell(self.cell, records, status, circumstances):
+        if not work.store.write_cell(self.cell, records, status, circumstances):
             return CellEnd(self.cell, reused=True)
         return CellEnd(self.cell, len(records), sum(record.success for record in records), self.seconds)
 

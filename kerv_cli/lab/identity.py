@@ -81,12 +81,11 @@ def _work(settings: str, identity: str, policy: str, engine: int) -> str:
 
 def effective(settings: Plain) -> dict[str, Any]:
     """The settings that determine a result: complete, without those that have no effect."""
-    determining = without(settings, NOT_DETERMINING)
     try:
         today = settings_from(settings, tolerant=True)
     except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
-        return determining
-    determining = _filled(determining, without(as_plain(today), NOT_DETERMINING))
+        return without(settings, NOT_DETERMINING)
+    determining = without(_filled(settings, as_plain(today)), NOT_DETERMINING)
     for key in idle_keys(today) if today.policy.kind != EXPERT else ():
         _drop(determining, key.split("."))
     determining["runtime"] = without(determining["runtime"], NOT_DETERMINING_RUNTIME)

@@ -12,11 +12,9 @@ import hashlib
 import json
 import math
 import re
-import secrets
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +30,7 @@ from kerv_cli.lab.identity import ENGINE, OBSERVATION
 from kerv_cli.lab.plan import Cell, make_cell
 from kerv_cli.lab.rows import DECODE_SCHEMA, EPISODE_SCHEMA, Circumstances, decode_rows, episode_row
 from kerv_cli.lab.served import Served, path_of, read_served
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import StudyStore, new_run_id
 
 _ELSEWHERE = "elsewhere"
 """Mode of the one decode that stands for those of a server which is not kerv."""
@@ -175,11 +173,6 @@ class Side:
     label: str
     evaluations: list[Evaluation] = field(default_factory=list)
 
-    @property
-    def facts(self) -> dict[str, Any]:
-        """See `Evaluation.facts`."""
-        return self.evaluations[0].facts
-
     def takes(self, one: Evaluation) -> bool:
         """Whether an evaluation of another benchmark is of the same server."""
         servers = [(each.name, each.facts, each.server.get("action_spec")) for each in (self.evaluations[0], one)]
@@ -215,12 +208,12 @@ def _check_same_episodes(first: Side, other: Side) -> None:
         names = (", ".join(one.benchmark for one in side.evaluations) for side in (first, other))
         raise UsageError(f"{first.label} and {other.label} are of other benchmarks: {' and '.join(names)}")
     for a, b in shared:
-        ours, theirs = _conditions(a.config), _conditions(b.config)
-        for key in sorted(ours.keys() | theirs.keys()):
-            if ours.get(key) != theirs.get(key):
+        left, right = _conditions(a.config), _conditions(b.config)
+        for key in sorted(left.keys() | right.keys()):
+            if left.get(key) != right.get(key):
                 raise UsageError(
                     f"{first.label} and {other.label} are of other episodes of {a.benchmark}: {key} is "
-                    f"{ours.get(key)} and {theirs.get(key)}"
+                    f"{left.get(key)} and {right.get(key)}"
                 )
     episodes = [{(a.benchmark, one.task, one.seed) for one in a.episodes} for a, _ in shared]
     if not set().union(*episodes) & {(b.benchmark, one.task, one.seed) for _, b in shared for one in b.episodes}:
@@ -249,7 +242,7 @@ def write_study(results: Path, name: str, sides: Sequence[Side], baseline: str, 
     if baseline not in labels:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(labels)}")
     benchmarks = list(dict.fromkeys(one.benchmark for side in sides for one in side.evaluations))
-    run = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+    run = new_run_id()
     planned = [cell for side in sides for cell in _planned(side, len(benchmarks) > 1)]
     notes = [line for side in sides for one in side.evaluations for line in _notes(side.label, one)]
     study = StudySettings(
@@ -328,16 +321,16 @@ def _status(one: Evaluation, episodes: Sequence[Episode], seconds: float, run: s
 
 def _settings(side: Side) -> dict[str, Any]:
     """Plain settings of a rollout that say what ran: those of kerv's server, else defaults with the server's name."""
-    stored = side.facts.get("settings")
-    plain = as_plain(RolloutSettings()) | {"method": side.evaluations[0].name}
+    first = side.evaluations[0]
+    stored = first.facts.get("settings")
+    plain = as_plain(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
         try:
             plain = as_plain(settings_from(stored, tolerant=True))
         except KervError:  # a part that is not registered here
             plain |= stored
-    config = side.evaluations[0].config
-    if str(config.get("benchmark", "")).startswith("kerv_cli."):
-        params = dict(config.get("params") or {})
+    if str(first.config.get("benchmark", "")).startswith("kerv_cli."):
+        params = dict(first.config.get("params") or {})
         for name, key in _WORLD.items():
             at, last = plain["world"], key.split(".")
             for part in last[:-1]:
@@ -350,7 +343,7 @@ def _identity(side: Side) -> dict[str, str]:
     """Hashes of the weights where kerv served, and of what was recorded: no rollout means the same."""
     recorded = [[one.id, [dataclasses.astuple(e) for e in one.episodes]] for one in side.evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
-    hashes = {str(k): str(v) for k, v in dict(side.facts.get("identity") or {}).items()}
+    hashes = {str(k): str(v) for k, v in dict(side.evaluations[0].facts.get("identity") or {}).items()}
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
 
 

@@ -54,8 +54,7 @@ class Cell:
 
     def again(self, names: Collection[str]) -> Cell:
         """This cell with the first id that is not among the names: `<id>-2`, `<id>-3`, …"""
-        first = self.part(self.seeds).id
-        return replace(self, id=next(n for n in (f"{first}-{i}" for i in range(2, 10_000)) if n not in names))
+        return replace(self, id=next(n for n in (f"{self.id}-{i}" for i in range(2, 10_000)) if n not in names))
 
 
 @dataclass(frozen=True)
@@ -113,13 +112,7 @@ class Block:
 
 
 def make_cell(
-    label: str,
-    overrides: str,
-    settings: Plain,
-    identity: Identity,
-    task: str,
-    seeds: Sequence[int],
-    repeat: int = 0,
+    label: str, overrides: str, settings: Plain, identity: Identity, task: str, seeds: Sequence[int], repeat: int = 0
 ) -> Cell:
     """The cell of one setting (plain RolloutSettings) on one task and some seeds.
 

@@ -20,7 +20,8 @@ from kerv_cli.lab.clock import RealClock
 from kerv_cli.lab.episode import ActionDecoder, Watcher
 from kerv_cli.lab.expert import ExpertDecoder
 from kerv_cli.lab.identity import OBSERVATION
-from kerv_cli.lab.resolve import tasks_of
+from kerv_cli.lab.plan import Cell, plan
+from kerv_cli.lab.resolve import ResolvedStudy, tasks_of
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.worlds import spec_of
@@ -77,6 +78,27 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation
     return {**hashes, **clock.profile_identity(settings), OBSERVATION: observation}
+
+
+def cells_of(resolved: ResolvedStudy) -> list[Cell]:
+    """The cells of a study, on the devices of this machine.
+
+    Raises:
+        UsageError, CheckpointError: as `check` of each setting. UsageError: more cells than a study can have.
+    """
+    study, settings = resolved.study, resolved.settings
+    identities = {label: check(one) for label, one in settings.items()}
+    for one in settings.values():
+        one.runtime.device, _ = set_up(one.runtime)
+    return plan(
+        settings,
+        resolved.tasks,
+        identities.__getitem__,
+        baseline=study.baseline,
+        overrides=resolved.overrides,
+        block=study.block,
+        repeats=study.repeats,
+    )
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
@@ -167,8 +189,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
         artifacts = artifacts_of(settings)
         decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
         if settings.deviation_every > 0:
-            reference = Decoder(artifacts.target, chunk=settings.chunk)
-            decoder = Sampled(decoder, reference, settings.deviation_every)
+            decoder = Sampled(decoder, Decoder(artifacts.target, chunk=settings.chunk), settings.deviation_every)
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 
@@ -180,8 +201,7 @@ def batch_decoder_for(settings: RolloutSettings) -> BatchDecoder:
         UsageError, CheckpointError: as `check`.
     """
     artifacts = artifacts_of(settings)
-    decoder = Method.of(settings).decoder(artifacts.target, artifacts.load)
-    return BatchDecoder(decoder, settings.deviation_every)
+    return BatchDecoder(Method.of(settings).decoder(artifacts.target, artifacts.load), settings.deviation_every)
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:

@@ -23,8 +23,6 @@ from kerv_cli.worlds import resolve_tasks, settled, spec_of
 EPISODES_PER_CELL = 1
 """Of a rollout: Ctrl-C loses at most the episode that runs."""
 
-_OF_THE_SWEEP = ("study", "results", "until", "loss", "rerun")
-
 
 @dataclass(frozen=True)
 class ResolvedStudy:
@@ -45,6 +43,11 @@ class ResolvedStudy:
         """The first setting, for what all have in common: tasks, results folder, processes."""
         return next(iter(self.settings.values()))
 
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Full names of the tasks, which all settings have in common."""
+        return resolve_tasks(self.first.task)
+
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     """The chosen study; overrides of `study…` and `results` go to the sweep, all others to each of its settings.
@@ -54,17 +57,17 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     """
     check_once(overrides, ["study"])
     file = next((o for o in overrides if o.startswith("study=") and o.endswith((".yaml", ".yml"))), None)
-    mine = [o for o in overrides if o != file and _key(o).split(".", 1)[0] in _OF_THE_SWEEP]
-    theirs = [o for o in overrides if o != file and (o not in mine or o.startswith("results="))]
-    sweep = compose("sweep", mine, SweepSettings)
+    of_sweep = [o for o in overrides if o != file and _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
+    of_settings = [o for o in overrides if o != file and (o not in of_sweep or o.startswith("results="))]
+    sweep = compose("sweep", of_sweep, SweepSettings)
     if file is not None:
-        names = {_key(o).removeprefix("study.") for o in mine} & set(StudySettings.__dataclass_fields__)
+        names = {_key(o).removeprefix("study.") for o in of_sweep} & set(StudySettings.__dataclass_fields__)
         changes = {name: getattr(sweep.study, name) for name in names}
         sweep.study = dataclasses.replace(study_of_file(Path(file.split("=", 1)[1]).expanduser()), **changes)
     study = sweep.study
-    study.name = study.name or next(o.split("=", 1)[1] for o in mine if o.startswith("study="))
-    keys = {_key(o) for o in theirs}
-    common = [o for o in split_words(study.common) if _key(o) not in keys] + theirs
+    study.name = study.name or next(o.split("=", 1)[1] for o in of_sweep if o.startswith("study="))
+    keys = {_key(o) for o in of_settings}
+    common = [o for o in split_words(study.common) if _key(o) not in keys] + of_settings
     points = _points(study)
     for words in points.values():
         varied = keys & {_key(word) for word in words}
@@ -81,7 +84,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     settings = {label: composer.compose([*common, *words]) for label, words in points.items()}
     narrows = any(key.startswith("policy") for key in keys) and not keys & {"task", "cover"}  # to the policy named
     _settle(settings.values(), settings[study.baseline], narrows)
-    return ResolvedStudy(sweep, settings, {label: " ".join(words) for label, words in points.items()}, tuple(theirs))
+    texts = {label: " ".join(words) for label, words in points.items()}
+    return ResolvedStudy(sweep, settings, texts, tuple(of_settings))
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:

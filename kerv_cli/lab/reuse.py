@@ -81,22 +81,28 @@ def _entries(store: StudyStore) -> Iterator[StockEntry]:
             config, status = store.described(folder.name)
             values = {key: config[key] for key in ("label", "task", "settings", "identity", "repeat")}
             cell = Cell(folder.name, overrides="", seeds=tuple(config["seeds"]), **values)
-            origin = str(status.get("started", "")), str(status["run"]), int(status.get("engine", 1))
-            yield StockEntry(cell, store, *origin, str(status.get("code", "")))
+            engine, code = int(status.get("engine", 1)), str(status.get("code", ""))
+            yield StockEntry(cell, store, str(status.get("started", "")), str(status["run"]), engine, code)
         except (CheckpointError, KeyError, TypeError, ValueError, AttributeError):
             continue  # damaged: it is named where it is read
 
 
 @dataclass
 class Covered:
-    """A plan whose cells are those on disk and those to run.
+    """A plan for a store, whose cells are those on disk and those to run.
 
     reasons: id of a cell to run -> why. sources: id of a cell that another study holds -> that study.
     """
 
+    store: StudyStore
     cells: list[Cell] = field(default_factory=list)
     reasons: dict[str, str] = field(default_factory=dict)
     sources: dict[str, StudyStore] = field(default_factory=dict)
+
+    @property
+    def complete(self) -> list[Cell]:
+        """Its cells on disk."""
+        return [cell for cell in self.cells if cell.id not in self.reasons]
 
 
 Pieces = dict[int, StockEntry]
@@ -117,19 +123,19 @@ def cover(planned: Sequence[Cell], stock: Stock, rerun: str = NEVER, since: str 
     for cell in planned:
         groups.setdefault((cell.task, cell.seeds, cell.repeat), []).append(cell)
     splits: dict[int, tuple[Pieces, list[tuple[int, ...]]]] = {}
-    code = code_hash() if rerun == CHANGED else ""
 
     def accepts(entry: StockEntry) -> bool:
         if rerun == ALL:
             return bool(since) and entry.started >= since
-        return rerun != CHANGED or entry.code == code
+        return rerun != CHANGED or entry.code == code_hash()
 
     for group in groups.values():
         pieces = _pieces(group, stock, accepts)
         if rerun == TIMED:
             pieces = _in_turn(group, pieces, stock)
-        splits |= zip(map(id, group), zip(pieces, _parts(group, pieces), strict=True), strict=True)
-    covered = Covered()
+        for cell, piece, parts in zip(group, pieces, _parts(group, pieces), strict=True):
+            splits[id(cell)] = piece, parts
+    covered = Covered(stock.store)
     for cell in planned:
         _append(covered, cell, *splits[id(cell)], stock, rerun)
     return covered
@@ -227,8 +233,8 @@ def _differences(entry: StockEntry, cell: Cell) -> str:
     return ", ".join(changes[:3]) or "new setting"
 
 
-def take_over(store: StudyStore, covered: Covered) -> None:
-    """Copies the cells that other studies hold into `store`. One that is damaged there is left out, and so runs here.
+def take_over(covered: Covered) -> None:
+    """Copies the cells that other studies hold into the plan's. One that is damaged there is left out, so it runs here.
 
     Raises:
         StorageError: the disk refused.
@@ -237,13 +243,12 @@ def take_over(store: StudyStore, covered: Covered) -> None:
         with contextlib.suppress(CheckpointError):
             source.status_of(name)
             copy = functools.partial(shutil.copytree, source.cells / name, dirs_exist_ok=True)
-            write_folder(store.cells / name, copy)
+            write_folder(covered.store.cells / name, copy)
 
 
-def rollout_store(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list[Cell], int]:
-    """The store of a rollout's cells, the cells by the names that they have in it, and the number of complete ones:
-    a new folder, or the newest run of the same cells that was interrupted. A complete run is not reused, because who
-    types a rollout wants it run."""
+def cover_rollout(results: str, cells: Sequence[Cell]) -> Covered:
+    """A rollout's cells in the newest run of the same cells that was interrupted, else in a new folder. A complete run
+    is not reused, because who types a rollout wants it run."""
     work = {(*cell.work, cell.seeds) for cell in cells}
     for store in reversed(stores(Path(results).expanduser(), ROLLOUTS)):
         with contextlib.suppress(UsageError, CheckpointError):
@@ -252,16 +257,16 @@ def rollout_store(results: str, cells: Sequence[Cell]) -> tuple[StudyStore, list
             clean_void(store.claims)
             covered = cover(cells, Stock(store, others=False))
             if covered.reasons:
-                return store, covered.cells, len(covered.cells) - len(covered.reasons)
-    return new_rollout(results, cells), list(cells), 0
+                return covered
+    return cover(cells, Stock(new_rollout(results, cells), others=False))
 
 
 def disagreements(cells: Iterable[Cell], stock: Stock) -> list[str]:
     """A sentence for every cell that was measured twice with other results: other tokens of the same work."""
     sentences = []
     for cell in unique_cells(cells):
-        for other in (entry.cell.id for entry in stock.of(cell) if entry.store.name == stock.store.name):
-            differ = _differ(stock.store, cell, other) if other != cell.id else []
+        for other in (e.cell.id for e in stock.of(cell) if e.store.name == stock.store.name and e.cell.id != cell.id):
+            differ = _differ(stock.store, cell, other)
             if differ:
                 sentences.append(
                     f"cells {other} and {cell.id} are the same work ({cell.label} on {cell.task}) and differ in "
@@ -289,7 +294,7 @@ class TimeEstimate:
     source: str  # of the figure, in words
 
 
-def estimate(covered: Covered, store: StudyStore, workers: int, prior_seconds: float) -> TimeEstimate:
+def estimate(covered: Covered, workers: int, prior_seconds: float) -> TimeEstimate:
     """Time for the cells that are to run, from the mean wall seconds per episode of the plan's other cells.
 
     A label with complete cells uses its own mean, others the mean over all; `prior_seconds` per episode is the guess
@@ -300,17 +305,16 @@ def estimate(covered: Covered, store: StudyStore, workers: int, prior_seconds: f
     """
     seconds: Counter[str] = Counter()
     episodes: Counter[str] = Counter()
-    cells = unique_cells(covered.cells)
-    to_run = [cell for cell in cells if cell.id in covered.reasons]
-    for cell in cells:
-        if cell.id not in covered.reasons:
-            _, status = covered.sources.get(cell.id, store).described(cell.id)
-            seconds[cell.label] += status["wall_seconds"]
-            episodes[cell.label] += status["episodes"]
+    complete = unique_cells(covered.complete)
+    to_run = unique_cells(cell for cell in covered.cells if cell.id in covered.reasons)
+    for cell in complete:
+        _, status = covered.sources.get(cell.id, covered.store).described(cell.id)
+        seconds[cell.label] += status["wall_seconds"]
+        episodes[cell.label] += status["episodes"]
     stored = episodes.total()
     prior = seconds.total() / stored if stored else prior_seconds
     means = {label: seconds[label] / count for label, count in episodes.items()}
     total = sum(len(cell.seeds) * means.get(cell.label, prior) for cell in to_run)
     source = f"measured on {stored} stored episodes" if stored else f"a guess of {prior_seconds:g} s per episode"
     at_once = max(1, min(workers, len(blocks_of(to_run, workers))))
-    return TimeEstimate(total / at_once, len(to_run), len(cells) - len(to_run), source)
+    return TimeEstimate(total / at_once, len(to_run), len(complete), source)

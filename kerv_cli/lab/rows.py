@@ -118,22 +118,17 @@ _DECODE: Fields = {
     "rounds": (pa.list_(_ROUND), lambda decode: [asdict(one) for one in decode.rounds]),
     **_attributes("compensated"),
     **_attributes("skipped", kind=FLAG),
-    **_attributes(
-        "looks", "abandoned"
-    ),  # at the world while it was executed; control steps given up after the last of them
+    # at the world while the chunk was executed; control steps given up after the last of them
+    **_attributes("looks", "abandoned"),
     **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),
     **_attributes("reason", kind=TEXT),  # of a skip rule: trusted, streak; null without one that says so
     "delay_seconds": (FLOAT, _delay("seconds")),  # these: null where the world waited
     "delay_steps": (INT, _delay("steps")),
     **{name: (INT, _delay(name)) for name in ("observed", "carried", "held", "dropped", "predicted")},
 }
-_PLACE = {
-    "task": TEXT,
-    "seed": INT,
-    "index": INT,
-    "step": INT,
-}  # decode of the episode, control step at which its actions begin
-DECODE_SCHEMA = pa.schema({**_PLACE, **{name: kind for name, (kind, _) in _DECODE.items()}}.items())
+# index: of the decode in its episode; step: control step at which its actions begin
+_POSITION = {"task": TEXT, "seed": INT, "index": INT, "step": INT}
+DECODE_SCHEMA = pa.schema({**_POSITION, **{name: kind for name, (kind, _) in _DECODE.items()}}.items())
 _DECODE_TIMES = pa.schema([DECODE_SCHEMA.field(name) for name in ("seed", "seconds")])
 
 
@@ -228,11 +223,11 @@ def _with_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     """
     if table.schema.equals(schema):
         return table
-    present, names = set(table.column_names), list(schema.names)
-    for field in (field for field in schema if field.name not in present):
-        table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    further = [name for name in table.column_names if name not in set(names)]
-    table = table.select([*names, *further])
+    for field in schema:
+        if field.name not in table.column_names:
+            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    further = [name for name in table.column_names if name not in schema.names]
+    table = table.select([*schema.names, *further])
     return table.cast(pa.schema([*schema, *(table.schema.field(name) for name in further)]))
 
 

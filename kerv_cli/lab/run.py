@@ -15,7 +15,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from kerv_cli.base.settings import CameraSettings, RolloutSettings, WorldSettings, settings_from
 from kerv_cli.engine.batched import BatchDecoder
+from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.episode import OnStep, run_episode
 from kerv_cli.lab.plan import Cell
@@ -101,11 +102,10 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
     Raises:
         UsageError, CheckpointError: the setting cannot run; see `policy.check`.
     """
-
-    def opened(task: str) -> World:
-        return new_world(task, settings.world, build_stress(settings.world.stress))
-
-    return run_together(batch_decoder_for(settings), requests, settings.rollout.batch, opened)
+    decoder, world = batch_decoder_for(settings), settings.world
+    return run_together(
+        decoder, requests, settings.rollout.batch, lambda task: new_world(task, world, build_stress(world.stress))
+    )
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
@@ -116,16 +116,16 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
     return settings.record < 0 or seed - settings.seed < settings.record
 
 
-def success_of(target: Any, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
+def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Share in [0, 1] of successful episodes over tasks and seeds, decoded as the target was trained to,
     autoregressively or in parallel, TOGETHER at a time."""
     decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task in tasks for seed in seeds]
     outcomes = []
-    for end in run_together(decoder, requests, TOGETHER, lambda task: new_world(task, settings)):
-        if isinstance(end.result, Exception):
-            raise end.result
-        outcomes.append(end.result.success)
+    for _, result in run_together(decoder, requests, TOGETHER, lambda task: new_world(task, settings)):
+        if isinstance(result, Exception):
+            raise result
+        outcomes.append(result.success)
     return float(np.mean(outcomes))
 
 
@@ -153,16 +153,17 @@ class CellRunner:
 
     def __call__(self, cell: Cell) -> Callable[[int], EpisodeRecord]:
         """Builds the cell's decoder -> the function that runs the episode of a seed. Only repeat 0 is recorded."""
-        settings = settings_from(cell.settings)
-        key = json.dumps(cell.settings, sort_keys=True), cell.task
-        runner = _runner(*key) if self.keep else Runner(settings, cell.task)
+        if self.keep:
+            runner = _runner(json.dumps(cell.settings, sort_keys=True), cell.task)
+        else:
+            runner = Runner(settings_from(cell.settings), cell.task)
 
         def episode(seed: int) -> EpisodeRecord:
             on_step = functools.partial(self.on_step, cell, seed) if self.on_step is not None else None
-            record = runner.episode(seed, cell.repeat == 0 and is_recorded(settings, seed), on_step)
+            record = runner.episode(seed, cell.repeat == 0 and is_recorded(runner.settings, seed), on_step)
             if record.frames:
                 name = f"{cell.label.replace(' ', '_').replace('=', '')}-{record.task}-{seed}-{cell.id[:6]}.rrd"
-                self.save(record, self.rollouts / name, cell.label, limits_of(settings, cell.task))
+                self.save(record, self.rollouts / name, cell.label, limits_of(runner.settings, cell.task))
             return dataclasses.replace(record, frames={}, places={})
 
         return episode
@@ -172,11 +173,10 @@ class CellRunner:
         it ends: its cell, its seed, and its record or the error that its world raised."""
         settings = settings_from(cells[0].settings)
         requests = [Request(cell, cell.task, seed) for cell in cells for seed in cell.seeds]
-        for end in run_batch(settings, requests):
-            cell, seed = end.request.key, end.request.seed
+        for request, result in run_batch(settings, requests):
             if self.on_step is not None:
-                self.on_step(cell, seed, settings.world.horizon)
-            yield cell, seed, end.result
+                self.on_step(request.key, request.seed, settings.world.horizon)
+            yield request.key, request.seed, result
 
 
 def limits_of(settings: RolloutSettings, task: str) -> dict[str, float]:

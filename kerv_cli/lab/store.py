@@ -74,7 +74,6 @@ class NewerCell(CheckpointError):
 class StoredCell:
     """A complete cell, read from its folder."""
 
-    id: str
     folder: Path
     config: dict[str, Any]  # the study's name and the fields of Cell
     status: dict[str, Any]  # provenance, run, seconds, sums
@@ -135,9 +134,9 @@ class StudyStore:
         self.claims = self.root / "claims"
         self.jobs = self.root / "jobs"  # an executor's own files
 
-    def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
-        """Writes plan.yaml -> the written plan. Cells of the stored plan are kept if they have the new plan's settings
-        and seeds and a task that it does not name.
+    def write_plan(self, study: StudySettings, cells: Sequence[Cell]) -> None:
+        """Writes plan.yaml. Cells of the stored plan are kept if they have the new plan's settings and seeds and a task
+        that it does not name.
 
         So sweeps of one study over different tasks end in one report, and changed settings or seeds replace old cells.
 
@@ -150,7 +149,6 @@ class StudyStore:
                 new = merge_plans(self.read_plan(), new)
             with atomic_path(self.plan_path) as temporary:
                 temporary.write_text(plan_text(new), encoding="utf-8")
-        return new
 
     def begin(self, study: StudySettings, cells: Sequence[Cell], arguments: Sequence[str]) -> None:
         """Writes the plan and notes the command. The folder of a new run appears with both in it.
@@ -262,12 +260,8 @@ class StudyStore:
         except NewerCell:
             raise
         except (CheckpointError, KeyError, TypeError, AttributeError) as error:
-            raise self._damaged(folder, error) from error
+            raise _damaged(folder, error) from error
         return status
-
-    def _damaged(self, folder: Path, error: Exception) -> CheckpointError:
-        why = str(error).replace(f"{folder}/", "")
-        return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
 
     def folders(self) -> list[Path]:
         """Folders of its cells, damaged ones among them; none that is being written or removed."""
@@ -284,7 +278,7 @@ class StudyStore:
             config = _read_config(read_text(folder / "config.yaml"))
             return config, read_mapping(folder / _STATUS)
         except (OSError, ValueError, CheckpointError) as error:
-            raise self._damaged(folder, error) from error
+            raise _damaged(folder, error) from error
 
     def set_aside(self, name: str) -> Path:
         """Moves a damaged cell out of the way -> where it lies now. The next sweep computes it again.
@@ -382,10 +376,10 @@ class StudyStore:
                 config = _read_config(read_text(folder / "config.yaml"))
                 tables.append(rows.read_tables(folder))
             except (OSError, ValueError, pa.ArrowException) as error:
-                raise self._damaged(folder, error) from error
+                raise _damaged(folder, error) from error
             described.append((folder, config, _interned(status)))
         frames = rows.frames_of(tables)
-        return [StoredCell(one[0].name, *one, frame) for one, frame in zip(described, frames, strict=True)]
+        return [StoredCell(*one, frame) for one, frame in zip(described, frames, strict=True)]
 
     def read_cells(self, cells: Iterable[Cell]) -> tuple[dict[str, StoredCell], list[Cell]]:
         """The complete ones of these cells by id, and those that are absent.
@@ -428,6 +422,11 @@ class StudyStore:
             self.failures.rmdir()  # refused where others are left
 
 
+def _damaged(folder: Path, error: Exception) -> DamagedCell:
+    why = str(error).replace(f"{folder}/", "")
+    return DamagedCell(f"cell {folder} is damaged ({why}): `kerv doctor --repair` sets it aside")
+
+
 def _plan_of(study: StudySettings, cells: Sequence[Cell]) -> StudyPlan:
     return StudyPlan(study.name, study.title, study.baseline, study.axis, tuple(cells), study.note)
 
@@ -462,6 +461,11 @@ def is_result_of(config: Mapping[str, Any], cell: Cell) -> bool:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def new_run_id() -> str:
+    """The id of a run that begins now, which its cells name: `20260301T142530Z-0f1e2d`."""
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
 
 
 def _seal(status: Mapping[str, Any]) -> str:

@@ -32,13 +32,9 @@ class Request(Generic[K]):
     seed: int
 
 
-@dataclass(frozen=True)
-class EpisodeEnd(Generic[K]):
-    """The end of an episode. result: its record, or the error that its world raised. The record's wall_seconds are
-    its share of the time: that of a decode is divided by the episodes that were decoded together."""
-
-    request: Request[K]
-    result: EpisodeRecord | Exception
+EpisodeEnd = tuple[Request[K], EpisodeRecord | Exception]
+"""What was requested, and its record or the error that its world raised. The record's wall_seconds are its share of the
+time: that of a decode is divided by the episodes that were decoded together."""
 
 
 def run_together(
@@ -120,7 +116,7 @@ class _Slot(Generic[K]):
             result = error
             self.close()
         self.request = None
-        yield EpisodeEnd(request, result)
+        yield request, result
 
     def _episode(self, request: Request[K]) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
         if self.world is None or self.task != request.task:

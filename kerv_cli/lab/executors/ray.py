@@ -65,7 +65,7 @@ class Tasks:
     def __init__(self, slots: int, threads: int, gpus: float, stack: contextlib.ExitStack) -> None:
         import ray
 
-        self.slots, self._own = slots, stack
+        self.slots, self._stack = slots, stack
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads))
         options: dict[str, Any] = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
         self._call = ray.remote(_call).options(runtime_env={"env_vars": variables}, **options)
@@ -87,7 +87,7 @@ class Tasks:
             for reference in self._open:
                 ray.cancel(reference, force=True)
         ray.shutdown()
-        self._own.close()
+        self._stack.close()
 
 
 def _call(work: Callable[[], T]) -> T:

@@ -42,12 +42,8 @@ def build(options: SlurmOptions, slots: int, threads: int, folder: Path) -> Exec
 def _parameters(options: SlurmOptions, threads: int) -> dict[str, Any]:
     exports = [f"export {name}={threads}" for name in THREAD_VARIABLES]
     common = {"name": "kerv", "timeout_min": options.minutes, "cpus_per_task": threads, "mem_gb": options.memory_gb}
-    slurm = {"setup": [*options.setup, *exports], "partition": options.partition or None}
-    return {
-        **common,
-        "gpus_per_node": options.gpus,
-        **{f"slurm_{name}": value for name, value in slurm.items() if value is not None},
-    }
+    partition = {"slurm_partition": options.partition} if options.partition else {}
+    return {**common, "gpus_per_node": options.gpus, "slurm_setup": [*options.setup, *exports], **partition}
 
 
 class Jobs:
