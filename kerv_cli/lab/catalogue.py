@@ -266,7 +266,7 @@ def _figures(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[st
 
 def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, str]:
     """Kind -> hash, from wherever an artifact's description names it."""
-    hashes = dict(value.get("made_from") or {})
+    hashes = dict(value.get("drafts") or {})  # of a certificate
     for kind, entry in (("target", value.get("target")), ("demos", value.get("demos") or provenance.get("demos"))):
         sha256 = entry.get("sha256") if isinstance(entry, Mapping) else entry
         hashes |= {kind: str(sha256)} if sha256 else {}
