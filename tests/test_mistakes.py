@@ -81,7 +81,6 @@ ANSWERS = [
     ("sweep study=nothing.yml", "study=nothing.yml cannot be read: No such file"),
     ("sweep study=folder/", "study=folder/ is no YAML file: name one that ends in .yaml"),
     ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
-    ("sweep study=pretrained policy.target=mine", "study 'pretrained' sets policy.target itself: leave it out"),
     ("sweep study=demo,threshold", "study=demo,threshold names 2 choices: this command takes one"),
     ("sweep study=demo study.baseline=AR", "study 'demo' has no setting 'AR', the baseline"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),

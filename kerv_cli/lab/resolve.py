@@ -70,8 +70,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     common = [o for o in split_words(study.common) if _key(o) not in keys] + of_settings
     points = _points(study)
     for words in points.values():
-        chosen = {_key(word) for word in words}
-        varied = keys & (chosen | {"policy.target"} if "policy" in chosen else chosen)  # a policy names its target
+        varied = keys & {_key(word) for word in words}
         if varied:
             raise UsageError(f"study '{study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
     if not points:
