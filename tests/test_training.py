@@ -256,7 +256,6 @@ def test_soft_labels_are_distributions_that_fall_off_with_distance() -> None:
     assert torch.allclose(token_loss(logits, tokens, soft_labels(255, 0.0)), plain)
 
 
-@pytest.mark.bits
 def test_light_is_of_the_sample_and_the_step_alone_and_moves_nothing() -> None:
     images = torch.randint(30, 60, (4, 3, 16, 32), dtype=torch.uint8)
     images[:, :, 5, 7] = 200  # a marker
@@ -269,6 +268,7 @@ def test_light_is_of_the_sample_and_the_step_alone_and_moves_nothing() -> None:
     assert torch.equal(lit(images, indices, 3, 0.0), images)
 
 
+@pytest.mark.bits
 def test_batched_greedy_decoding_is_the_decoders() -> None:
     from kerv_cli.engine.decoder import Decoder
 
