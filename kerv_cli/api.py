@@ -8,7 +8,6 @@ error, as a command's do. What kerv raises deliberately is a KervError, whose me
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command, where nump
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.config import compose
+from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.places import results_dir
 from kerv_cli.base.settings import ServeSettings
@@ -204,22 +203,3 @@ def load_policy(
     """
     typed = as_words(*words, **{"policy.target": target, "method": method, "task_name": task}, **settings)
     return Policy(Served(compose("serve", typed, ServeSettings)))
-
-
-def as_words(*words: str, **settings: object) -> list[str]:
-    """Words and keywords as they are typed behind a command: `episodes=3`, `task=[reach,push]`, `threshold.r=5`."""
-    return [*words, *(word for key, value in settings.items() for word in _typed(key, value))]
-
-
-def _typed(key: str, value: object) -> Iterator[str]:
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            yield from _typed(f"{key}.{name}", inner)
-    else:
-        yield f"{key}={_text(value)}"
-
-
-def _text(value: object) -> str:
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(_text, value))}]"
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

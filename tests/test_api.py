@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import kerv_cli as kerv
-from kerv_cli.api import as_words
+from kerv_cli.base.config import as_words
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}

@@ -229,6 +229,8 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     serve = ["serve", "--plan", "policy.target=nano-vision", f"results={results}", "port=0"]
     serve += ["prefill_draft=scoped", "prefill_draft.outside=hold", "skip=certified"]
     assert CliRunner().invoke(app, serve).exit_code == 0
+    other = CliRunner().invoke(app, [*words, "threshold.r=5", "--plan"])
+    assert "add 'proposer=none threshold.r=5'" in other.stderr
     deploy = [
         "rollout",
         "--plan",

@@ -12,7 +12,7 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -225,6 +225,25 @@ def _check_ranges(settings: Any) -> None:
         # another part's settings are refused by the method's check
         if part is not None and part.check is not None and isinstance(part_settings, part.settings):
             part.check(part_settings)
+
+
+def as_words(*words: str, **settings: object) -> list[str]:
+    """Words and keywords as they are typed behind a command: `episodes=3`, `task=[reach,push]`, `threshold.r=5`."""
+    return [*words, *(word for key, value in settings.items() for word in _typed(key, value))]
+
+
+def _typed(key: str, value: object) -> Iterator[str]:
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _typed(f"{key}.{name}", inner)
+    else:
+        yield f"{key}={_text(value)}"
+
+
+def _text(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(_text, value))}]"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 @functools.lru_cache(maxsize=4096)

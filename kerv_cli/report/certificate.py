@@ -7,15 +7,16 @@ import hashlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.config import compose
+from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.provenance import provenance
-from kerv_cli.base.registry import METHOD_KINDS
+from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Cell, seeds_text
@@ -59,12 +60,19 @@ def folder_of(resolved: ResolvedStudy, name: str | None) -> Path:
 def deployment_note(resolved: ResolvedStudy) -> str:
     """One sentence where method=one_pass_certified decodes otherwise than the study's settings, with the words that
     change that; else empty."""
-    deployed, first = compose("rollout", ["method=one_pass_certified"], RolloutSettings).parts(), _settings(resolved)[1]
-    other = [kind for kind, part in first.parts().items() if kind not in _VARIED and part != deployed[kind]]
-    if not other:
-        return ""
-    was, words = (" ".join(f"{kind}={parts[kind].kind}" for kind in other) for parts in (deployed, first.parts()))
-    return f"method=one_pass_certified has {was}, this study {words}: to deploy its certificate add '{words}'"
+    preset, study = compose("rollout", ["method=one_pass_certified"], RolloutSettings).parts(), _settings(resolved)[1]
+    kinds = [kind for kind, part in study.parts().items() if kind not in _VARIED and part != preset[kind]]
+    was = " ".join(word for kind in kinds for word in _difference(kind, preset[kind], getattr(study, kind)))
+    words = " ".join(word for kind in kinds for word in _difference(kind, getattr(study, kind), preset[kind]))
+    return words and f"method=one_pass_certified has {was}, this study {words}: to deploy its certificate add '{words}'"
+
+
+def _difference(kind: str, part: Any, other: Any) -> list[str]:
+    """The words that put a part, by its settings, in the place of another of its kind."""
+    chosen = [] if part.kind == other.kind else [f"{kind}={part.kind}"]
+    base = dataclasses.asdict(part_of(kind, part.kind).default if chosen else other)
+    changed = {f"{kind}.{name}": value for name, value in dataclasses.asdict(part).items() if value != base[name]}
+    return as_words(*chosen, **changed)
 
 
 def certify(
