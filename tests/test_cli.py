@@ -15,11 +15,14 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from kerv_cli.base.config import groups
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import NoSettings, Part, parts
 from kerv_cli.cli.app import app
+from kerv_cli.cli.common import one_line_errors
 
 FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
@@ -337,6 +340,26 @@ def test_an_interrupted_command_says_so_in_one_line(
     assert begun.returncode == 130, errors
     (line,) = errors.splitlines()
     assert line.startswith("kerv: interrupted")
+
+
+def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # which an interrupt changes
+
+    def compose() -> None:
+        try:
+            try:
+                raise KeyboardInterrupt
+            finally:
+                raise AttributeError("'NoneType' object has no attribute '_invalidate_flags_cache'")
+        except AttributeError as error:
+            raise UsageError("defaults: what nobody typed") from error
+
+    with pytest.raises(typer.Exit) as ended, one_line_errors([]):
+        compose()
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().err == "kerv: interrupted\n"
 
 
 def test_the_question_of_runs_rm_ends_in_one_line(policies: Path) -> None:

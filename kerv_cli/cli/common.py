@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kerv_cli.base.errors import Interrupted, KervError
+from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.near import KEYS, OPTIONS, nearest, question
 
 if TYPE_CHECKING:
@@ -69,6 +69,8 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except (typer.Exit, typer.Abort):
         raise
     except KervError as error:
+        if isinstance(error, UsageError) and _is_of_an_interrupt(error):
+            _refuse("interrupted", Interrupted.exit_code, None)
         _refuse(runnable(str(error), words), error.exit_code, error)
     except typer.TyperException as error:
         if "\n" in error.format_message():  # the help, where the command is left out
@@ -85,6 +87,13 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
         if isinstance(error, MemoryError) or re.search("allocate memory|bad_alloc|start new thread", str(error)):
             _refuse("out of memory: end other programs, or ask for less", 1, error)
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
+
+
+def _is_of_an_interrupt(error: BaseException | None) -> bool:
+    """Whether an error began as Ctrl-C: what OmegaConf does in a `finally` may fail on a node that is half built."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:
