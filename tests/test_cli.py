@@ -186,9 +186,9 @@ def test_cfg_prints_the_resolved_settings_and_loads_nothing() -> None:
 
 
 def test_the_settings_of_a_certificate_stand_in_front_of_its_studys() -> None:
-    shown = kerv("calibrate", "success", "margin=3", "delta=0.2", "name=mine", "--cfg").stdout
+    shown = kerv("calibrate", "success", "margin=3", "delta=0.2", "--cfg").stdout
     lines = shown.partition("---\n")[0].splitlines()
-    assert [line.split("  #")[0] for line in lines] == ["name: mine", "margin: 3.0", "delta: 0.2"]
+    assert [line.split("  #")[0] for line in lines] == ["margin: 3.0", "delta: 0.2"]
 
 
 def test_completion_knows_groups_names_and_keys_of_the_command() -> None:

@@ -57,12 +57,28 @@ def test_thirty_five_of_fifty_tasks_are_in_one_study_and_the_others_in_the_other
 @pytest.mark.parametrize("cover", [*COVERS, "thirty_five", "half"])
 def test_a_preset_names_tasks_and_artifacts_alike_for_every_command(cover: str, command: str) -> None:
     settings = compose(command, [f"cover={cover}"], COMMANDS[command])
-    kinds = ("drafter", "early", "datastore")
+    kinds = ("drafter", "early", "scout", "datastore", "certificate")
     assert {settings.policy.named(kind) for kind in kinds} == {cover}
     if cover in COVERS:
         assert covers_tasks(cover, command) == covers_tasks(cover)
         other = compose(command, [f"cover={cover}", "task=[reach]"], COMMANDS[command])
         assert (other.task, other.policy.early) == (["reach"], cover)
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        ("cover=seven method=early_unverified", "train drafter drafter=early policy.target=mt10-vision cover=seven"),
+        ("cover=five method=one_pass_certified", "calibrate success policy.target=mt10-vision cover=five"),
+        ("policy.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision policy.scout=m"),
+    ],
+)
+def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(
+    words: str, command: str, tmp_path: Path
+) -> None:
+    run = CliRunner().invoke(app, ["rollout", *words.split(), f"results={tmp_path / 'results'}"])
+    assert run.exit_code == 1
+    assert f"kerv {command}" in run.stderr
 
 
 @pytest.fixture(scope="module")

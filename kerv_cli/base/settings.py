@@ -576,7 +576,6 @@ class CalibrateSuccessSettings(SweepSettings):
 
     groups: ClassVar = {"study": "certify"}
 
-    name: str | None = setting(None, "of the certificate; default: certificate/ beside the target")
     margin: float = number(5.0, above=0, most=99.9, help="points of success that may be lost against AR")
     delta: float = number(0.1, above=0, most=0.5, help="the certificate holds with probability 1 - delta")
 

@@ -150,7 +150,7 @@ def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json
         typer.echo("\n".join([*(line for line in lines if line.split(":")[0] in OF_TEST), "---"]))
         print_settings(resolved)
         return
-    folder = folder_of(resolved, settings.name)
+    folder = folder_of(resolved)
     note = deployment_note(resolved)
     if note:
         typer.echo(f"note: {note}", err=True)

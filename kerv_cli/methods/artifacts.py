@@ -249,8 +249,8 @@ class Artifacts:
                 continue
             files, path = kind_of(kind), self.path(kind)
             if files.command and not files.json(path).is_file():
-                remedy = f"run 'kerv prepare policy.target={self.policy.target}'"
-                raise CheckpointError(f"no {files.noun} in {path}: {remedy}, or name a folder that holds one")
+                line = " ".join(self._making(files))
+                raise CheckpointError(f"no {files.noun} in {path}: run 'kerv {line}', or name a folder that holds one")
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             todo += files.brings(description)
@@ -258,6 +258,15 @@ class Artifacts:
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes
+
+    def _making(self, files: Artifact[Any]) -> tuple[str, ...]:
+        """Words of the command that makes an artifact of the policy: beside its target, or of the name that it has."""
+        from kerv_cli.base.config import groups
+
+        target, name = f"policy.target={self.policy.target}", getattr(self.policy, files.kind, None)
+        if name is None or "/" in name:
+            return "prepare", target
+        return *files.command, target, f"cover={name}" if name in groups()["cover"] else f"policy.{files.kind}={name}"
 
     def load(self, kind: str) -> Any:
         """The artifact, for the loaded target; one object per process.

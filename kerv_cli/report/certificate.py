@@ -34,7 +34,7 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 POINTS = 100.0
 
 
-def folder_of(resolved: ResolvedStudy, name: str | None) -> Path:
+def folder_of(resolved: ResolvedStudy) -> Path:
     """The certificate's folder.
 
     Raises:
@@ -54,7 +54,7 @@ def folder_of(resolved: ResolvedStudy, name: str | None) -> Path:
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     artifacts = artifacts_of(first)
-    return CertificateArtifact().path(first.results, name or first.policy.certificate, artifacts.folder)
+    return CertificateArtifact().path(first.results, first.policy.certificate, artifacts.folder)
 
 
 def deployment_note(resolved: ResolvedStudy) -> str:
