@@ -70,7 +70,7 @@ def test_a_preset_names_tasks_and_artifacts_alike_for_every_command(cover: str, 
     [
         ("cover=seven method=early_unverified", "train drafter drafter=early policy.target=mt10-vision cover=seven"),
         ("cover=five method=one_pass_certified", "calibrate success policy.target=mt10-vision cover=five"),
-        ("policy.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision policy.scout=m"),
+        ("policy.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision"),
     ],
 )
 def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(
