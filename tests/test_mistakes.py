@@ -118,6 +118,7 @@ MENDS = [
     ("rollout method:ar", "method=ar"),
     ("rollout 'method = ar'", "method=ar"),
     ("rollout task=reach, push", "task=[reach,push]"),
+    ("rollout task=reach push", "task=[reach,push]"),
     ("rollout 'task=reach;push'", "task=[reach,push]"),
     ("rollout task=reach,", "task=reach"),
     ("rollout task=[reach", "task=reach"),

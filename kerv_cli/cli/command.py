@@ -194,6 +194,8 @@ def _check_bare(part: Part, words: list[str]) -> None:
             meant = f"{word.rstrip(',')}{after}" if word[-1] == "=" else _in_brackets(word + after)
         elif word.rstrip(":") in keys and after and "=" not in after:
             meant = f"{word.rstrip(':')}={after}"
+        elif taking == ["task"] and number and words[number - 1].startswith("task="):
+            meant = _in_brackets(f"{words[number - 1]},{word}")
         elif taking:
             meant = f"{taking[0]}={word}"
         elif word.endswith((".yaml", ".yml")) and {"study", "method"} & set(keys):
