@@ -249,7 +249,7 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     assert refused.exit_code == 2
     assert "with a policy of metaworld: the certificate is of elsewhere" in refused.stderr
     written.write_text(issued)
-    few = CliRunner().invoke(app, [*words[:-2], "margin=1", "name=few", "--json"])
+    few = CliRunner().invoke(app, [*words[:-2], "margin=1", "policy.certificate=few", "--json"])
     assert few.exit_code == 0, few.output
     assert "nothing is certified" in few.stdout
     wrong = CliRunner().invoke(app, [*words, "seed=100000"])
