@@ -18,7 +18,6 @@ from kerv_cli.base.settings import CameraSettings, TargetSettings, TrainTargetSe
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.views import View, frame_shape, views_of
 from kerv_cli.cli.app import app
-from kerv_cli.targets.compact.kernels import has_blocked_layouts
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.imitation import check_init, continued_target, vocabulary
@@ -147,7 +146,6 @@ def test_every_view_has_tokens_of_its_own() -> None:
 
 
 @pytest.mark.bits
-@pytest.mark.skipif(not has_blocked_layouts(), reason="no packed vision encoder in this build of torch")
 @pytest.mark.parametrize("camera", ["corner4", HAND, "corner4+corner4@4+gripperPOV"])
 def test_packed_weights_compute_the_same_prompt(camera: str) -> None:
     plain, packed = made(camera), made(camera)

@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("kerv", "torch", "metaworld", "mujoco", "numpy")
+PACKAGES = ("kerv", "torch", "metaworld", "mujoco", "numpy", "onnxruntime")
 _HERE = Path(__file__).resolve().parent
 
 

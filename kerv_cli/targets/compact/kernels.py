@@ -1,4 +1,4 @@
-"""Products, norms and convolutions of packed weights on a CPU: the same numbers in the layout that is fastest there;
+"""Products and norms of packed weights on a CPU: the same numbers in the layout that is fastest there;
 oneDNN's blocked one halves the time of 30 rows."""
 
 from __future__ import annotations
@@ -83,24 +83,3 @@ def with_pairs(qkv: Tensor, channels: int) -> Tensor:
     pairs = torch.arange(channels).view(2, -1).t().flatten()
     qk = qkv[: 2 * width].unflatten(0, (-1, channels))[:, pairs].flatten(0, 1)
     return torch.cat([qk, qkv[2 * width :]])
-
-
-class FastConv:
-    """A convolution on channels-last maps of one fixed size, with a blocked weight and a fused function `pointwise`."""
-
-    def __init__(self, conv: nn.Conv2d, size: int, weight: Tensor | None = None, bias: Tensor | None = None) -> None:
-        weight = conv.weight if weight is None else weight
-        self.bias = conv.bias if bias is None else bias
-        self.geometry = (list(conv.padding), list(conv.stride), list(conv.dilation), conv.groups)
-        self.weight = torch.ops.mkldnn._reorder_convolution_weight(
-            weight.contiguous(memory_format=torch.channels_last), *self.geometry, [1, conv.in_channels, size, size]
-        )
-
-    def __call__(self, x: Tensor, pointwise: str = "none") -> Tensor:
-        return torch.ops.mkldnn._convolution_pointwise(x, self.weight, self.bias, *self.geometry, pointwise, [], "")
-
-    def added_to(self, other: Tensor, x: Tensor) -> Tensor:
-        """other += the convolution of x, in place -> other."""
-        return torch.ops.mkldnn._convolution_pointwise_.binary(
-            other, x, self.weight, self.bias, *self.geometry, "add", 1.0, None, [], None
-        )

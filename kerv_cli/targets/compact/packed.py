@@ -6,16 +6,15 @@ At these widths half of a one-token forward was the overhead of calls, the other
 has as few calls and copies as possible.
 
 Packed weights are not part of the module's state: copying, pickling, moving, loading weights or training drops them,
-and the module computes without them.
+and the module computes without them. A vision encoder's are a graph of ONNX Runtime (`vision_graph.py`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -26,11 +25,9 @@ from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
 from kerv_cli.targets.compact.kernels import (
-    FastConv,
     FastLinear,
     RowNorm,
     gain_of,
-    has_blocked_layouts,
     row_product,
     with_pairs,
 )
@@ -195,87 +192,6 @@ class PackedLayers(PackedStack):
         return row * (np.float32(1) / np.sqrt(np.dot(row, row) + self.width_eps))
 
 
-class PackedStage:
-    """Packed weights of a strided convolution and the residual block behind it."""
-
-    def __init__(self, stage: nn.Sequential, size: int, weight: Tensor | None = None) -> None:
-        entry: Any = stage[0]
-        residual: Any = stage[1]
-        self.entry, self.norm = FastConv(entry, size, weight), residual.norm
-        self.first, self.second = (FastConv(c, size // entry.stride[0]) for c in (residual.first, residual.second))
-
-    def __call__(self, x: Tensor) -> Tensor:
-        x = self.entry(x)
-        return self.second.added_to(x, self.first(self.norm(x), "relu"))
-
-
-class PackedVision(Packed):
-    """Packed weights of `VisionEncoder.forward` for one frame; heat maps are summed from coarse to fine.
-
-    Softmax is taken to the base 2, which the temperature absorbs: 2^x is a fast vector loop where MKL's e^x is not
-    (measured on an AMD CPU, 48 × 48 × 32 numbers: 12 µs against 48 µs).
-    """
-
-    def __init__(self, vision: VisionEncoder) -> None:
-        height = vision.columns.shape[0]
-        self.size = 2 * height
-        entry: Any = vision.fine[0]
-        self.fine = PackedStage(vision.fine, self.size, entry.weight / 255)
-        self.middle = PackedStage(vision.middle, self.size // 2)
-        self.coarse = PackedStage(vision.coarse, self.size // 4)
-        self.patch = FastConv(vision.patch, self.size // 8)
-        self.grid_position = vision.grid_position
-        sharp = vision.temperature * math.log2(math.e)
-        self.heat_fine = FastConv(vision.heat_fine, height, *scaled(vision.heat_fine, sharp))
-        self.heat_middle, self.heat_coarse = (
-            (bias[None], weight.flatten(1).t().contiguous())
-            for weight, bias in (scaled(vision.heat_middle, sharp), scaled(vision.heat_coarse, sharp))
-        )
-        column, row = vision.columns.repeat(height), vision.columns.repeat_interleave(height)
-        self.moments = torch.stack([torch.ones_like(column), column, row])
-
-    def __call__(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """images (1, 3, size, size) uint8 -> tokens (1, grid², E), points (1, 2K)."""
-        # the mean cannot move into the bias: the border is padded with zeros behind the subtraction
-        pixels = images.contiguous(memory_format=torch.channels_last).float().sub_(127.5)
-        fine = self.fine(pixels)
-        middle = self.middle(fine)
-        coarse = self.coarse(middle)
-        heat = cells(self.heat_fine(fine))
-        half = torch.addmm(self.heat_middle[0], cells(middle), self.heat_middle[1])
-        quarter = torch.addmm(self.heat_coarse[0], cells(coarse), self.heat_coarse[1])
-        add_upsampled(half, quarter, self.size // 4)
-        add_upsampled(heat, half, self.size // 2)
-        tokens = (cells(self.patch(coarse)) + self.grid_position)[None]
-        weight = heat.sub_(column_max(heat)).exp2_()
-        total, columns, rows = self.moments @ weight
-        return tokens, torch.cat([columns / total, rows / total])[None]
-
-
-def scaled(conv: nn.Conv2d, factor: Tensor) -> tuple[Tensor, Tensor]:
-    """Weight and bias whose outputs (C,) are multiplied by `factor` (C,)."""
-    assert conv.bias is not None
-    return conv.weight * factor[:, None, None, None], conv.bias * factor
-
-
-def cells(maps: Tensor) -> Tensor:
-    """(1, C, h, w) channels-last -> (h w, C), a view."""
-    return maps.permute(0, 2, 3, 1).view(-1, maps.shape[1])
-
-
-def column_max(rows: Tensor) -> Tensor:
-    """The maximum of each column (K,) of rows (s², K). Reduced row by row, 16 columns take 97 µs; as s wide rows, 6."""
-    side = math.isqrt(len(rows))
-    return rows.view(side, -1).amax(0).view(side, -1).amax(0)
-
-
-def add_upsampled(heat: Tensor, coarse: Tensor, size: int) -> None:
-    """heat (s², K) += coarse (s² / 4, K), each cell for its four, in place."""
-    half = size // 2
-    wide = coarse.view(half, half, 1, -1).expand(-1, -1, 2, -1).reshape(half, 1, -1)
-    heat.view(half, 2, -1).add_(wide)
-
-
 def affine(function: Callable[[Tensor], Tensor], inputs: int) -> Affine:
     """Bias (O,) and weight (I, O) of an affine function (1, I) -> (1, O), found by evaluating it in float64."""
     offset = function(torch.zeros(1, inputs, dtype=torch.float64))
@@ -348,7 +264,9 @@ def packed_weights(part: Packable) -> Packed | None:
             return BlockedLayers(part.rotary, part.layers, part.norm)  # type: ignore[arg-type]
         return None
     if isinstance(part, VisionEncoder):
-        return PackedVision(part) if has_blocked_layouts() and part.columns.dtype == torch.float32 else None
+        from kerv_cli.targets.compact.vision_graph import PackedVision  # ONNX Runtime, which a GPU does not need
+
+        return PackedVision(part) if part.columns.dtype == torch.float32 else None
     if isinstance(part, CompactTarget):
         return PackedPrompt(part) if part.cameras and part.dtype == torch.float32 else None
     return part.pack_weights()
