@@ -22,7 +22,6 @@ from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, ScoutProposer, check_sees
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
@@ -104,14 +103,24 @@ def test_verified_strictly_its_drafts_change_no_token(target: CompactTarget, sco
         assert record.phases["vision"] > 0  # encoded once, when the prefill asked
 
 
-def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: Scout) -> None:
+@pytest.mark.parametrize("views", [1, 2])
+def test_packed_weights_give_the_same_draft(target: CompactTarget, scout: Scout, views: int) -> None:
     inputs = target.inputs(observed(target, 0))
+    assert inputs.images is not None
+    inputs = dataclasses.replace(inputs, images=torch.cat([inputs.images, 255 - inputs.images][:views], -1))
+    shape = target.actions, target.observation, target.chunk, views, target.settings.image_size, target.words.size
+    made = Scout(scout.settings, *shape).eval().requires_grad_(False)
+    with torch.no_grad():
+        for part in made.modules():
+            if isinstance(part, (torch.nn.Linear, torch.nn.RMSNorm, torch.nn.GroupNorm)):
+                part.weight.normal_(0, 0.3)
     with torch.inference_mode():
-        plain, places = scout(inputs)
-        pack(scout)
-        assert isinstance(scout.drafter, EarlyDrafter)
-        assert scout.drafter.packed is not None
-        packed, again = scout(inputs)
+        plain, places = made(inputs)
+        pack(made)
+        assert made.packed is not None
+        packed, again = made(inputs)
+        other = made(dataclasses.replace(inputs, images=255 - inputs.images))[0]
+        assert (other - packed).abs().max() > 10 * (packed - plain).abs().max()  # it reads the image
     assert torch.allclose(packed, plain, rtol=1e-3, atol=1e-3)
     assert torch.allclose(again, places, atol=1e-4)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,8 +27,10 @@ from kerv_cli.engine.transfer import read
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.targets.compact.kernels import FastLinear, RowNorm, gain_of
-from kerv_cli.targets.compact.packable import Packable, Packed
+from kerv_cli.targets.compact.packable import Packable
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.early.packed import PackedEarly
 
 SURE = 0.05
 """Estimate from which fallback sources do not draft: 89 % of such chunks were accepted whole (mt10-vision, r = 9)."""
@@ -82,6 +84,8 @@ class EarlyDrafter(Packable):
 
     def pack_weights(self) -> PackedEarly | None:
         """The packed weights of a float32 drafter; None in other number formats."""
+        from kerv_cli.methods.early.packed import PackedEarly  # ONNX Runtime, which a GPU does not need
+
         return PackedEarly(self) if self.mean.dtype == torch.float32 else None
 
     def standardise(self, features: Tensor) -> None:
@@ -92,7 +96,7 @@ class EarlyDrafter(Packable):
     def forward(self, features: Tensor) -> Tensor:
         """pooled prompts (B, F) -> logits (B, N, V)."""
         if self.packed is not None and len(features) == 1:
-            return self.packed(features[0])[None]
+            return self.packed(features)
         x = self.enter((features - self.mean) * self.scale)
         for block in self.blocks:
             x = block(x)
@@ -102,47 +106,12 @@ class EarlyDrafter(Packable):
     def draft(self, features: Tensor, radius: int) -> Tensor:
         """features (B, F) -> N tokens and the odds that all are accepted, (B, N + 1) float64, without a wait for the
         device. radius: r in bins, see `choose`."""
-        tokens, odds = choose_with_odds(self(features.to(self.head.weight.dtype)), radius, self.strict)
+        return self.chosen(self(features.to(self.head.weight.dtype)), radius)
+
+    def chosen(self, logits: Tensor, radius: int) -> Tensor:
+        """logits (B, N, V) -> what `draft` gives."""
+        tokens, odds = choose_with_odds(logits, radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
-
-
-class PackedBlock:
-    """Packed weights of a frozen residual SwiGLU block on a CPU, for one observation: the norm's gain is folded into
-    the weights behind it, as in `targets/compact/packed.py`."""
-
-    def __init__(self, block: Block) -> None:
-        self.norm = RowNorm(block.norm)
-        self.gate_up, self.gate_up_bias = FastLinear(block.gate_up.weight * gain_of(block.norm)), block.gate_up.bias
-        self.down, self.down_bias = FastLinear(block.down.weight), block.down.bias
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """(W,), changed in place -> (W,)."""
-        gate, up = self.gate_up.of_vector(x, self.norm.of_vector(x)).add_(self.gate_up_bias).chunk(2)
-        x += self.down_bias
-        return self.down.added_to_vector(x, F.silu(gate).mul_(up))
-
-
-class PackedEarly(Packed):
-    """Packed weights of `EarlyDrafter.forward` for one observation; standardisation is folded into the first layer."""
-
-    def __init__(self, early: EarlyDrafter) -> None:
-        weight = early.enter.weight * early.scale
-        self.enter = FastLinear(weight)
-        self.enter_bias = early.enter.bias - weight @ early.mean
-        blocks: Any = early.blocks
-        self.blocks = [PackedBlock(block) for block in blocks]
-        self.norm = RowNorm(early.norm)
-        self.spread, self.spread_bias = FastLinear(early.spread.weight * gain_of(early.norm)), early.spread.bias
-        self.head, self.head_bias = FastLinear(early.head.weight), early.head.bias
-        self.shape = early.tokens, early.settings.rank
-
-    def __call__(self, features: Tensor) -> Tensor:
-        """The pooled prompt (F,) -> logits (N, V)."""
-        x = self.enter.added_to_vector(self.enter_bias, features)
-        for block in self.blocks:
-            x = block(x)
-        spread = self.spread.of_vector(x, self.norm.of_vector(x)).add_(self.spread_bias)
-        return self.head(spread.view(self.shape)).add_(self.head_bias)
 
 
 def choose(logits: Tensor, radius: int, strict: Tensor) -> Tensor:
@@ -175,6 +144,11 @@ def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
     return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 
 
+def radius_of(chunks: Sequence[Chunk]) -> int:
+    """r of chunks whose limits are equal."""
+    return max(chunks[0].limits, default=0)
+
+
 class EarlyProposer(ChainProposer):
     """The early drafter's chunk (docs/methods.md §5), drafted once per observation.
 
@@ -201,14 +175,10 @@ class EarlyProposer(ChainProposer):
         assert self._drafted is not None
         return self._drafted[1:]
 
-    def features(self, chunk: Chunk) -> Tensor:
-        """What the network reads of the chunk's observation, (1, F): the pooled prompt."""
-        return self.target.pooled(chunk.prompt)
-
     def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
         """The drafts of B chunks whose limits are equal, (B, N + 1) as `EarlyDrafter.draft`."""
-        features = torch.cat([self.features(chunk) for chunk in chunks])
-        return self.early.draft(features, max(chunks[0].limits, default=0))
+        features = torch.cat([self.target.pooled(chunk.prompt) for chunk in chunks])
+        return self.early.draft(features, radius_of(chunks))
 
     def on_device(self, chunk: Chunk) -> Tensor | None:
         """The draft and its odds on the device, (N + 1,); None where the host has them."""

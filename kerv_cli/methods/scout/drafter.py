@@ -7,7 +7,9 @@ stem and its estimate of positions stands the early drafter's network.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -19,17 +21,22 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Weights, WeightsDescription
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer, radius_of
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
+from kerv_cli.targets.compact.packable import Packable
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
 
+if TYPE_CHECKING:
+    from kerv_cli.methods.scout.packed import PackedScout
 
-class Scout(nn.Module):
+
+class Scout(Packable):
     """From one observation to the logits (N, V) of a chunk. Shapes: B batch, p proprioception, K places, W words."""
 
     centre: Tensor
+    packed: PackedScout | None
 
     def __init__(
         self,
@@ -76,8 +83,16 @@ class Scout(nn.Module):
 
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Observations -> logits (B, N, V), positions (B, K, 3)."""
+        if self.packed is not None and len(inputs.proprioception) == 1:
+            return self.packed(inputs)
         features, places = self.see(inputs)
-        return self.drafter(features), places
+        return self.drafter(features.to(self.drafter.head.weight.dtype)), places
+
+    def pack_weights(self) -> PackedScout | None:
+        """The packed weights of a float32 scout; None in other number formats."""
+        from kerv_cli.methods.scout.packed import PackedScout  # ONNX Runtime, which a GPU does not need
+
+        return PackedScout(self) if self.cells.weight.dtype == torch.float32 else None
 
 
 class ScoutProposer(EarlyProposer):
@@ -95,10 +110,11 @@ class ScoutProposer(EarlyProposer):
         return cls(context.artifact("scout"), context.target)
 
     @torch.inference_mode()
-    def features(self, chunk: Chunk) -> Tensor:
-        """What the network reads of the chunk's observation, (1, F)."""
-        assert chunk.observation is not None
-        return self.scout.see(self.inputs(chunk.observation))[0]
+    def _rows(self, chunks: Sequence[Chunk]) -> Tensor:
+        """The drafts of B chunks whose limits are equal, (B, N + 1), from their observations."""
+        seen = [chunk.observation for chunk in chunks if chunk.observation is not None]
+        logits = torch.cat([self.scout(self.inputs(observation))[0] for observation in seen])
+        return self.early.chosen(logits, radius_of(chunks))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,5 @@
-"""The vision encoder of a frozen float32 policy as one ONNX graph, computed by ONNX Runtime in one call on a CPU.
+"""Networks of a frozen float32 policy as ONNX graphs, each computed by ONNX Runtime in one call on a CPU: the vision
+encoder, and the parts of which others are put together.
 
 Convolutions of so few channels are small: oneDNN takes 19 µs per call before it computes anything, and a scout's stem
 has eleven (measured on an AMD EPYC, 96 × 96 pixels: 8 channels 607 µs by oneDNN, 270 by the graph; 24 channels, as of
@@ -7,6 +8,7 @@ the targets, 1 410 and 1 250).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,6 +46,14 @@ class Graph:
     def shaped(self, x: str, *shape: int) -> str:
         """x in another shape."""
         return self.add("Reshape", x, self.constant(np.array(shape, np.int64)))
+
+    def linear(self, x: str, weight: Tensor, bias: Tensor) -> str:
+        """x (n, I) -> (n, O), of a weight (O, I)."""
+        return self.add("Gemm", x, self.constant(weight), self.constant(bias), transB=1)
+
+    def silu(self, x: str) -> str:
+        """x · sigmoid(x)."""
+        return self.add("Mul", x, self.add("Sigmoid", x))
 
     def conv(self, x: str, conv: nn.Conv2d, factor: Tensor | float = 1.0, scale: float = 1.0) -> str:
         """A convolution whose outputs are multiplied by `factor` (C,), of an input divided by `scale`."""
@@ -85,14 +95,13 @@ class Graph:
         return self.add("Resize", x, "", twice, **how)
 
 
-def graph_of(vision: VisionEncoder) -> bytes:
-    """`VisionEncoder.forward` for one frame as a model: frame (1, 3, size, size) uint8 -> tokens (1, grid², E), points
-    (1, 2K). Heat maps are summed from coarse to fine, the temperature is in their weights."""
-    graph, side = Graph(), vision.columns.shape[0]
-    size, sharp = 2 * side, vision.temperature.detach()
-    pixels = graph.add("Cast", "frame", to=TensorProto.FLOAT)
+def add_vision(graph: Graph, frame: str, vision: VisionEncoder) -> tuple[str, str]:
+    """`VisionEncoder.forward` of one frame (1, 3, size, size) uint8 -> tokens (1, grid², E), points (1, 2K). Heat maps
+    are summed from coarse to fine, the temperature is in their weights."""
+    side, sharp = vision.columns.shape[0], vision.temperature.detach()
     # the mean cannot move into the bias: the border is padded with zeros behind the subtraction
-    pixels = graph.add("Sub", pixels, graph.constant(np.array(127.5, np.float32)))
+    mean = graph.constant(np.array(127.5, np.float32))
+    pixels = graph.add("Sub", graph.add("Cast", frame, to=TensorProto.FLOAT), mean)
     fine = graph.stage(pixels, vision.fine, side, scale=255.0)
     middle = graph.stage(fine, vision.middle, side // 2)
     coarse = graph.stage(middle, vision.coarse, side // 4)
@@ -105,30 +114,41 @@ def graph_of(vision: VisionEncoder) -> bytes:
     points = graph.shaped(graph.add("Transpose", points, perm=[1, 0]), 1, -1)
     tokens = graph.shaped(graph.conv(coarse, vision.patch), 1, vision.patch.out_channels, -1)
     tokens = graph.add("Transpose", tokens, perm=[0, 2, 1])
-    tokens = graph.add("Add", tokens, graph.constant(vision.grid_position))
-    body = helper.make_graph(
-        graph.nodes,
-        "vision",
-        [helper.make_tensor_value_info("frame", TensorProto.UINT8, [1, 3, size, size])],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in (tokens, points)],
-        graph.constants,
-    )
-    made: bytes = helper.make_model(
-        body, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR
-    ).SerializeToString()
-    return made
+    return graph.add("Add", tokens, graph.constant(vision.grid_position)), points
 
 
-class PackedVision(Packed):
-    """`VisionEncoder.forward` for one frame, by ONNX Runtime with as many threads as torch has now."""
+class Session(Packed):
+    """A graph that is computed with as many threads as torch has when it is made.
 
-    def __init__(self, vision: VisionEncoder) -> None:
+    inputs: name -> number format and shape. outputs: names, of the graph's nodes.
+    """
+
+    def __init__(self, graph: Graph, inputs: Mapping[str, tuple[int, Sequence[int | None]]], *outputs: str) -> None:
+        taken = [helper.make_tensor_value_info(name, kind, shape) for name, (kind, shape) in inputs.items()]
+        given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
+        body = helper.make_graph(graph.nodes, "kerv", taken, given, graph.constants)
+        model = helper.make_model(body, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = torch.get_num_threads(), 1
         options.log_severity_level = 3
-        self.session = onnxruntime.InferenceSession(graph_of(vision), options, providers=["CPUExecutionProvider"])
+        self.session = onnxruntime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+
+    def run(self, **inputs: Tensor) -> list[Tensor]:
+        """The outputs for these inputs."""
+        arrays = {name: np.ascontiguousarray(value.numpy()) for name, value in inputs.items()}
+        return [torch.from_numpy(output) for output in self.session.run(None, arrays)]
+
+
+class PackedVision(Session):
+    """`VisionEncoder.forward` for one frame."""
+
+    def __init__(self, vision: VisionEncoder) -> None:
+        graph, size = Graph(), 2 * vision.columns.shape[0]
+        super().__init__(graph, {"frame": (TensorProto.UINT8, [1, 3, size, size])}, *add_vision(graph, "frame", vision))
 
     def __call__(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """images (1, 3, size, size) uint8 -> tokens (1, grid², E), points (1, 2K)."""
-        tokens, points = self.session.run(None, {"frame": np.ascontiguousarray(images.numpy())})
-        return torch.from_numpy(tokens), torch.from_numpy(points)
+        tokens, points = self.run(frame=images)
+        return tokens, points
