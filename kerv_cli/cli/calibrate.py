@@ -126,7 +126,7 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
 @command(
     "calibrate success",
     CalibrateSuccessSettings,
-    keys="study margin delta name task episodes policy.target runtime.workers results",
+    keys="study margin delta task episodes policy.target policy.certificate runtime.workers results",
     examples=("kerv calibrate success", "kerv calibrate success margin=3 episodes=50 --plan"),
     each="rollout",
 )
