@@ -8,7 +8,7 @@ import numpy as np
 from onnx import TensorProto
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.vision_graph import Graph, Session
+from kerv_cli.targets.compact.graph import Graph, Session
 
 
 class PackedEarly(Session):

@@ -14,10 +14,11 @@ from onnx import TensorProto
 from torch import Tensor, nn
 
 from kerv_cli.methods.early.packed import add_drafter
-from kerv_cli.targets.compact.features import hand_features, saturating_columns, scene_features
-from kerv_cli.targets.compact.packed import affine
+from kerv_cli.targets.compact.features import hand_features, saturating_columns
+from kerv_cli.targets.compact.graph import Graph, Session
+from kerv_cli.targets.compact.packed import affine, affine_scene
 from kerv_cli.targets.compact.target import Inputs
-from kerv_cli.targets.compact.vision_graph import Graph, Session, add_vision
+from kerv_cli.targets.compact.vision_graph import add_vision
 
 
 class PackedScout(Session):
@@ -43,10 +44,7 @@ class PackedScout(Session):
         hand = graph.linear("proprioception", weight.t(), bias)
         located = graph.add("Concat", *(points for _, points in views), hand, words, axis=1)
         located = add_perceptron(graph, located, scout.locate, 0.1, scout.centre.repeat(places))
-        bias, weight = affine(
-            lambda x: scene_features(x[:, :p], x[:, p:].unflatten(1, (places, 3)), centre, saturate=lambda v: v),
-            p + 3 * places,
-        )
+        bias, weight = affine_scene(p, places, centre)
         lines = graph.linear(graph.add("Concat", "proprioception", located, axis=1), weight.t(), bias)
         saturates = np.isin(np.arange(len(bias)), saturating_columns(scout.observation))[None]
         scene = graph.add("Where", graph.constant(saturates), graph.add("Tanh", lines), lines)

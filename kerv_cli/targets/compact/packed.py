@@ -199,6 +199,14 @@ def affine(function: Callable[[Tensor], Tensor], inputs: int) -> Affine:
     return offset[0].float(), weight.float()
 
 
+def affine_scene(p: int, places: int, centre: Tensor) -> Affine:
+    """`scene_features` before it saturates, of p numbers of proprioception and K places in a row (1, p + 3 K)."""
+    return affine(
+        lambda x: scene_features(x[:, :p], x[:, p:].unflatten(1, (places, 3)), centre, saturate=lambda v: v),
+        p + 3 * places,
+    )
+
+
 def affine_layers(net: nn.Sequential) -> list[Affine]:
     """Bias and input-major weight of each linear layer."""
     return [(part.bias, part.weight.t().contiguous()) for part in net if isinstance(part, nn.Linear)]
@@ -222,10 +230,7 @@ class PackedPrompt(Packed):
         self.encoders, self.words, self.size = target.encoders, target.word_embedding, target.settings.image_size
         self.tokens, self.places = target.settings.scene_tokens, places
         self.hand = affine(lambda x: hand_features(x, centre), p)
-        bias, weight = affine(
-            lambda x: scene_features(x[:, :p], x[:, p:].unflatten(1, (places, 3)), centre, saturate=lambda v: v),
-            p + 3 * places,
-        )
+        bias, weight = affine_scene(p, places, centre)
         saturating = saturating_columns(space)
         order = [column for column in range(len(bias)) if column not in saturating] + saturating
         self.straight = len(bias) - len(saturating)
