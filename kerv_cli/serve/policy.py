@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.provenance import stamp
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import MethodSettings, RolloutSettings, ServeSettings
@@ -46,8 +46,11 @@ class Policy:
     def __init__(self, settings: ServeSettings) -> None:
         if settings.gripper not in GRIPPERS:
             raise UnknownName("gripper", settings.gripper, GRIPPERS)
+        if settings.policy.kind != "model":
+            raise UsageError(f"policy={settings.policy.kind}: it acts in the simulator's worlds and cannot be served")
         self.settings = settings
         self.artifacts = artifacts_of(settings)
+        self.task = self._task()
         self.method = Method.of(settings)
         self.method.check(self.artifacts.description, settings.batch, "batch")
         if settings.protocol != VLA_EVAL:
@@ -57,13 +60,31 @@ class Policy:
             self.artifacts.load("certificate").check_environment(self.artifacts.description.environment)
         self.interface = self._interface()
         self.range = self._range()
-        self.by_task = not settings.task_name and bool(self._task_artifacts())
+        self.by_task = not self.task and bool(self._task_artifacts())
+        if self.by_task and settings.protocol != VLA_EVAL and self._task_artifacts() != ["certificate"]:
+            raise UsageError(
+                f"method={settings.method}: its levels or drafts differ between tasks: name one with task=NAME"
+            )
         self._turn = threading.Lock()
         self._idle: list[Decoder] = []
         first = self._decoder(self._any_task())
         self.chunk = first.steps
         self._together = Together(BatchDecoder(first), settings.batch) if settings.batch > 1 else None
         self.take_back(first)
+
+    def _task(self) -> str:
+        """The full name of the settings' task; empty: none.
+
+        Raises:
+            UnknownName: the policy's environment has no such task.
+        """
+        name, spec = self.settings.task_name, specs().get(self.artifacts.description.environment)
+        if not name or spec is None:
+            return name
+        full = spec.expand(name)
+        if len(full) != 1:
+            raise UnknownName("task", name, spec.tasks)
+        return str(full[0])
 
     def _interface(self) -> Interface:
         description = self.artifacts.description
@@ -80,7 +101,7 @@ class Policy:
             privileged=not description.cameras and description.observation.state > 0,
             gripper=self.settings.gripper,
             grip=tuple(spec.grip) if spec else (),
-            task=self.settings.task_name,
+            task=self.task,
             images_alone=bool(find("target", description.family).traits.get("images_alone")),
         )
 
@@ -101,9 +122,10 @@ class Policy:
         """The task of the settings; without one, where a client names its tasks, one for which the method has
         levels."""
         if not self.by_task or self.settings.protocol != VLA_EVAL:
-            return self.settings.task_name
+            return self.task
         artifact = self.artifacts.load(self._task_artifacts()[0])
-        return next(iter(getattr(artifact, "variability", None) or getattr(artifact, "tasks", None) or ()), "")
+        named = (getattr(artifact, field, None) for field in ("variability", "tasks", "shards"))
+        return next((task for tasks in named for task in tasks or ()), "")
 
     @contextlib.contextmanager
     def session(self) -> Iterator[Session]:
@@ -118,7 +140,7 @@ class Policy:
     def new_session(self) -> Session:
         """A session for one more client."""
         holds = self.settings.outside == HOLD
-        return Session(self._client_decoder, self.settings.task_name, self.by_task, self.range, holds)
+        return Session(self._client_decoder, self.task, self.by_task, self.range, holds)
 
     def take_back(self, decoder: Decoder) -> None:
         """Keeps the decoder of a client that has left, for the next client; not one that is for a single task."""

@@ -32,7 +32,7 @@ class QdrantSearchSettings:
     url: str | None = None  # a server, e.g. http://localhost:6333; None: the engine in this process
 
 
-add("artifact", "datastore", _DATASTORE + "DatastoreArtifact")
+add("artifact", "datastore", _DATASTORE + "DatastoreArtifact", by_task=True)
 _retrieval = (_RULES + "RetrievalProposer.build", RetrievalProposerSettings, ("datastore",))
 add("proposer", "retrieval", *_retrieval, colour=0x009E73, when=PREFILL, chains=True)
 # what searches: every backend finds the same neighbours
