@@ -58,7 +58,7 @@ WRONG = [
     ("rollout", "world.camera.fovy=nan", "world.camera.fovy=nan: above 0, at most 179"),
     ("rollout", "record=-7", "record=-7"),
     ("rollout", "policy.others={a:[1]}", "policy.others="),
-    ("rollout", "method=ar,spec_vla", "run each in turn with 'kerv rollout -m'"),
+    ("rollout", "method=ar,spec_vla", "-m runs each in turn"),
     ("train_target", "target=tiny,small", "this command takes one"),
     ("train_target", "train.steps=0", "train.steps=0: from 1 to"),
     ("train_target", "train.lr=nan", "train.lr=nan"),

@@ -157,6 +157,8 @@ def test_reasons_name_what_changed(store: StudyStore, monkeypatch: pytest.Monkey
     assert why(same, "push-v3") == "new task"
     assert why(settings_of("spec_vla", 4)) == "threshold.r 3 → 4"
     assert why(same, weights={**IDENTITY, "target": "c" * 64}) == "weights of mt10-vision changed"
+    another = dataclasses.replace(same, policy=dataclasses.replace(same.policy, target="mine"))
+    assert why(another, weights={**IDENTITY, "target": "c" * 64}) == "new setting"  # nobody's weights changed
     monkeypatch.setattr(identity, "ENGINE", 4)
     monkeypatch.setattr(identity.work_of, "__defaults__", (4,))
     monkeypatch.setattr("kerv_cli.lab.reuse.ENGINE", 4)

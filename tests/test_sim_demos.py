@@ -138,7 +138,7 @@ def test_the_number_of_workers_changes_nothing(recorded, tmp_path):
 
 def test_another_configuration_is_refused_and_nothing_touched(copied):
     before = files_of(copied)
-    with pytest.raises(UsageError, match="episodes=6, not 7: choose another folder"):
+    with pytest.raises(UsageError, match="episodes=6, not 7: give these another name="):
         record(replace(CONFIG, episodes=7), copied)
     with pytest.raises(UsageError, match="camera="):
         record(replace(CONFIG, camera=CameraSettings(size=32)), copied)
@@ -255,7 +255,7 @@ def test_a_dataset_of_experts_with_several_ways_is_read_and_not_gone_on_with(cop
         value["config"]["ways"] = ["left", "right"]
         (copied / name).write_text(json.dumps(value))
     assert DemoDataset.open(copied).load(0).steps
-    with pytest.raises(UsageError, match=r"ways=\['left', 'right'\], not None: choose another folder"):
+    with pytest.raises(UsageError, match=r"ways=\['left', 'right'\], not None: give these another name="):
         record(CONFIG, copied)
 
 

@@ -148,7 +148,7 @@ class Composer(Generic[T]):
             several = [name.strip() for name in value.split(",")]
             if len(several) > 1 and set(several) <= set(self.groups[key]):
                 grid = self.command == "rollout"
-                hint = "run each in turn with 'kerv rollout -m', or" if grid else "this command takes one:"
+                hint = "-m runs each in turn, or" if grid else "this command takes one:"
                 raise UsageError(f"{word} names {len(several)} choices: {hint} choose one of them")
             raise UnknownName(key, value, self.groups[key], self._of_policy(key, value))
 
@@ -176,7 +176,7 @@ class Composer(Generic[T]):
         if kind.startswith("list"):
             hint = f"write {key}=[{value}]"
         elif self.command == "rollout":
-            hint = "run each in turn with 'kerv rollout -m', or choose one of them"
+            hint = "-m runs each in turn, or choose one of them"
         raise UsageError(f"{word} holds several values: {hint}")
 
     def _is_value(self, override: Any) -> bool:

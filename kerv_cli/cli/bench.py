@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result as JSON in the last line.")]
 Compare = Annotated[
-    tuple[Path, Path] | None, typer.Option("--compare", help="Compare two results instead of measuring one.")
+    tuple[Path, Path] | None,
+    typer.Option("--compare", metavar="A B", help="Compare two results instead of measuring one."),
 ]
 
 

@@ -150,7 +150,7 @@ def runnable(message: str, words: Sequence[str]) -> str:
 def _is_shared(word: str, command: str) -> bool:
     key = word.split("=", 1)[0].split(".", 1)[0]
     takers = _SHARED.get(key, ())
-    return takers is None or command in takers
+    return "=" in word and (takers is None or command in takers)
 
 
 def results_word(words: Iterable[str]) -> str:

@@ -22,7 +22,7 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
     "view",
     ViewSettings,
     keys="results",
-    examples=("kerv view --web", "kerv view --to episode.gif results/rollouts"),
+    examples=("kerv view --web", "kerv view --to episode.gif NAME.rrd"),
     names="NAME: recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )

@@ -193,7 +193,7 @@ def _read_study(path: Path) -> dict[str, Any]:
         why = getattr(error, "strerror", None) or "it is not YAML"
         raise UsageError(f"study={path} cannot be read: {why}") from error
     if not isinstance(value, dict):
-        raise UsageError(f"study={path} is no study: it needs the keys settings and baseline, see conf/study/demo.yaml")
+        raise UsageError(f"study={path} is no study: it needs the key settings, see conf/study/demo.yaml")
     return value
 
 

@@ -213,7 +213,8 @@ def _reason(cell: Cell, stock: Stock, rerun: str) -> str:
         return "new seeds"
     if cell.work[0] in stock.settings:
         return "new task" if cell.repeat == 0 else "new repeat"
-    near = stock.by_label.get(cell.label, [])
+    target = cell.settings["policy"]["target"]
+    near = [one for one in stock.by_label.get(cell.label, []) if one.cell.settings["policy"]["target"] == target]
     return _differences(near[-1], cell) if near else "new setting"
 
 

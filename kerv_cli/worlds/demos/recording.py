@@ -288,7 +288,8 @@ def _claim_folder(out: Path, identity: dict[str, Any]) -> None:
     if new != old:
         key = next(key for key in [*new, *old] if new.get(key) != old.get(key))
         raise UsageError(
-            f"{out} holds demonstrations with {key}={old.get(key)}, not {new.get(key)}: choose another folder"
+            f"{out} holds demonstrations with {key}={old.get(key)}, not {new.get(key)}: "
+            "give these another name=; demos=A+B joins both"
         )
 
 
