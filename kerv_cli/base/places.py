@@ -104,6 +104,17 @@ def find_target(results: str, name: str) -> Path:
     )
 
 
+def check_not_shipped(path: Path, word: str) -> None:
+    """Refuses to write an artifact in place of a shipped policy's. word: of the command, names another place.
+
+    Raises:
+        UsageError: the shipped policy that has its artifacts there has this one.
+    """
+    made_here = (path / "resume.safetensors").is_file()
+    if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
+        raise UsageError(f"{path} is there, as a part of a shipped policy: {word}=NAME makes one of yours")
+
+
 def target_names(results: str) -> list[str]:
     """Names of the targets that are there: shipped ones, then those of the results folder."""
     shipped = sorted(path.parent.parent.name for path in shipped_dir().glob("[!.]*/target/target.json"))

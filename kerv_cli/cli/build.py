@@ -73,7 +73,10 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     "build datastore",
     BuildDatastoreSettings,
     keys="policy.target demos task episodes starts name stride key components half",
-    examples=("kerv build datastore demos=mt10", "kerv build datastore policy.target=mine demos=mine half=true --plan"),
+    examples=(
+        "kerv build datastore demos=mt10 name=mine",
+        "kerv build datastore policy.target=mine demos=mine half=true --plan",
+    ),
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks under the target's own features, for retrieval."""

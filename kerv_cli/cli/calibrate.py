@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     "calibrate",
     CalibrateSettings,
     keys="policy.target demos task name episodes decodes proposer window boundary_windows epsilon",
-    examples=("kerv calibrate demos=mt10", "kerv calibrate policy.target=mine demos=mine decodes=20 --plan"),
+    examples=("kerv calibrate demos=mt10 name=mine", "kerv calibrate policy.target=mine demos=mine decodes=20 --plan"),
 )
 def calibrate(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     """Fit the kinematic predictors, each task's variability, the boundary's ranges and the skip levels."""
@@ -127,7 +127,10 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
     "calibrate success",
     CalibrateSuccessSettings,
     keys="study margin delta task episodes policy.target policy.certificate runtime.workers results",
-    examples=("kerv calibrate success", "kerv calibrate success margin=3 episodes=50 --plan"),
+    examples=(
+        "kerv calibrate success policy.target=mine",
+        "kerv calibrate success policy.certificate=mine margin=3 episodes=50 --plan",
+    ),
     each="rollout",
 )
 def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:

@@ -15,6 +15,7 @@ import pandas as pd
 from kerv_cli.base.config import as_words, compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
+from kerv_cli.base.places import check_not_shipped
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import METHOD_KINDS, part_of
 from kerv_cli.base.settings import RolloutSettings
@@ -38,7 +39,8 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     """The certificate's folder.
 
     Raises:
-        UsageError: settings that differ in more than how they trust, or seeds that are not for selection.
+        UsageError: settings that differ in more than how they trust, or seeds that are not for selection; a shipped
+            policy's certificate.
     """
     baseline, *candidates = _settings(resolved)
     if not candidates:
@@ -54,7 +56,9 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     artifacts = artifacts_of(first)
-    return CertificateArtifact().path(first.results, first.policy.certificate, artifacts.folder)
+    folder = CertificateArtifact().path(first.results, first.policy.certificate, artifacts.folder)
+    check_not_shipped(folder, "policy.certificate")
+    return folder
 
 
 def deployment_note(resolved: ResolvedStudy) -> str:

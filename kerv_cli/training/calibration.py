@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import write_json
-from kerv_cli.base.places import artifact
+from kerv_cli.base.files import read_mapping, write_json
+from kerv_cli.base.places import artifact, check_not_shipped
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.settings import CalibrateSettings, RolloutSettings
 from kerv_cli.base.spaces import ObservationSpace
@@ -102,6 +102,8 @@ class CalibrationRun:
         self.stored = (self.datastore / "manifest.json").is_file()
         if self.stored:
             self.artifacts.check(["datastore"])
+        if not (self.stored and self.path.is_file() and read_mapping(self.path).get("skip") is None):
+            check_not_shipped(self.path, "name")  # a shipped one may be given the levels of a datastore made since
         self.windows: Windows | None = None
         self.notes: list[str] = []
 

@@ -16,7 +16,7 @@ import torch
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
-from kerv_cli.base.places import artifact
+from kerv_cli.base.places import artifact, check_not_shipped
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import BuildDatastoreSettings
@@ -107,6 +107,7 @@ class DatastoreBuild:
         self.folder = self.artifacts.path("datastore")
         if settings.name:
             self.folder = artifact(settings.results, "datastore", settings.name)
+        check_not_shipped(self.folder, "name")
         entries = self.dataset.episodes  # of every task the first ones by seed
         by_seed = sorted(range(len(entries)), key=lambda i: entries[i].seed)
         most = settings.episodes or None

@@ -15,7 +15,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.places import artifact, find_target
+from kerv_cli.base.places import artifact, check_not_shipped, find_target
 from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
@@ -269,6 +269,7 @@ class DrafterRun(Run):
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
+        check_not_shipped(self.folder, f"policy.{self.artifact.kind}")
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task, settings.starts)
         read_target(self.target_folder).check_autoregressive(
