@@ -22,6 +22,7 @@ from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, ScoutProposer, check_sees
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
@@ -178,7 +179,7 @@ def certificate(target: CompactTarget, chosen: int | None, **changes: Any) -> Ce
 
 
 def context(target: CompactTarget, artifacts: dict[str, Any], task: str, **method: Any) -> Context:
-    settings = RolloutSettings(**method).parts()
+    settings = RolloutSettings(**{"prefill_draft": ScopedSettings(), **method}).parts()
     return Context(target, artifacts.__getitem__, task, {}, settings, 0)
 
 
@@ -201,13 +202,17 @@ def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTa
     assert (skip.settings.most, skip.settings.opening) == (8, 1)
 
 
-def test_a_certificate_of_another_method_chunk_format_or_world_is_refused(target: CompactTarget) -> None:
+def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(target: CompactTarget) -> None:
     def deploy(issued: Certificate, **method: Any) -> None:
         certified(CertifiedSkipSettings(), context(target, {"certificate": issued}, TASK, **method))
 
     issued = certificate(target, 0)
     with pytest.raises(UsageError, match=r"acceptance.kind=relaxed: the certificate is of strict"):
         deploy(issued, acceptance=NoSettings("relaxed"))
+    for other in (NoSettings("early"), MergedProposerSettings()):
+        with pytest.raises(UsageError, match=rf"prefill_draft={other.kind}: .* set prefill_draft=scoped"):
+            deploy(issued, prefill_draft=other)
+    issued.check_method(RolloutSettings(prefill_draft=NoSettings("scout")).parts(), "float32")  # the certified one
     with pytest.raises(UsageError, match=r"runtime.dtype=float32: the certificate is of bfloat16"):
         deploy(certificate(target, 0, dtype="bfloat16"))
     with pytest.raises(UsageError, match=r"chunk=4: the certificate is of 8"):
