@@ -232,11 +232,12 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
         f"task={TASK} seed=50500 episodes=2 record=0 world.horizon=8 policy.target=nano-vision\n"
         "block: 2\nsettings:\n  ar: method=ar prefill_draft=none\n  half: skip=streak skip.most=1\n  all: skip=always\n"
     )
-    words = ["calibrate", "success", f"study={study}", f"results={results}", "margin=99", "delta=0.5"]
+    words = ["calibrate", "success", f"study={study}", "study.repeats=2", f"results={results}"]
+    words += ["margin=99", "delta=0.5"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     path = results / "artifacts/target/nano-vision"  # beside the target
-    assert "0/2" in done.stdout
+    assert "0/2" in done.stdout  # a repeat is no pair
     assert "this study proposer=none: to deploy its certificate add 'proposer=none'" in done.stderr
     written = next(results.rglob("certificate.json"))
     assert written.is_file(), path

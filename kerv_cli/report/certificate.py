@@ -82,6 +82,7 @@ def certify(
     `margin` points (fixed-sequence testing: the probability that any certified one loses more is delta at most)."""
     baseline, first = _settings(resolved)[:2]
     episodes = load_study(store, cells).episodes
+    episodes = episodes[episodes["repeat"] == 0]  # a repeat is another time, not another pair
     ar = episodes[episodes["label"] == resolved.study.baseline]
     candidates: list[Candidate] = []
     chosen, testing = None, True
