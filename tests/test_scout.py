@@ -18,15 +18,17 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.artifacts import Request
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, certified, scoped
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import Scout, ScoutArtifact, ScoutProposer, check_sees
 from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
 from kerv_cli.methods.unverified import AlwaysSkip
-from kerv_cli.report.certificate import _needed, _values
+from kerv_cli.report.certificate import _needed, _values, folder_of
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.packed import pack
 from kerv_cli.targets.compact.target import CompactTarget
@@ -178,7 +180,7 @@ def certificate(target: CompactTarget, chosen: int | None, **changes: Any) -> Ce
 
 
 def context(target: CompactTarget, artifacts: dict[str, Any], task: str, **method: Any) -> Context:
-    settings = RolloutSettings(**method).parts()
+    settings = RolloutSettings(**{"prefill_draft": ScopedSettings(), **method}).parts()
     return Context(target, artifacts.__getitem__, task, {}, settings, 0)
 
 
@@ -201,13 +203,17 @@ def test_a_certified_task_gets_its_rule_and_any_other_a_streak(target: CompactTa
     assert (skip.settings.most, skip.settings.opening) == (8, 1)
 
 
-def test_a_certificate_of_another_method_chunk_format_or_world_is_refused(target: CompactTarget) -> None:
+def test_a_certificate_of_another_draft_method_chunk_format_or_world_is_refused(target: CompactTarget) -> None:
     def deploy(issued: Certificate, **method: Any) -> None:
         certified(CertifiedSkipSettings(), context(target, {"certificate": issued}, TASK, **method))
 
     issued = certificate(target, 0)
     with pytest.raises(UsageError, match=r"acceptance.kind=relaxed: the certificate is of strict"):
         deploy(issued, acceptance=NoSettings("relaxed"))
+    for other in (NoSettings("early"), MergedProposerSettings()):
+        with pytest.raises(UsageError, match=rf"prefill_draft={other.kind}: .* set prefill_draft=scoped"):
+            deploy(issued, prefill_draft=other)
+    issued.check_method(RolloutSettings(prefill_draft=NoSettings("scout")).parts(), "float32")  # the certified one
     with pytest.raises(UsageError, match=r"runtime.dtype=float32: the certificate is of bfloat16"):
         deploy(certificate(target, 0, dtype="bfloat16"))
     with pytest.raises(UsageError, match=r"chunk=4: the certificate is of 8"):
@@ -227,11 +233,12 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
         f"task={TASK} seed=50500 episodes=2 record=0 world.horizon=8 policy.target=nano-vision\n"
         "block: 2\nsettings:\n  ar: method=ar prefill_draft=none\n  half: skip=streak skip.most=1\n  all: skip=always\n"
     )
-    words = ["calibrate", "success", f"study={study}", f"results={results}", "margin=99", "delta=0.5"]
+    words = ["calibrate", "success", f"study={study}", "study.repeats=2", f"results={results}"]
+    words += ["margin=99", "delta=0.5"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     path = results / "artifacts/target/nano-vision"  # beside the target
-    assert "0/2" in done.stdout
+    assert "0/2" in done.stdout  # a repeat is no pair
     assert "this study proposer=none: to deploy its certificate add 'proposer=none'" in done.stderr
     written = next(results.rglob("certificate.json"))
     assert written.is_file(), path
@@ -263,6 +270,42 @@ def test_a_study_becomes_a_certificate_and_the_certificate_a_method(results: Pat
     assert "nothing is certified" in few.stdout
     wrong = CliRunner().invoke(app, [*words, "seed=100000"])
     assert wrong.exit_code == 2, wrong.output
+
+
+@pytest.mark.parametrize(
+    ("ar", "scout", "common", "says"),
+    [
+        ("", "chunk=2", "", "setting 'scout' differs in chunk=: a certificate is of settings that differ in"),
+        ("", "policy.scout=other", "", "setting 'scout' differs in policy="),
+        ("", "threshold.r=5", "", "setting 'scout' differs in threshold="),
+        ("", "runtime.dtype=bfloat16", "", "setting 'scout' differs in runtime.dtype="),
+        ("", "episodes=5", "", "setting 'scout' differs in episodes="),
+        ("world.horizon=9", "", "", "setting 'ar' differs in world="),
+        ("proposer=drafter", "", "", "'ar' has proposer=drafter: a certificate compares with AR, set proposer=none"),
+        ("", "", "world.stress.kind=push world.stress.level=1", "says nothing of a stressed world"),
+        ("", "", "rollout.clock=real", "rollout.clock=real: a certificate is of a world that waits"),
+    ],
+)
+def test_settings_of_other_conditions_get_no_certificate(
+    policies: Path, tmp_path: Path, ar: str, scout: str, common: str, says: str
+) -> None:
+    study = tmp_path / "mixed.yaml"
+    study.write_text(
+        f"settings:\n  early: method=early_unverified\n  scout: method=scout_unverified {scout}\n  ar: method=ar {ar}\n"
+    )
+    words = f"policy.target=nano-vision task={TASK} seed=50500 {common} results={policies}"
+    with pytest.raises(UsageError) as refused:
+        folder_of(resolve([f"study={study}", *words.split()]))
+    assert says in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["study=certify policy=vision_h8 proposer=none", "study=certify_50 cover=thirty_five proposer=none seed=50860"],
+)
+def test_the_shipped_studies_of_certificates_pass(policies: Path, words: str) -> None:
+    resolved = resolve([*words.split(), "policy.target=nano-vision", "policy.certificate=mine", f"results={policies}"])
+    assert folder_of(resolved) == policies / "artifacts/certificate/mine"
 
 
 def test_the_guard_ends_trust_in_an_episode_that_lasts_longer_than_the_certified_ones(

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.places import check_not_shipped
 from kerv_cli.base.provenance import provenance
 from kerv_cli.base.registry import METHOD_KINDS, part_of
-from kerv_cli.base.settings import RolloutSettings
+from kerv_cli.base.settings import WAITS, RolloutSettings
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Cell, seeds_text
 from kerv_cli.lab.policy import artifacts_of
@@ -36,7 +37,7 @@ POINTS = 100.0
 
 
 def folder_of(resolved: ResolvedStudy) -> Path:
-    """The certificate's folder.
+    """The certificate's folder, of a study that meets its conditions (`_check_conditions`).
 
     Raises:
         UsageError: settings that differ in more than how they trust, or seeds that are not for selection; a shipped
@@ -45,20 +46,42 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     baseline, *candidates = _settings(resolved)
     if not candidates:
         raise UsageError(f"study '{resolved.study.name}' has nothing but its baseline to certify")
+    _check_conditions(resolved)
     first, tasks = candidates[0], resolve_tasks(baseline.task)
-    for label, other in list(resolved.settings.items()):
-        differing = [k for k in METHOD_KINDS if k not in _VARIED and getattr(other, k) != getattr(first, k)]
-        if label != resolved.study.baseline and differing:
-            raise UsageError(
-                f"setting '{label}' differs in {differing[0]}: a certificate is of settings that differ in "
-                f"{'= and '.join(_VARIED)}="
-            )
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     artifacts = artifacts_of(first)
     folder = CertificateArtifact().path(first.results, first.policy.certificate, artifacts.folder)
     check_not_shipped(folder, "policy.certificate")
     return folder
+
+
+def _check_conditions(resolved: ResolvedStudy) -> None:
+    """Refuses what a certificate does not say: it names one chunk, method, world, policy and number format, of a world
+    that is not stressed and waits, and compares with AR.
+
+    Raises:
+        UsageError: names the setting and what to change.
+    """
+    baseline, first = _settings(resolved)[:2]
+    for label, other in resolved.settings.items():
+        keys = _CONDITIONS if other is baseline else (*_CONDITIONS, *_OF_CANDIDATES)
+        differing = [key for key in keys if attrgetter(key)(other) != attrgetter(key)(first)]
+        if differing:
+            raise UsageError(
+                f"setting '{label}' differs in {differing[0]}=: a certificate is of settings that differ in "
+                f"{'= and '.join(_VARIED)}= alone, and of AR under the same conditions"
+            )
+    drafting = [kind for kind in (*_VARIED, "proposer") if getattr(baseline, kind).kind != "none"]
+    if drafting:
+        raise UsageError(
+            f"the baseline '{resolved.study.baseline}' has {drafting[0]}={getattr(baseline, drafting[0]).kind}: a "
+            f"certificate compares with AR, set {drafting[0]}=none there"
+        )
+    if first.world.stress.active:
+        raise UsageError("world.stress: a certificate says nothing of a stressed world, leave it out")
+    if first.rollout.clock != WAITS:
+        raise UsageError(f"rollout.clock={first.rollout.clock}: a certificate is of a world that waits, leave it out")
 
 
 def deployment_note(resolved: ResolvedStudy) -> str:
@@ -86,6 +109,7 @@ def certify(
     `margin` points (fixed-sequence testing: the probability that any certified one loses more is delta at most)."""
     baseline, first = _settings(resolved)[:2]
     episodes = load_study(store, cells).episodes
+    episodes = episodes[episodes["repeat"] == 0]  # a repeat is another time, not another pair
     ar = episodes[episodes["label"] == resolved.study.baseline]
     candidates: list[Candidate] = []
     chosen, testing = None, True
@@ -136,6 +160,12 @@ def certify(
 
 _VARIED = ("prefill_draft", "skip")
 """Kinds in which candidates may differ."""
+
+_CONDITIONS = ("task", "seed", "episodes", "world", "rollout.clock", "runtime.dtype", "policy.kind", "policy.target")
+"""What all settings have in common, the baseline too."""
+
+_OF_CANDIDATES = ("chunk", "policy", *(kind for kind in METHOD_KINDS if kind not in _VARIED))
+"""What all candidates have in common."""
 
 
 def write(folder: Path, certificate: Certificate) -> Path:

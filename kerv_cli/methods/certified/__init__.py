@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number
-from kerv_cli.base.registry import PREFILL, add, part_of
+from kerv_cli.base.registry import PREFILL, add, find, part_of
 
 
 @dataclass
@@ -27,6 +28,16 @@ class ScopedSettings:
     outside: str = "merged"
 
 
+def check_scoped(settings: ScopedSettings) -> None:
+    """Raises UsageError for a draft elsewhere that cannot draft whole chunks before the prefill."""
+    outside = find("proposer", settings.outside, "prefill_draft.outside")
+    if outside.name != "merged" and not outside.traits.get("chains"):
+        raise UsageError(
+            f"prefill_draft.outside={outside.name}: it does not draft whole chunks from the prompt; set "
+            "prefill_draft.outside=merged, or a source of merged drafts, e.g. early"
+        )
+
+
 def _needs(settings: ScopedSettings) -> tuple[str, ...]:
     """The certificate, which brings what its draft reads, and what the other draft reads."""
     outside = part_of("prefill_draft", settings.outside)
@@ -36,7 +47,7 @@ def _needs(settings: ScopedSettings) -> tuple[str, ...]:
 _CERTIFICATE = "kerv_cli.methods.certified.certificate:"
 
 add("artifact", "certificate", _CERTIFICATE + "CertificateArtifact", sees=True, by_task=True)
-add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, when=PREFILL, chains=True)
+add("proposer", "scoped", _CERTIFICATE + "scoped", ScopedSettings, _needs, check_scoped, when=PREFILL, chains=True)
 add(
     "skip",
     "certified",

@@ -101,8 +101,14 @@ class Certificate:
         """Refuses a method that decodes otherwise than what was certified. method: kind -> settings of its parts.
 
         Raises:
-            UsageError: a part or the number format differs; names both values.
+            UsageError: the draft, another part or the number format differs; names both values.
         """
+        draft = method["prefill_draft"]
+        if self.certified is not None and draft.kind != "scoped" and draft != self.certified.source:
+            raise UsageError(
+                f"skip=certified with prefill_draft={draft.kind}: the certificate is of the draft of "
+                f"'{self.certified.label}'; set prefill_draft=scoped"
+            )
         for kind, certified in self.method.items():
             used = asdict(method[kind])
             for key in sorted({*certified, *used}, key=lambda key: key != "kind"):
