@@ -60,6 +60,16 @@ def test_an_episode_without_an_end_is_not_remembered(target: CompactTarget) -> N
     assert episode(decoder, prompts) == [1]
 
 
+@pytest.mark.parametrize("merged", [False, True])
+@torch.inference_mode()
+def test_an_episode_that_never_asks_the_cache_leaves_nothing_in_it(target: CompactTarget, merged: bool) -> None:
+    cache = SelfCacheProposer(SelfCacheSettings(least=1), target)
+    decoder = Decoder(target, Parts(prefill_draft=MergedProposer([], 48, [cache]) if merged else cache))
+    episode(decoder, [random_prompt(target, 0)], ends=False)  # as a warm-up
+    episode(decoder, [])
+    assert not cache.tasks
+
+
 @torch.inference_mode()
 def test_the_newest_chunks_are_kept_and_unverified_ones_are_not(target: CompactTarget) -> None:
     cache = SelfCacheProposer(SelfCacheSettings(least=1, most=2), target)
