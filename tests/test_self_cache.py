@@ -10,6 +10,7 @@ from test_decoding_lossless import plain_greedy, random_prompt, random_target
 from kerv_cli.base.settings import RolloutSettings, as_plain
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.lab.identity import depends_on_order
+from kerv_cli.methods.certified import ScopedSettings
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.self_cache import SelfCacheSettings
@@ -89,3 +90,5 @@ def test_results_that_depend_on_earlier_episodes_are_reused_whole() -> None:
     assert depends_on_order(settings(SelfCacheSettings()))
     assert depends_on_order(settings(MergedProposerSettings(fallback=["hold", "self_cache"])))
     assert not depends_on_order(settings(MergedProposerSettings()))
+    assert depends_on_order(settings(ScopedSettings(outside="self_cache")))
+    assert not depends_on_order(settings(ScopedSettings()))

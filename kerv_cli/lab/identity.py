@@ -121,7 +121,9 @@ def depends_on_order(settings: Plain) -> bool:
     """Whether an episode's result depends on the episodes before it in its cell: a proposer that remembers them, a
     streak that keeps its trust, or a skip level that feedback moves."""
     skip, drafts = settings.get("skip", {}), [settings.get(kind, {}) for kind in ("proposer", "prefill_draft")]
-    names = [name for d in drafts for name in (d.get("kind"), *d.get("sources", ()), *d.get("fallback", ()))]
+    names = [
+        n for d in drafts for n in (d.get("kind"), d.get("outside"), *d.get("sources", ()), *d.get("fallback", ()))
+    ]
     remembers = {name for name in parts("proposer") if part_of("proposer", name).traits.get("remembers")}
     return any(skip.get(name) for name in ("up", "down", "keeps")) or bool(remembers.intersection(names))
 
