@@ -47,6 +47,8 @@ NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
 """The parts that judge drafts."""
+_WHOLE = ("early", "scout", "retrieval")
+"""The drafts that never lack a whole chunk; where another does, the target decodes behind a proposer."""
 _ARTIFACTS = ("drafter", "early", "datastore", "calibration")
 
 
@@ -193,7 +195,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     idle: dict[str, str] = {}
     if names["proposer"] == names["prefill_draft"] == "none":
         idle |= dict.fromkeys(_JUDGED, f"method {settings.method} drafts nothing")
-    elif names["skip"] == "always":
+    elif names["skip"] == "always" and (names["prefill_draft"] in _WHOLE or names["proposer"] == "none"):
         idle["rectifier"] = "skip=always verifies nothing, so nothing is rejected"
     elif names["acceptance"] in ("strict", "sequence"):
         idle["threshold"] = f"acceptance={names['acceptance']} has no threshold"
