@@ -52,3 +52,5 @@ def test_the_other_view_brings_its_own_needs_and_must_draft_whole_chunks() -> No
     for source in ("drafter", "jacobi"):
         with pytest.raises(UsageError, match=f"skip.source={source}: it does not draft whole chunks"):
             compose("rollout", [*words, f"skip.source={source}"], RolloutSettings)
+    with pytest.raises(UsageError, match=r"skip\.source=self_cache: it remembers episodes"):
+        compose("rollout", [*words, "skip.source=self_cache"], RolloutSettings)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from kerv_cli.base.config import compose
-from kerv_cli.base.settings import RolloutSettings, SweepSettings
-from kerv_cli.lab.identity import without_effect
+from kerv_cli.base.config import compose, conf_dir
+from kerv_cli.base.settings import RolloutSettings, SweepSettings, as_plain
+from kerv_cli.lab.identity import effective, idle_keys, without_effect
 from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
 
 
@@ -23,6 +23,8 @@ from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
         ("method=spec_vla policy.drafter=mine", ""),
         ("method=spec_vla datastore=qdrant", "datastore=qdrant"),
         ("method=early_unverified rectifier=compensate", "rectifier=compensate"),
+        ("method=one_pass_streak prefill_draft=scout skip=always rectifier=compensate", "rectifier=compensate"),
+        ("method=one_pass_streak prefill_draft=hold skip=always rectifier=compensate", ""),
         ("method=ar runtime.workers=4", "runtime.workers=4"),
         ("method=ar record=0 record_size=64", "record_size=64"),
         ("method=ar episodes=2 seed=100007 world.horizon=9", ""),
@@ -31,6 +33,15 @@ from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
 def test_an_override_without_effect_is_found(words: str, idle: str) -> None:
     settings = compose("rollout", words.split(), RolloutSettings)
     assert " ".join(without_effect(settings, words.split())) == idle
+
+
+def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing() -> None:
+    names = [path.stem for path in conf_dir().glob("method/*_unverified.yaml")]
+    assert len(names) == 3
+    for name in names:
+        settings = compose("rollout", [f"method={name}"], RolloutSettings)
+        assert "rectifier" in idle_keys(settings)
+        assert "rectifier" not in effective(as_plain(settings))
 
 
 def test_a_sweep_names_what_none_of_its_settings_reads() -> None:

@@ -10,6 +10,7 @@ from test_decoding_lossless import plain_greedy, random_prompt, random_target
 from kerv_cli.base.settings import RolloutSettings, as_plain
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.lab.identity import depends_on_order
+from kerv_cli.methods.certified import ScopedSettings
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.self_cache import SelfCacheSettings
@@ -60,6 +61,16 @@ def test_an_episode_without_an_end_is_not_remembered(target: CompactTarget) -> N
     assert episode(decoder, prompts) == [1]
 
 
+@pytest.mark.parametrize("merged", [False, True])
+@torch.inference_mode()
+def test_an_episode_that_never_asks_the_cache_leaves_nothing_in_it(target: CompactTarget, merged: bool) -> None:
+    cache = SelfCacheProposer(SelfCacheSettings(least=1), target)
+    decoder = Decoder(target, Parts(prefill_draft=MergedProposer([], 48, [cache]) if merged else cache))
+    episode(decoder, [random_prompt(target, 0)], ends=False)  # as a warm-up
+    episode(decoder, [])
+    assert not cache.tasks
+
+
 @torch.inference_mode()
 def test_the_newest_chunks_are_kept_and_unverified_ones_are_not(target: CompactTarget) -> None:
     cache = SelfCacheProposer(SelfCacheSettings(least=1, most=2), target)
@@ -79,3 +90,5 @@ def test_results_that_depend_on_earlier_episodes_are_reused_whole() -> None:
     assert depends_on_order(settings(SelfCacheSettings()))
     assert depends_on_order(settings(MergedProposerSettings(fallback=["hold", "self_cache"])))
     assert not depends_on_order(settings(MergedProposerSettings()))
+    assert depends_on_order(settings(ScopedSettings(outside="self_cache")))
+    assert not depends_on_order(settings(ScopedSettings()))

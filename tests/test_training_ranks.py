@@ -160,6 +160,15 @@ def test_a_policy_acts_by_its_method(tmp_path: Path) -> None:
     assert (refused.exit_code, "skip=watch with kerv demos" in refused.stderr) == (2, True)
 
 
+@pytest.mark.parametrize("method", ["ar", "early_unverified"])
+def test_the_chunk_counts_and_is_executed(method: str) -> None:
+    words = ["policy=vision", f"method={method}"]
+    whole, two = (PolicyActs.of(compose("demos", [*words, f"chunk={n}"], DemosSettings), SPEC) for n in (0, 2))
+    assert whole.sha256 != two.sha256
+    decoder = two(DemoConfig(("reach-v3",), 1, camera=SHORT)).decoder_of("reach-v3")
+    assert (decoder.steps, decoder.target.chunk > 2) == (2, True)
+
+
 def test_an_actors_failed_episode_is_kept(tmp_path: Path) -> None:
     class Still:
         def reset(self, world: object, seed: int) -> None: ...

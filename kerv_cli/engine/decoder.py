@@ -96,9 +96,9 @@ class Decoder:
         random = boundary.numbers(task, seed) if boundary is not None else np.random.default_rng(seed)
         history = ActionHistory(self.target.actions.dofs)
         self.situation = Situation(task, history, [np.asarray(end_effector)], random)
-        self.threshold.reset()
-        if self.parts.rectifier is not None:
-            self.parts.rectifier.reset()
+        for part in (self.threshold, self.parts.rectifier, self.parts.prefill_draft, self.parts.proposer):
+            if part is not None:
+                part.reset()
         if self.parts.skip is not None:
             self.parts.skip.begin(task, seed)
 

@@ -25,6 +25,9 @@ class Proposer:
     needs_states = False
     nodes = 0
 
+    def reset(self) -> None:
+        """A new episode begins."""
+
     def prepare(self, chunk: Chunk) -> None:
         """Called before the prefill; adds the vectors that it needs on the host to `chunk.reads`."""
 

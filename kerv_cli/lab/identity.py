@@ -47,6 +47,8 @@ NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options"})
 
 _JUDGED = ("acceptance", "threshold", "rectifier")
 """The parts that judge drafts."""
+_WHOLE = ("early", "scout", "retrieval")
+"""The drafts that never lack a whole chunk; where another does, the target decodes behind a proposer."""
 _ARTIFACTS = ("drafter", "early", "datastore", "calibration")
 
 
@@ -121,7 +123,9 @@ def depends_on_order(settings: Plain) -> bool:
     """Whether an episode's result depends on the episodes before it in its cell: a proposer that remembers them, a
     streak that keeps its trust, or a skip level that feedback moves."""
     skip, drafts = settings.get("skip", {}), [settings.get(kind, {}) for kind in ("proposer", "prefill_draft")]
-    names = [name for d in drafts for name in (d.get("kind"), *d.get("sources", ()), *d.get("fallback", ()))]
+    names = [
+        n for d in drafts for n in (d.get("kind"), d.get("outside"), *d.get("sources", ()), *d.get("fallback", ()))
+    ]
     remembers = {name for name in parts("proposer") if part_of("proposer", name).traits.get("remembers")}
     return any(skip.get(name) for name in ("up", "down", "keeps")) or bool(remembers.intersection(names))
 
@@ -191,7 +195,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     idle: dict[str, str] = {}
     if names["proposer"] == names["prefill_draft"] == "none":
         idle |= dict.fromkeys(_JUDGED, f"method {settings.method} drafts nothing")
-    elif names["skip"] == "always":
+    elif names["skip"] == "always" and (names["prefill_draft"] in _WHOLE or names["proposer"] == "none"):
         idle["rectifier"] = "skip=always verifies nothing, so nothing is rejected"
     elif names["acceptance"] in ("strict", "sequence"):
         idle["threshold"] = f"acceptance={names['acceptance']} has no threshold"

@@ -43,8 +43,14 @@ class WatchSettings:
 
 def check_source(settings: AgreementSettings | WatchSettings) -> None:
     """Raises UnknownName for a source that is not there, UsageError for one that cannot look."""
-    if not find("proposer", settings.source, "skip.source").traits.get("chains"):
+    traits = find("proposer", settings.source, "skip.source").traits
+    if not traits.get("chains"):
         raise UsageError(f"skip.source={settings.source}: it does not draft whole chunks from an observation")
+    if traits.get("remembers"):
+        raise UsageError(
+            f"skip.source={settings.source}: it remembers episodes, of which a skip rule tells its source nothing; set "
+            f"prefill_draft={settings.source}, or another source, e.g. hold"
+        )
 
 
 def needs_of_source(settings: AgreementSettings | WatchSettings) -> tuple[str, ...]:

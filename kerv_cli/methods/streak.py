@@ -68,7 +68,11 @@ class StreakSkip(Skip):
     def verified(self, chunk: Chunk) -> None:
         """The prefill verified the chunk: allows twice as many unverified decodes, or none."""
         self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
-        self.left = self.kept[self.task] = self.allowed
+        self.left = self.allowed
+
+    def finish(self, success: bool) -> None:
+        """An episode ended; a warm-up, which does not, leaves nothing behind."""
+        self.kept[self.task] = self.allowed
 
     def _agrees(self, chunk: Chunk) -> bool:
         """Whether the source's draft was judged, and was accepted whole or is at most `tolerance` from the target's

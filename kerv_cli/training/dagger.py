@@ -27,8 +27,9 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 
 class PolicyActor:
     """A policy decodes chunks and executes them whole. For a share of the chunks, drawn by task and seed, the expert
-    acts instead; then the policy decodes anew. decoder_of: task -> its decoder. actions: those of the current chunk
-    that are not executed yet."""
+    acts instead; then the policy decodes anew. The decoder is never told that an episode has ended: nothing that it
+    would remember makes an episode depend on those before it in the same process. decoder_of: task -> its decoder.
+    actions: those of the current chunk that are not executed yet."""
 
     def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
         self.decoder_of, self.share = functools.cache(decoder_of), expert_share
@@ -121,8 +122,8 @@ class PolicyActs:
 
 
 def _is_plain(settings: DemosSettings) -> bool:
-    """Whether no method was chosen: the target decodes as it was trained to."""
-    return settings.parts() == DemosSettings().parts()
+    """Whether no method and no chunk was chosen: the target decodes as it was trained to."""
+    return not settings.chunk and settings.parts() == DemosSettings().parts()
 
 
 def _artifacts(settings: DemosSettings) -> Artifacts:
@@ -133,4 +134,5 @@ def _hash(settings: DemosSettings) -> str:
     if _is_plain(settings):
         return _artifacts(settings).description.sha256
     hashes = _artifacts(settings).check(Method.of(settings).needs)
-    return hash_of([hashes, {kind: as_plain(part) for kind, part in settings.parts().items()}])
+    chunk = [settings.chunk] if settings.chunk else []  # the hash of a recording from before it counted stays
+    return hash_of([hashes, {kind: as_plain(part) for kind, part in settings.parts().items()}, *chunk])

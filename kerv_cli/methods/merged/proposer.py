@@ -46,6 +46,11 @@ class MergedProposer(Proposer):
         sources, fallback = ([source(name) for name in names] for names in (settings.sources, settings.fallback))
         return cls(sources, settings.nodes, fallback)
 
+    def reset(self) -> None:
+        """Tells the sources."""
+        for source in (*self.sources, *self.fallback):
+            source.reset()
+
     def finish(self, success: bool) -> None:
         """Tells the sources."""
         for source in (*self.sources, *self.fallback):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kerv_cli.engine.chunk import Chunk, Situation
+from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.engine.record import Round
@@ -48,7 +48,6 @@ class SelfCacheProposer(ChainProposer):
         self.settings, self.target = settings, target
         self.segments = [name for name in KEY if name in target.segments] or list(target.segments)
         self.tasks: dict[str, Chunks] = {}  # by full name
-        self.episode: Situation | None = None
         self.present: list[tuple[np.ndarray, Chunk]] = []  # keys and chunks of the present episode
         self._drafted: tuple[Chunk, list[int]] | None = None
 
@@ -56,6 +55,10 @@ class SelfCacheProposer(ChainProposer):
     def build(cls, settings: SelfCacheSettings, context: Context) -> SelfCacheProposer:
         """proposer=self_cache."""
         return cls(settings, context.target)
+
+    def reset(self) -> None:
+        """An episode begins; nothing is kept of one before it that did not end, as a warm-up."""
+        self.present = []
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """The nearest chunk's tokens behind the committed ones; nothing before `least` episodes of the task."""
@@ -65,8 +68,6 @@ class SelfCacheProposer(ChainProposer):
         return [rest] if rest else []
 
     def _draft(self, chunk: Chunk) -> list[int]:
-        if self.episode is not chunk.situation:
-            self.episode, self.present = chunk.situation, []
         key = prompt_key(chunk.prompt, self.target, self.segments)[0]
         self.present.append((key, chunk))
         kept = self.tasks.get(chunk.situation.task)
