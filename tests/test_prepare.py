@@ -138,6 +138,20 @@ def test_another_run_in_the_folder_is_refused_before_anything_is_read() -> None:
     assert "other settings or data: choose another name=, or remove it with 'kerv runs rm target/short'" in another
 
 
+@pytest.mark.usefixtures("results", "few_validations")
+def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with() -> None:
+    quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]
+    made = {
+        "target/new": ["train", "target", "target=nano", "name=new", "target.observation=state", *quick],
+        "early/one": ["train", "drafter", "drafter=early", "policy.target=new", "policy.early=one", *quick],
+        "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0", "held_out=0.5"],
+    }
+    for name, words in made.items():
+        kerv(*words)
+        assert sorted(json.loads(kerv("runs", "show", name, "--json"))["command"]) == sorted(["kerv", *words])
+    assert "made by   kerv train target target=nano " in kerv("runs", "show", "target/new")
+
+
 def test_a_certificate_is_made_from_what_its_candidates_read() -> None:
     assert needs(("one_pass_certified",), sees=True) == ("drafter", "early", "scout", "certificate")
     assert needs(("one_pass",), sees=True) == ("early",)
