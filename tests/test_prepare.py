@@ -66,6 +66,10 @@ def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(result
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/other")
     line = kerv("build", "datastore", MINE, code=1)
     assert "kerv demos name=few task=reach episodes=4'" in line
+    assert "kerv demos name=few task=reach episodes=4'" in kerv("calibrate", MINE, "task=push", code=1)
+    assert "kerv demos task=mt10'" in kerv("calibrate", MINE, "task=push", "demos=mt10", code=1)
+    for command in (("train", "target", "name=new"), ("demos", "export")):
+        assert "kerv demos task=drawer-open'" in kerv(*command, "demos=drawer-open", code=1)
     assert "demos=other" in line
     assert "kerv demos task=push'" in kerv("train", "target", "name=new", "task=push", code=1)
 
