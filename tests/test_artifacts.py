@@ -205,7 +205,7 @@ def complete(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return results
 
 
-MESSAGE = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build)"
+MESSAGE = rf"was \w+ for [a-z ]+ {OTHER[:12]}, not for [0-9a-f]{{12}}: (run|build|remove)"
 
 
 @pytest.mark.parametrize("kind", FILES)

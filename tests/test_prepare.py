@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -64,6 +66,10 @@ def test_missing_demonstrations_are_recorded_by_the_command_that_is_named(result
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/other")
     line = kerv("build", "datastore", MINE, code=1)
     assert "kerv demos name=few task=reach episodes=4'" in line
+    assert "kerv demos name=few task=reach episodes=4'" in kerv("calibrate", MINE, "task=push", code=1)
+    assert "kerv demos task=mt10'" in kerv("calibrate", MINE, "task=push", "demos=mt10", code=1)
+    for command in (("train", "target", "name=new"), ("demos", "export")):
+        assert "kerv demos task=drawer-open'" in kerv(*command, "demos=drawer-open", code=1)
     assert "demos=other" in line
     assert "kerv demos task=push'" in kerv("train", "target", "name=new", "task=push", code=1)
 
@@ -102,6 +108,52 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results: Path) ->
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
     assert "kerv runs rm drafter/mine'" in kerv("prepare", MINE, "--plan", code=1)
+
+
+def typed(line: str) -> Iterator[list[str]]:
+    """The words behind `kerv` of the commands that a message quotes, in their order."""
+    return (quoted.split() for quoted in re.findall("'kerv ([^']*)'", line))
+
+
+@pytest.mark.usefixtures("few_validations")
+def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: Path) -> None:
+    rollout = ("rollout", "method=spec_vla", "task=reach", MINE, "--plan")
+    fast = ("train.steps=1", "train.batch=2", "drafter.samples=40")
+    for files in (results / "artifacts/drafter/mine").iterdir():
+        files.unlink()
+    kerv("train", "drafter", MINE, *fast)
+    path = results / "artifacts/drafter/mine/drafter.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
+    remove, train = typed(kerv(*rollout, code=1))
+    assert (remove[:3], train) == (["runs", "rm", "drafter/mine"], ["train", "drafter", MINE])
+    another = kerv(*train, "train.lr=0.5", "--plan", code=1)
+    assert "choose another policy.drafter=, or remove it with 'kerv runs rm drafter/mine'" in another
+    kerv(*remove, "--yes")
+    kerv(*train, *fast)
+    assert "1 tasks" in kerv(*rollout)
+
+
+@pytest.mark.usefixtures("results")
+def test_another_run_in_the_folder_is_refused_before_anything_is_read() -> None:
+    words = ("train", "target", "name=short", "demos=few", "target=nano", "target.observation=state", "train.batch=2")
+    kerv(*words, "train.steps=1")
+    kerv(*words, "train.steps=2", "--plan")
+    another = kerv(*words, "train.lr=0.5", "--plan", code=1)
+    assert "other settings or data: choose another name=, or remove it with 'kerv runs rm target/short'" in another
+
+
+@pytest.mark.usefixtures("results", "few_validations")
+def test_an_artifact_is_shown_with_the_settings_that_it_was_made_with() -> None:
+    quick = ["demos=few", "task=[reach-v3]", "train.steps=1", "train.batch=2"]
+    made = {
+        "target/new": ["train", "target", "target=nano", "name=new", "target.observation=state", *quick],
+        "early/one": ["train", "drafter", "drafter=early", "policy.target=new", "policy.early=one", *quick],
+        "calibration/new": ["calibrate", "policy.target=new", *quick[:2], "decodes=0", "held_out=0.5"],
+    }
+    for name, words in made.items():
+        kerv(*words)
+        assert sorted(json.loads(kerv("runs", "show", name, "--json"))["command"]) == sorted(["kerv", *words])
+    assert "made by   kerv train target target=nano " in kerv("runs", "show", "target/new")
 
 
 def test_a_certificate_is_made_from_what_its_candidates_read() -> None:

@@ -93,7 +93,7 @@ def test_runs_are_listed_and_filtered(results: Path) -> None:
 
 def test_a_run_is_shown_and_a_wrong_name_refused(results: Path) -> None:
     told = works("runs", "show", "last", f"results={results}")
-    assert re.search(r"^command +(kerv rollout|unknown)", told, re.MULTILINE)
+    assert re.search(r"^(command +kerv rollout|made by +unknown)", told, re.MULTILINE)
     missing = kerv("runs", "show", "nothing-like-it", f"results={results}")
     assert missing.exit_code == 2
     assert "unknown run 'nothing-like-it'" in missing.stderr

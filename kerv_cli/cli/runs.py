@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -93,14 +93,14 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 @_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command and figures, what it was made from, where it lies."""
-    from kerv_cli.lab.catalogue import disk_bytes, find_runs, parents, store_of
+    from kerv_cli.lab.catalogue import command_of, disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import sides
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study, rows_of
 
     results, (name,) = settings.results, _run_names(names)
     chosen = sides(results, name)
-    run = chosen[0].run
+    run = replace(chosen[0].run, command=command_of(chosen[0].run))
     table = load_study(store_of(run)).table if run.has_episodes and run.episodes else None
     if table is not None:
         table = table[table["label"].isin([side.label for side in chosen])]
@@ -112,7 +112,8 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     line = shlex.join(["kerv", *run.command]) if run.command else "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
-    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", "command": line} | parts).items():
+    words = "command" if run.has_episodes else "made by"
+    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", words: line} | parts).items():
         typer.echo(f"{name:<9} {value}")
     if table is not None:
         console().print(SummaryTable(table))

@@ -11,17 +11,19 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from kerv_cli.base.config import as_words, compose, groups
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.registry import parts
+from kerv_cli.base.settings import as_plain, choices_of
 from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, unique_cells
@@ -193,6 +195,26 @@ def description_of(run: RunEntry) -> dict[str, Any]:
         CheckpointError: the file is damaged.
     """
     return dict(_described(run.folder, run.kind).get("provenance") or {})
+
+
+def command_of(run: RunEntry) -> tuple[str, ...]:
+    """Words behind `kerv` that make the run: of a sweep or rollout as they were typed, of an artifact its command, with
+    the settings that its description names and that are not the command's defaults."""
+    name = " ".join(run.command)
+    if run.has_episodes or name not in parts("command"):
+        return run.command
+    schema, described = parts("command")[name].settings, _described(run.folder, run.kind)
+    stored = described["provenance"].get("settings") or described
+    settings = {at.name: stored[at.name] for at in fields(schema) if at.name in stored}
+    chosen = [
+        f"{group}={value}"
+        for group, default in choices_of(schema).items()
+        if isinstance(settings.get(group), Mapping)
+        for value in settings[group].values()
+        if value in groups()[group] and value != default
+    ]
+    defaults = as_words(**as_plain(compose(name.replace(" ", "_"), chosen, schema)))
+    return *run.command, *chosen, *(word for word in as_words(**settings) if word not in defaults)
 
 
 def _described(folder: Path, kind: str) -> dict[str, Any]:

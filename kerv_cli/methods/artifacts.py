@@ -79,6 +79,11 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
             raise CheckpointError(f"{what} for {noun} {digest[:12]}, not for {used[kind][:12]}: {again}")
 
 
+def removal(kind: str, path: Path) -> str:
+    """The remedy where an artifact stands in the way of a new one."""
+    return f"remove it with 'kerv runs rm {kind}/{path.name}'" if path.parent.name == kind else f"move {path} aside"
+
+
 class Artifact(Generic[T]):
     """A kind of artifact: one JSON of the dataclass `schema`, with other files beside it or none, made for one target.
     `Weights` is the base of those that are a network.
@@ -97,6 +102,10 @@ class Artifact(Generic[T]):
     def again(self) -> str:
         """The remedy where one is missing or does not fit."""
         return f"run 'kerv {' '.join(self.command)}'"
+
+    def anew(self, path: Path) -> str:
+        """The remedy where the one in `path` was made for another target; its command replaces it."""
+        return self.again
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
         """Its path; name None: the one beside the target in the folder `target`."""
@@ -156,7 +165,7 @@ class Artifact(Generic[T]):
         """
         description = self.read(path)
         made_for, what = self.made_for(description), f"the {self.noun} in {path}"
-        made_for.check_same(MadeFor.of(target), what, self.made, self.again)
+        made_for.check_same(MadeFor.of(target), what, self.made, self.anew(path))
         return description
 
 
@@ -175,6 +184,10 @@ class Weights(Artifact[W]):
     """Base of kinds that are a network: safetensors and a JSON, `<kind>.json`."""
 
     any_chunk = False  # whether the target's H does not matter
+
+    def anew(self, path: Path) -> str:
+        """The remedy where the one in `path` was made for another target: a training goes on with none but its own."""
+        return f"{removal(self.kind, path)}, then {self.again}"
 
     def module(self, description: W, target: ReadableTarget) -> nn.Module:
         """A fresh network of this description."""
@@ -254,7 +267,8 @@ class Artifacts:
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             todo += files.brings(description)
-            sources.append((files.sources(description), f"the {files.noun} in {path} was {files.made}", files.again))
+            what = f"the {files.noun} in {path} was {files.made}"
+            sources.append((files.sources(description), what, files.anew(path)))
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes

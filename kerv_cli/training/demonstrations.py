@@ -15,7 +15,7 @@ from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets.checkpoint import TargetDescription, described
-from kerv_cli.worlds import resolve_tasks, specs
+from kerv_cli.worlds import resolve_tasks, specs, stands_for_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 S = TypeVar("S", bound=DemonstrationSettings)
@@ -50,6 +50,7 @@ def open_demos(results: str, names: str, tasks: Sequence[str] = (), episodes: in
 
 
 def _remedy(results: str, folder: Path, tasks: Sequence[str], episodes: int) -> str:
+    tasks = [folder.name] if stands_for_tasks(folder.name) else tasks
     name = [] if folder.name == name_of(tasks) else [f"name={folder.name}"]
     task = [f"task={tasks[0]}" if len(tasks) == 1 else f"task=[{','.join(tasks)}]"] if tasks else []
     words = [*name, *task, *([f"episodes={episodes}"] if episodes else [])]
@@ -73,7 +74,8 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     episodes = config.get("episodes", 0) if isinstance(config, dict) else 0
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     names = resolve_tasks(tasks) if tasks else ()
-    dataset = open_demos(settings.results, name, tasks or target.tasks, episodes)
+    asked = tasks if settings.demos else ()  # the target's own are recorded whole
+    dataset = open_demos(settings.results, name, asked or target.tasks, episodes)
     check_spaces(dataset, target.actions, target.observation, "the target")
     if target.family == "compact" and target.cameras:
         camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])

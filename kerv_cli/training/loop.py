@@ -28,6 +28,8 @@ from kerv_cli.training.interruption import until_interrupted
 from kerv_cli.training.ranks import ALONE, Ranks
 
 Metrics = dict[str, float]
+RESUME = "resume.safetensors"
+"""The file of a run's state in its folder."""
 
 
 class Lesson(Protocol):
@@ -186,7 +188,7 @@ class Loop:
         tensors["losses"] = torch.tensor(self.losses, dtype=torch.float64)
         best = self.best if self.history else None
         progress = RunProgress(self.identity, self.step, best, self.history)
-        write_state(self.folder / "resume.safetensors", tensors, progress)
+        write_state(self.folder / RESUME, tensors, progress)
         self.log()
 
     def log(self) -> None:
@@ -204,14 +206,11 @@ class Loop:
         Raises:
             CheckpointError: it is of a run with other settings or data, or damaged.
         """
-        path = self.folder / "resume.safetensors"
+        path = self.folder / RESUME
         if not path.is_file():
             return
         tensors, progress = read_state(path)
-        if progress.identity != self.identity:
-            raise CheckpointError(
-                f"{self.folder} holds a run with other settings or data: choose another name=, or move it aside"
-            )
+        check_same_run(self.folder, progress.identity, self.identity, "move it aside")
         self.module.load_state_dict({k[6:]: v for k, v in tensors.items() if k.startswith("model.")})
         self.ema = {k[4:]: v.to(self.ema[k[4:]].device) for k, v in tensors.items() if k.startswith("ema.")}
         state: dict[int, dict[str, Tensor]] = {}
@@ -225,6 +224,22 @@ class Loop:
         self.best = -math.inf if progress.best is None else progress.best
         self.losses = tensors["losses"].tolist() if "losses" in tensors else [math.nan] * self.step
         self.log()  # the run may have ended before it wrote the log
+
+
+def check_same_run(folder: Path, stored: str, identity: str, remedy: str) -> None:
+    """Raises CheckpointError: the run in the folder has an identity, `stored`, other than this one."""
+    if stored != identity:
+        raise CheckpointError(f"{folder} holds a run with other settings or data: {remedy}")
+
+
+def stored_identity(folder: Path) -> str | None:
+    """The identity of the run in the folder, without its tensors; None: no run, or a damaged one, as `read_state` will
+    say."""
+    try:
+        with safe_open(regular(folder / RESUME), "pt") as file:
+            return str(json.loads(json.loads((file.metadata() or {})["state"])["progress"])["identity"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
+        return None
 
 
 def write_state(path: Path, tensors: Mapping[str, Tensor], progress: RunProgress) -> None:

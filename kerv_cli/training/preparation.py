@@ -12,7 +12,7 @@ from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import CalibrateSuccessSettings, PrepareSettings, RolloutSettings, TrainDrafterSettings
 from kerv_cli.lab.catalogue import state_of
 from kerv_cli.lab.resolve import resolve
-from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of
+from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.worlds import specs
@@ -104,8 +104,7 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
         artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
         if isinstance(files, Weights):
-            name = f"{kind}/{path.name}"
-            raise CheckpointError(f"{str(error).split(': ')[0]}: remove it with 'kerv runs rm {name}'") from error
+            raise CheckpointError(f"{str(error).split(': ')[0]}: {removal(kind, path)}") from error
         return "of other artifacts"
     if kind == "calibration":
         lacks = [name for name, part in (("variability", "drafter"), ("skip", "datastore")) if part in kinds]

@@ -22,7 +22,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.lab.run import success_of
-from kerv_cli.methods.artifacts import MadeFor, Weights
+from kerv_cli.methods.artifacts import MadeFor, Weights, removal
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
@@ -43,7 +43,7 @@ from kerv_cli.training.imitation import (
     task_borders,
     vocabulary,
 )
-from kerv_cli.training.loop import Lesson, Loop, Metrics
+from kerv_cli.training.loop import Lesson, Loop, Metrics, check_same_run, stored_identity
 from kerv_cli.training.ranks import Ranks, join
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -91,14 +91,27 @@ class Run(ABC):
         Raises:
             CheckpointError: the folder holds another run. KervError: training diverged. StorageError: writing failed.
         """
-        train = self.settings.train
-        parts = {"train": run_settings(train), "demos": self.dataset.sha256, **self.identity()}
-        identity = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
         self.learnt.module.train()
-        loop = Loop(self.learnt, self.save, train, self.folder, identity, self.ranks, self.borders)
+        loop = Loop(self.learnt, self.save, self.settings.train, self.folder, self.hash, self.ranks, self.borders)
         metrics = loop.run(on_step)
         self.losses = loop.losses
         return metrics
+
+    @property
+    def hash(self) -> str:
+        """Of everything that determines the run."""
+        parts = {"train": run_settings(self.settings.train), "demos": self.dataset.sha256, **self.identity()}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+    def check_folder(self, kind: str, key: str) -> None:
+        """Refuses to go on with another run. kind: of artifact. key: the setting that names the folder.
+
+        Raises:
+            CheckpointError: the folder holds one.
+        """
+        stored = stored_identity(self.folder)
+        if stored is not None:
+            check_same_run(self.folder, stored, self.hash, f"choose another {key}=, or {removal(kind, self.folder)}")
 
     def begin(self) -> None:
         """Chooses the device, and joins the other processes where torchrun started several.
@@ -137,7 +150,7 @@ class TargetRun(Run):
 
     Raises:
         UsageError: settings that do not fit together. CheckpointError: no such demonstrations or `train.init`,
-            demonstrations of another environment or camera.
+            demonstrations of another environment or camera, another run in the folder.
     """
 
     kind = "target"
@@ -162,7 +175,9 @@ class TargetRun(Run):
         check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")
         if settings.target.observation == "vision":
             check_camera(self.dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
-        self.init_hash: dict[str, str] = {}  # {"init": hash of its weights}; empty for a fresh run
+        # {"init": hash of its weights}; empty for a fresh run
+        self.init_hash = {"init": read_target(self.init).sha256} if self.init else {}
+        self.check_folder(self.kind, "name")
 
     def find_init(self) -> Path | None:
         """Folder of the target `train.init`; None for a fresh run.
@@ -202,7 +217,6 @@ class TargetRun(Run):
         settings, camera, init = self.settings, self.world.camera.name, None
         if self.init is not None:
             init, description = load_target(self.init)
-            self.init_hash = {"init": description.sha256}
             check_spaces(self.dataset, description.actions, description.observation, f"the target in {self.init}")
         words = init.words if init else vocabulary(self.dataset.manifest.environment)
         samples = load_samples(self.dataset, settings.target, words, self.tasks, progress)
@@ -250,7 +264,7 @@ class DrafterRun(Run):
     part of a run's identity.
 
     Raises:
-        UsageError: `train.init` is set. CheckpointError: no such target or demonstrations.
+        UsageError: `train.init` is set. CheckpointError: no such target or demonstrations, another run in the folder.
     """
 
     kind = "drafter"
@@ -272,9 +286,11 @@ class DrafterRun(Run):
         check_not_shipped(self.folder, f"policy.{self.artifact.kind}")
         self.settings, dataset = demos_for(settings)
         self.dataset = subset(dataset, self.settings.task, settings.starts)
-        read_target(self.target_folder).check_autoregressive(
+        self.description = read_target(self.target_folder)
+        self.description.check_autoregressive(
             f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
         )
+        self.check_folder(self.artifact.kind, f"policy.{self.artifact.kind}")
 
     @abstractmethod
     def lesson(self, progress: OnProgress) -> Lesson:
@@ -298,7 +314,7 @@ class DrafterRun(Run):
             UsageError: no such device, or a batch that cannot be divided.
         """
         self.begin()
-        self.target, self.description = load_target(self.target_folder, self.device)
+        self.target, _ = load_target(self.target_folder, self.device)
         self.learnt = self.lesson(progress)
 
     def identity(self) -> dict[str, Any]:

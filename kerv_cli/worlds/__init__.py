@@ -70,6 +70,11 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(tasks)
 
 
+def stands_for_tasks(name: str) -> bool:
+    """Whether demonstrations of this name are of the task or the suite that has it, in small letters."""
+    return name == name.lower() and any(spec.expand(name) for spec in specs().values())
+
+
 def task_names() -> Iterator[str]:
     """Suites and tasks of all environments, for completion."""
     for part in parts(KIND).values():

@@ -12,6 +12,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json, sha256_of
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.worlds import stands_for_tasks
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
 from kerv_cli.worlds.recorded import register_recorded
 
@@ -150,11 +151,10 @@ class DemoDataset:
         """
         path = Path(path)
         if not (path / "manifest.json").exists():
+            command = f"'kerv demos {'task' if stands_for_tasks(path.name) else 'name'}={path.name}'"
             if (path / "recording.json").exists():
-                raise CheckpointError(
-                    f"the demonstrations in {path} are unfinished: run 'kerv demos name={path.name}' again to go on"
-                )
-            raise CheckpointError(f"no demonstrations in {path}: record them with 'kerv demos name={path.name}'")
+                raise CheckpointError(f"the demonstrations in {path} are unfinished: run {command} again to go on")
+            raise CheckpointError(f"no demonstrations in {path}: record them with {command}")
         manifest = _read_manifest(path / "manifest.json")
         if manifest.instructions:
             camera, spaces = manifest.config["camera"]["name"], (manifest.actions, manifest.observation)
