@@ -134,7 +134,7 @@ def test_no_drafter_is_distilled_from_it(results: Path, monkeypatch: pytest.Monk
 
     of_them = {"actions": SPEC.actions, "observation": SPEC.observation, "environment": SPEC.name, "tasks": {}}
     same = type("M", (), of_them)
-    demos = type("D", (), {"manifest": same, "path": Path("demos")})()
+    demos = type("D", (), {"manifest": same, "path": Path("demos"), "episodes": ()})()
     monkeypatch.setattr(DemoDataset, "open", classmethod(lambda cls, folder: demos))
     settings = compose("train_drafter", [f"results={results}", "policy.target=parallel"], TrainDrafterSettings)
     with pytest.raises(UsageError, match="no greedy decodes to imitate"):

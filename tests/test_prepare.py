@@ -57,7 +57,11 @@ def test_tasks_and_demonstrations_are_those_of_the_target(command: str) -> None:
 
 
 def test_a_target_is_trained_on_the_demonstrations_that_are_named(results: Path) -> None:
-    assert "8 demonstrations of 2 tasks" in kerv("train", "target", "name=new", "demos=few", "--plan")
+    planned = kerv("train", "target", "name=new", "demos=few", "--plan")
+    assert "8 demonstrations of 2 tasks, 6000 steps of 64 samples, about 96 min (a guess)" in planned
+    refused = kerv("train", "target", "name=new", "demos=few", "task=drawer-open", "--plan", code=1)
+    assert "no episode of drawer-open-v3" in refused
+    assert "'kerv demos task=drawer-open-v3'" in refused
     (results / "artifacts/demos/few").rename(results / "artifacts/demos/reach")
     assert "4 demonstrations of 1 tasks" in kerv("train", "target", "name=new", "task=reach", "--plan")
 
@@ -131,6 +135,7 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     kerv(*remove, "--yes")
     kerv(*train, *fast)
     assert "1 tasks" in kerv(*rollout)
+    assert "4000 steps of 64, about 3 min (a guess)" in kerv("train", "drafter", MINE, "policy.drafter=b", "--plan")
 
 
 @pytest.mark.usefixtures("results")
@@ -213,3 +218,9 @@ def test_prepare_refuses_what_cannot_be(words: list[str], says: str) -> None:
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
 def test_a_wrong_target_is_noticed_before_anything_else(command: str) -> None:
     assert "no target 'min'" in kerv(*command.split(), "policy.target=min", code=2)
+
+
+def test_a_plan_to_record_refuses_what_cannot_be_recorded() -> None:
+    line = ("demos", "task=reach", "name=visited", "--plan")
+    assert "no target 'min'" in kerv(*line, "policy=vision", "policy.target=min", code=2)
+    assert "100 episodes" in kerv(*line, "policy=vision", "episodes=100")

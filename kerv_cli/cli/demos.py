@@ -32,15 +32,10 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     visits by its method, labelled by the expert."""
     from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds import resolve_tasks, spec_of
+    from kerv_cli.worlds.demos.recording import DemoConfig, record
 
     tasks = resolve_tasks(settings.task)
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
-    if plan:
-        steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
-        minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
-        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
-    from kerv_cli.worlds.demos.recording import DemoConfig, record
-
     actor = _actor(settings, tasks[0])
     config = DemoConfig(
         tasks=tasks,
@@ -54,6 +49,10 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         policy=actor.sha256 if actor else "",
         expert_share=settings.expert_share if actor else 0.0,
     )
+    if plan:
+        steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
+        minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
+        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
     try:
         with progress_bar("demonstrations") as advance:
             manifest = record(config, folder, advance, actor)

@@ -80,18 +80,28 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     if target.family == "compact" and target.cameras:
         camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])
         check_camera(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
+    if dataset.manifest.environment == target.environment:
+        check_tasks(dataset, names)
     recorded = list(dataset.manifest.tasks)
-    same = dataset.manifest.environment == target.environment
-    for task in names if same else ():
+    trained = resolve_tasks(target.tasks) if target.tasks and not tasks else ()
+    if set(recorded) - set(trained):
+        tasks = tasks or [task for task in recorded if task in trained]
+    return replace(settings, demos=name, task=tasks), dataset
+
+
+def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
+    """Refuses demonstrations that lack one of these tasks, by their full names.
+
+    Raises:
+        CheckpointError: the first one without an episode.
+    """
+    recorded = list(dict.fromkeys(entry.task for entry in dataset.episodes))
+    for task in names:
         if task not in recorded:
             raise CheckpointError(
                 f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "
                 f"{', '.join(recorded)}, or record others with 'kerv demos task={task}' and name them by demos="
             )
-    trained = resolve_tasks(target.tasks) if target.tasks and not tasks else ()
-    if set(recorded) - set(trained):
-        tasks = tasks or [task for task in recorded if task in trained]
-    return replace(settings, demos=name, task=tasks), dataset
 
 
 def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: ObservationSpace, owner: str) -> None:
@@ -127,9 +137,7 @@ def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str) -> DemoDatas
     if not tasks and starts == ALL:
         return dataset
     names = resolve_tasks(tasks) if tasks else tuple(dataset.manifest.tasks)
-    missing = [task for task in names if task not in dataset.manifest.tasks]
-    if missing:
-        raise CheckpointError(f"the demonstrations in {dataset.path} hold no episode of {missing[0]}")
+    check_tasks(dataset, names)
     chosen = [index for index, entry in enumerate(dataset.episodes) if entry.task in names]
     if starts == HALF:
         chosen = _one_side(dataset, chosen)

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
@@ -51,15 +51,12 @@ def load_samples(
     task_names: tuple[str, ...],
     on_progress: OnProgress = lambda done, total: None,
 ) -> Samples:
-    """Reads the tasks' episodes into memory.
+    """Reads the tasks' episodes, one of each at least, into memory.
 
     Raises:
-        CheckpointError: a task without an episode, too few labels or frames of another size.
+        CheckpointError: too few labels or frames of another size.
     """
     chosen = [i for i, e in enumerate(dataset.episodes) if e.task in task_names]
-    missing = set(task_names) - {dataset.episodes[i].task for i in chosen}
-    if missing:
-        raise CheckpointError(f"the demonstrations hold no episode of {', '.join(sorted(missing))}: record them first")
     parts = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)

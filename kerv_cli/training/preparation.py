@@ -15,6 +15,7 @@ from kerv_cli.lab.resolve import resolve
 from kerv_cli.methods.artifacts import Artifacts, Weights, kind_of, removal
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.demonstrations import demos_for
+from kerv_cli.training.runs import drafter_seconds
 from kerv_cli.worlds import specs
 
 THERE, MISSING = "there", "missing"
@@ -114,8 +115,7 @@ def _state(artifacts: Artifacts, kind: str, kinds: Sequence[str]) -> str:
 
 
 def _seconds(kind: str, command: Sequence[str]) -> float:
-    """A guess, from nano and small targets on one core."""
+    """A guess."""
     if command[0] != "train":
         return {"certificate": 120.0}.get(kind, 30.0)
-    train = compose("train_drafter", command[2:], TrainDrafterSettings).train
-    return train.steps * {"scout": 0.4}.get(kind, 0.05)
+    return drafter_seconds(kind, compose("train_drafter", command[2:], TrainDrafterSettings).train.steps)

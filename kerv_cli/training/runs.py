@@ -29,6 +29,7 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.demonstrations import (
     check_camera,
     check_spaces,
+    check_tasks,
     demos_for,
     name_of,
     open_demos,
@@ -61,6 +62,11 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     settings = {k: v for k, v in asdict(train).items() if k not in free}
     settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
     return {k: v for k, v in settings.items() if k not in later or v != later[k]}
+
+
+def about(seconds: float) -> str:
+    """The time of a plan in words."""
+    return f"about {seconds / 60:.0f} min (a guess)"
 
 
 class Run(ABC):
@@ -150,7 +156,7 @@ class TargetRun(Run):
 
     Raises:
         UsageError: settings that do not fit together. CheckpointError: no such demonstrations or `train.init`,
-            demonstrations of another environment or camera, another run in the folder.
+            demonstrations of another environment, camera or tasks, another run in the folder.
     """
 
     kind = "target"
@@ -173,6 +179,7 @@ class TargetRun(Run):
         self.init = self.find_init()
         camera = self.world.camera.name
         check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")
+        check_tasks(self.dataset, self.tasks)
         if settings.target.observation == "vision":
             check_camera(self.dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
         # {"init": hash of its weights}; empty for a fresh run
@@ -199,13 +206,20 @@ class TargetRun(Run):
         return folder
 
     def plan(self) -> str:
-        """One line for --plan: demonstrations, tasks, steps and folder."""
+        """One line for --plan: demonstrations, tasks, steps, time and folder."""
         train, episodes = self.settings.train, [e for e in self.dataset.episodes if e.task in self.tasks]
         return (
             f"{self.folder}: {self.settings.target.size} on {self.settings.target.observation}, {len(episodes)} "
-            f"demonstrations of {len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples"
-            + (f", beginning with {self.init}" if self.init else "")
+            f"demonstrations of {len(self.tasks)} tasks, {train.steps} steps of {train.batch} samples, "
+            f"{about(self.seconds)}" + (f", beginning with {self.init}" if self.init else "")
         )
+
+    @property
+    def seconds(self) -> float:
+        """A guess, from nano to small targets on one core: the trunk's weights, and the pixels if it sees."""
+        s, train = self.settings.target, self.settings.train
+        weights = s.layers * s.width * (4 * s.width + 3 * s.feed_forward)
+        return train.steps * train.batch * (2.2e-9 * weights + 3e-4 * s.channels * (s.observation == "vision"))
 
     def load(self, progress: OnProgress) -> None:
         """Reads the demonstrations and the weights of `train.init` into memory, and makes the target.
@@ -302,9 +316,10 @@ class DrafterRun(Run):
         return f"{s.layers}-layer {what}, greedy decodes of {s.samples} observations"
 
     def plan(self) -> str:
-        """One line for --plan: target, observations, steps and folder."""
+        """One line for --plan: target, observations, steps, time and folder."""
         train = self.settings.train
-        return f"{self.folder}: {self.summary()}, {train.steps} steps of {train.batch}"
+        time = about(drafter_seconds(self.artifact.kind, train.steps))
+        return f"{self.folder}: {self.summary()}, {train.steps} steps of {train.batch}, {time}"
 
     def load(self, progress: OnProgress) -> None:
         """Loads the target and reads the demonstrations.
@@ -328,6 +343,11 @@ class DrafterRun(Run):
         """Writes the drafter's folder."""
         made_for, stored = MadeFor.of(self.description), self.settings.train.stored
         self.artifact.save(self.folder, module, made_for, origin, stored, settings=asdict(self.settings.drafter))
+
+
+def drafter_seconds(kind: str, steps: int) -> float:
+    """Of training an artifact of this kind: a guess, from nano and small targets on one core."""
+    return steps * {"scout": 0.4}.get(kind, 0.05)
 
 
 def drafter_run(settings: TrainDrafterSettings) -> DrafterRun:
