@@ -18,6 +18,9 @@ RELEASED = {
 }
 """Shipped policy -> SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
 
+RESUME = "resume.safetensors"
+"""The file of a training's state in the folder of what it makes; nothing that is shipped has it."""
+
 
 def results_dir(results: str) -> Path:
     """The results folder.
@@ -105,12 +108,13 @@ def find_target(results: str, name: str) -> Path:
 
 
 def check_not_shipped(path: Path, word: str) -> None:
-    """Refuses to write an artifact in place of a shipped policy's. word: of the command, names another place.
+    """Refuses to replace an artifact of a shipped policy. path: where it is to be written. word: the setting that names
+    another place, e.g. `policy.scout`.
 
     Raises:
-        UsageError: the shipped policy that has its artifacts there has this one.
+        UsageError: there is one beside the shipped target, and no training of the user's made it.
     """
-    made_here = (path / "resume.safetensors").is_file()
+    made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
         raise UsageError(f"{path} is there, as a part of a shipped policy: {word}=NAME makes one of yours")
 

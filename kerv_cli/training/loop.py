@@ -22,14 +22,13 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.base.files import atomic_path, regular
 from kerv_cli.base.manifests import read
+from kerv_cli.base.places import RESUME
 from kerv_cli.base.settings import TrainSettings
 from kerv_cli.targets.checkpoint import load_tensors, save_tensors
 from kerv_cli.training.interruption import until_interrupted
 from kerv_cli.training.ranks import ALONE, Ranks
 
 Metrics = dict[str, float]
-RESUME = "resume.safetensors"
-"""The file of a run's state in its folder."""
 
 
 class Lesson(Protocol):
