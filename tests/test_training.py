@@ -28,9 +28,10 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.imitation import lit, soft_labels, token_loss, vocabulary
+from kerv_cli.training.imitation import lit, moved, soft_labels, token_loss, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -266,6 +267,39 @@ def test_light_is_of_the_sample_and_the_step_alone_and_moves_nothing() -> None:
     assert (changed != images).flatten(1).any(1).all()
     assert changed.flatten(2).argmax(-1).eq(5 * 32 + 7).all()
     assert torch.equal(lit(images, indices, 3, 0.0), images)
+
+
+def test_a_view_is_moved_by_what_is_said_and_each_by_itself() -> None:
+    images = torch.zeros(6, 3, 16, 32, dtype=torch.uint8)
+    images[:, :, 7, 8] = images[:, :, 9, 16 + 6] = 200  # a marker in each view: row 7, column 8; row 9, column 6
+    indices = torch.arange(6)
+    found, by = moved(images, indices, 3, 2)
+    assert torch.equal(moved(images[2:], indices[2:], 3, 2)[0], found[2:])  # whatever the batch
+    pixels = (by * (16 / 2 - 1)).round().long()
+    assert len(pixels.unique()) == 5
+    assert not torch.equal(by[:, 0], by[:, 1])
+    for one, view, (column, row) in ((i, v, d) for i in range(6) for v, d in enumerate(pixels[i].tolist())):
+        at = found[one, 0, :, 16 * view : 16 * view + 16].flatten().argmax()
+        assert divmod(int(at), 16) == ((7, 9)[view] + row, (8, 6)[view] + column)
+    assert (moved(images + 5, indices, 3, 2)[0] >= 5).all()  # the edge is repeated
+    assert torch.equal(moved(images, indices, 3, 0)[0], images)
+
+
+def test_waypoints_are_the_hands_at_the_next_change_of_the_gripper_and_at_the_end() -> None:
+    states = np.zeros((10, 39), np.float32)
+    states[:, :3] = np.arange(10)[:, None] + np.array([0, 0.1, 0.2])
+    labels = np.zeros((13, 4), np.float32)
+    labels[4:, 3] = 1.0  # closes
+    labels[8:, 3] = -1.0  # opens
+    labels[10:, 3] = 1.0  # beyond the success
+    frames, steps = np.zeros((10, 8, 8, 3), np.uint8), np.arange(10)
+    episode = DemoEpisode("reach-v3", 0, False, 10, frames, steps, states, labels, labels[:10], np.zeros(3))
+    two = waypoints(episode, np.array([0, 3, 4, 7, 8, 9]), 2, ACTIONS)
+    assert two.shape == (6, 2, 3)
+    assert two[:, 0, 0].tolist() == [4, 4, 8, 8, 9, 9]
+    assert torch.equal(two[:, 1], torch.from_numpy(states[9, :3]).expand(6, 3))
+    three = waypoints(episode, np.array([0, 5, 8]), 3, ACTIONS)
+    assert three[:, :, 0].tolist() == [[4, 8, 9], [8, 9, 9], [9, 9, 9]]
 
 
 @pytest.mark.bits

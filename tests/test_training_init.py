@@ -35,7 +35,7 @@ WORDS = WordTokenizer.build(["pull the drawer open", "jump"])
 class Demos:
     """Four made-up episodes of a task."""
 
-    sha256, path = "d" * 64, Path("demos")
+    sha256, path, views = "d" * 64, Path("demos"), 0
     manifest = SimpleNamespace(config={}, environment=SPEC.name, actions=ACTIONS, observation=OBSERVATION)
     episodes = tuple(DemoEntry(seed, False, 6, 0, "", "drawer-open-v3", Path()) for seed in range(4))
 
@@ -151,6 +151,9 @@ def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
             TargetRun(settings(results, "name=old", same))
     with pytest.raises(UsageError, match=r"train\.init=old: only 'kerv train target'"):
         runs.drafter_run(compose("train_drafter", ["train.init=old"], TrainDrafterSettings))
+    for word in ("colour=0.3", "shift=4", "places=path"):
+        with pytest.raises(UsageError, match=rf"train\.{word}: only 'kerv train target' has this setting"):
+            runs.drafter_run(compose("train_drafter", [f"train.{word}"], TrainDrafterSettings))
 
 
 def test_the_plan_names_it(results: Path) -> None:

@@ -340,7 +340,11 @@ class TrainSettings:
     label_sigma: float = number(1.0, 0, 1000, help="bins over which a label is spread (Gaussian); 0: one-hot")
     balance: float = number(0.0, 0, 1, help="0: every sample is drawn as often as any other; 1: every task")
     scene_weight: float = number(1.0, 0, 1e6, help="weight of the position loss (vision only)")
+    places: str = choice(
+        "state", "state", "path", help="positions learnt: of object and goal; path: of the hand, later in the episode"
+    )
     colour: float = number(0.0, 0, 3, help="random light on the images (target only): spread of its logarithm")
+    shift: int = number(0, 0, 64, help="most pixels by which a view is moved at random (target only)")
     scene_steps: int = number(0, 0, 10**9, help="first steps that train only the vision encoder, on positions")
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for validation")
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")

@@ -14,6 +14,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.places import artifact, find_target, results_dir
 from kerv_cli.base.settings import DEFAULT_TASKS, DemonstrationSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
+from kerv_cli.base.views import views_of
 from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.worlds import resolve_tasks, specs, stands_for_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -79,7 +80,7 @@ def demos_for(settings: S) -> tuple[S, DemoDataset]:
     check_spaces(dataset, target.actions, target.observation, "the target")
     if target.family == "compact" and target.cameras:
         camera = specs()[dataset.manifest.environment].camera_name(target.cameras[0])
-        check_camera(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
+        dataset = seen_by(dataset, camera, "the target sees", f"record them with world.camera.name={camera}")
     if dataset.manifest.environment == target.environment:
         check_tasks(dataset, names)
     recorded = list(dataset.manifest.tasks)
@@ -116,15 +117,19 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
         raise CheckpointError(f"{where} have other observations than {owner}: they are of another environment")
 
 
-def check_camera(dataset: DemoDataset, camera: str, who: str, remedy: str) -> None:
-    """Refuses demonstrations whose frames are of another camera than `camera`. who, remedy: for the message.
+def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDataset:
+    """The dataset with the views of `camera` alone, where further ones were recorded behind them. who, remedy: for the
+    message.
 
     Raises:
-        CheckpointError: they are.
+        CheckpointError: its frames begin with other views.
     """
     recorded = dataset.manifest.config["camera"]["name"]
-    if recorded != camera:
-        raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
+    if recorded == camera:
+        return dataset
+    if recorded.startswith(f"{camera}+"):
+        return replace(dataset, views=len(views_of(camera)))
+    raise CheckpointError(f"the demonstrations in {dataset.path} show camera {recorded}, {who} {camera}: {remedy}")
 
 
 def subset(dataset: DemoDataset, tasks: Sequence[str], starts: str) -> DemoDataset:

@@ -20,6 +20,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import TargetSettings, TrainSettings
+from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.target import CompactTarget
@@ -28,6 +29,7 @@ from kerv_cli.training.loop import Metrics
 from kerv_cli.training.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.worlds import specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
 WITHIN = 9
 """Bins; validation reports the share of tokens that are off by at most this many (the relaxed radius of Spec-VLA)."""
@@ -40,6 +42,7 @@ class Samples(Observations):
     """The training data of a policy: observations and the expert's chunks."""
 
     chunks: Tensor  # (n, H, D) float32, the expert's clean actions, environment units
+    places: Tensor  # (n, K, 3) float32, the positions that are learnt, metres
     episodes: Tensor  # (n,) int64, index of the sample's episode
     tasks: Tensor  # (n,) int64, index of the sample's task
 
@@ -50,8 +53,9 @@ def load_samples(
     words: WordTokenizer,
     task_names: tuple[str, ...],
     on_progress: OnProgress = lambda done, total: None,
+    places: str = "state",
 ) -> Samples:
-    """Reads the tasks' episodes, one of each at least, into memory.
+    """Reads the tasks' episodes, one of each at least, into memory. places: as `train.places`.
 
     Raises:
         CheckpointError: too few labels or frames of another size.
@@ -64,9 +68,26 @@ def load_samples(
         chunks = torch.from_numpy(read_chunks(episode, observations.steps.numpy(), settings.chunk)).float()
         episodes = torch.full((len(observations),), number)
         tasks = torch.full_like(episodes, task_names.index(episode.task))
-        parts.append(Samples(**vars(observations), chunks=chunks, episodes=episodes, tasks=tasks))
+        learnt = places_of(observations.states, dataset.manifest.observation)
+        if places == "path":
+            learnt = waypoints(episode, observations.steps.numpy(), learnt.shape[1], dataset.manifest.actions)
+        parts.append(Samples(**vars(observations), chunks=chunks, places=learnt, episodes=episodes, tasks=tasks))
         on_progress(number + 1, len(chosen))
     return Samples.joined(parts)
+
+
+def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
+    """(n, K, 3) float32 for K = `count`: where the hand is when strict DoFs (a gripper) next change, K − 1 times behind
+    each of `steps` (n,), and at the episode's end, metres. Positions that a demonstration itself shows, without a
+    simulator's state. A change: the expert's command crosses the middle of its range; one that does not come is the
+    end."""
+    strict = episode.labels[: episode.steps, actions.is_strict] > actions.middle[actions.is_strict]
+    changes = np.flatnonzero((strict[1:] != strict[:-1]).any(-1)) + 1
+    last = episode.steps - 1
+    times = np.append(changes, [last] * count)
+    first = np.searchsorted(changes, steps, side="right")
+    at = np.concatenate([times[first[:, None] + np.arange(count - 1)], np.full((len(steps), 1), last)], 1)
+    return torch.from_numpy(episode.end_effector[at]).float()
 
 
 def task_borders(tasks: Tensor, balance: float) -> Tensor | None:
@@ -100,6 +121,22 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
     factors = torch.from_numpy(fields).float().to(images.device).exp()
     light = F.interpolate(factors, images.shape[-2:], mode="bilinear", align_corners=True)
     return (images * light).round_().clamp_(0, 255).to(torch.uint8)
+
+
+def moved(images: Tensor, indices: Tensor, step: int, most: int) -> tuple[Tensor, Tensor]:
+    """images (B, 3, size, size x views) uint8 with the contents of each view moved by up to `most` pixels, its edge
+    repeated, and by how much (B, views, 2) to the right and down, in units of image points. Drawn as in `lit`."""
+    size, views = images.shape[-2], images.shape[-1] // images.shape[-2]
+    draws = [np.random.default_rng((step, index, 1)) for index in indices.tolist()]
+    shifts = torch.from_numpy(np.stack([r.integers(-most, most + 1, (views, 2)) for r in draws])).to(images.device)
+    line = torch.arange(size, device=images.device)
+    rows, columns = ((line - shifts[..., axis, None]).clamp(0, size - 1) for axis in (1, 0))  # (B, views, size) each
+    each = torch.arange(len(images), device=images.device)[:, None, None]
+    parts = [
+        view[each, :, rows[:, i, :, None], columns[:, i, None, :]].permute(0, 3, 1, 2)
+        for i, view in enumerate(images.split(size, -1))
+    ]
+    return torch.cat(parts, -1), shifts.float() / (size / 2 - 1)
 
 
 class Imitation:
@@ -140,9 +177,12 @@ class Imitation:
         inputs = self.training.inputs(indices, self.device)
         if self.settings.colour and inputs.images is not None:
             inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
+        if self.settings.shift and inputs.images is not None:
+            images, distances = moved(inputs.images, indices, step, self.settings.shift)
+            inputs = replace(inputs, images=images, moved=distances)
         scene = self.settings.scene_weight if self.module.cameras else 0.0
         with self.precision():
-            places = places_of(inputs.states, self.module.observation)
+            places = self.training.places[indices].to(self.device)
             if scene and step < self.settings.scene_steps:
                 loss = position_loss(self.module.encode_batch(inputs)[1], places)
                 return loss, {"position_loss": float(loss.detach())}
@@ -174,7 +214,7 @@ class Imitation:
             close.append((distance <= WITHIN).float().flatten())
             gap = np.abs(actions.values_of(guess.cpu().numpy()) - actions.values_of(tokens.cpu().numpy()))
             errors.append(gap.reshape(-1, actions.dofs))
-            offsets.append((positions - places_of(inputs.states, module.observation)).norm(dim=-1))
+            offsets.append((positions - self.held_out.places[indices].to(self.device)).norm(dim=-1))
         error = np.concatenate(errors).mean(0)
         metrics = {
             "score": -float(error.mean()),
@@ -186,6 +226,8 @@ class Imitation:
         if module.cameras:
             medians = torch.cat(offsets).median(0).values.tolist()
             names = [place.name.replace(" ", "_") for place in module.observation.places]
+            if self.settings.places == "path":
+                names = [f"waypoint_{number}" for number in range(1, len(names) + 1)]
             metrics |= {f"{name}_error_cm": 100 * e for name, e in zip(names, medians, strict=True)}
         if self.closed_loop is not None:
             metrics["closed_loop_success"] = self.closed_loop(module)

@@ -27,12 +27,12 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.demonstrations import (
-    check_camera,
     check_spaces,
     check_tasks,
     demos_for,
     name_of,
     open_demos,
+    seen_by,
     subset,
 )
 from kerv_cli.training.imitation import (
@@ -58,7 +58,7 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     `init` is identified by the hash of its weights instead of its name."""
     free = ("steps", "validate_every", "init", "stored")
     # settings that older runs lack -> the values that they ran with
-    later = {"balance": 0.0, "closed_loop": False, "colour": 0.0}
+    later = {"balance": 0.0, "closed_loop": False, "colour": 0.0, "shift": 0, "places": "state"}
     settings = {k: v for k, v in asdict(train).items() if k not in free}
     settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
     return {k: v for k, v in settings.items() if k not in later or v != later[k]}
@@ -181,7 +181,8 @@ class TargetRun(Run):
         check_spaces(self.dataset, self.spec.actions, self.spec.observation, f"the tasks' environment {self.spec.name}")
         check_tasks(self.dataset, self.tasks)
         if settings.target.observation == "vision":
-            check_camera(self.dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
+            shown = "the policy would be shown"
+            self.dataset = seen_by(self.dataset, camera, shown, "set world.camera.name, or record again")
         # {"init": hash of its weights}; empty for a fresh run
         self.init_hash = {"init": read_target(self.init).sha256} if self.init else {}
         self.check_folder(self.kind, "name")
@@ -233,7 +234,7 @@ class TargetRun(Run):
             init, description = load_target(self.init)
             check_spaces(self.dataset, description.actions, description.observation, f"the target in {self.init}")
         words = init.words if init else vocabulary(self.dataset.manifest.environment)
-        samples = load_samples(self.dataset, settings.target, words, self.tasks, progress)
+        samples = load_samples(self.dataset, settings.target, words, self.tasks, progress, settings.train.places)
         if init is None:
             target = new_target(settings.target, self.dataset, samples, words, camera, settings.train.seed)
         else:
@@ -244,9 +245,10 @@ class TargetRun(Run):
         self.borders = task_borders(self.learnt.training.tasks, settings.train.balance)
 
     def identity(self) -> dict[str, Any]:
-        """Shapes, tasks and the weights to begin with."""
+        """Shapes, tasks, the views if more were recorded, and the weights to begin with."""
         shapes = {k: v for k, v in asdict(self.settings.target).items() if (k, v) != ("norm", "group")}  # as before it
-        return {"target": shapes, "tasks": self.tasks, **self.init_hash}
+        views = {"views": self.dataset.views} if self.dataset.views else {}
+        return {"target": shapes, "tasks": self.tasks, **views, **self.init_hash}
 
     def closed_loop(self, target: CompactTarget) -> float:
         """Success in [0, 1] of autoregressive decoding over the tasks, on selection seeds."""
@@ -292,8 +294,9 @@ class DrafterRun(Run):
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
-        if settings.train.colour:
-            raise UsageError(f"train.colour={settings.train.colour}: only 'kerv train target' changes the light")
+        for key in ("colour", "shift", "places"):
+            if (value := getattr(settings.train, key)) != getattr(TrainSettings, key):
+                raise UsageError(f"train.{key}={value}: only 'kerv train target' has this setting")
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)

@@ -1,8 +1,7 @@
 """Frames -> vision tokens and image points.
 
 A small convolutional stem. Two things leave it: a coarse grid of tokens for the trunk, and K image points by spatial
-soft-argmax (Finn et al. 2016) on the finest map, because success depends on the position of markers of 4 pixels. Images
-are not shifted for augmentation: positions in the image carry that information.
+soft-argmax (Finn et al. 2016) on the finest map, because success depends on the position of markers of 4 pixels.
 """
 
 from __future__ import annotations

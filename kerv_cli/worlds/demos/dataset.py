@@ -14,6 +14,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
 from kerv_cli.worlds.demos.episode_file import DemoEpisode, load_episode
+from kerv_cli.worlds.demos.frames import EncodedFrames
 from kerv_cli.worlds.recorded import register_recorded
 
 OnProgress = Callable[[int, int], object]
@@ -131,11 +132,13 @@ class DemoDataset:
         path: the dataset's folder.
         manifest: what was recorded.
         episodes: one entry per episode, by task in the recording's order, then by seed.
+        views: how many of the recorded views are read, from the left; 0: all.
     """
 
     path: Path
     manifest: DemoManifest
     episodes: list[DemoEntry]
+    views: int = 0
 
     @property
     def sha256(self) -> str:
@@ -205,7 +208,11 @@ class DemoDataset:
             raise CheckpointError(
                 f"{entry.path} changed since it was recorded: move it aside and run 'kerv demos' again"
             )
-        return load_episode(entry.path, self.manifest.actions, self.manifest.observation)
+        episode = load_episode(entry.path, self.manifest.actions, self.manifest.observation)
+        frames = episode.frames
+        if not self.views or not isinstance(frames, EncodedFrames):
+            return episode
+        return replace(episode, frames=frames.left(self.views * frames.size))
 
 
 def _read_manifest(path: Path) -> DemoManifest:

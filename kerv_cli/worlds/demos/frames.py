@@ -23,7 +23,7 @@ LENGTH = struct.Struct("<Q")  # a safetensors file starts with its header's leng
 
 class EncodedFrames:
     """n frames (size, width, 3) uint8. sources: the files; sources[source[i]] holds the PNG of frame i at start[i] …
-    end[i]."""
+    end[i], which may be wider."""
 
     def __init__(
         self,
@@ -92,6 +92,10 @@ class EncodedFrames:
         at = np.asarray(chosen) if not isinstance(chosen, slice) else chosen
         return EncodedFrames(self.sources, self.source[at], self.start[at], self.end[at], self.size, self.width)
 
+    def left(self, width: int) -> EncodedFrames:
+        """The same frames without what lies right of `width` pixels: the first views of several."""
+        return EncodedFrames(self.sources, self.source, self.start, self.end, self.size, width)
+
     def pixels(self) -> NDArray[np.uint8]:
         """(n, size, width, 3), decoded on as many threads as this process may use.
 
@@ -113,7 +117,7 @@ class EncodedFrames:
                 file.seek(start)
                 data = file.read(int(self.end[i]) - start)
             with Image.open(io.BytesIO(data)) as image:
-                return np.array(image)  # a copy: torch warns of memory that may not be written to
+                return np.array(image)[:, : self.width]  # a copy: torch warns of memory that may not be written to
         except (OSError, SyntaxError, ValueError) as error:
             raise CheckpointError(f"a frame of the demonstrations in {path} is damaged: {error}") from error
 
