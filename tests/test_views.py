@@ -175,7 +175,7 @@ def test_a_view_is_added_to_a_trained_policy_without_moving_its_estimates() -> N
     cells = one.settings.grid**2
     assert torch.allclose(places, expected, atol=1e-6)  # zeros more to add, in blocks of another length on some CPUs
     assert torch.equal(ours[:, :cells], theirs[:, :cells])
-    assert torch.equal(ours[:, 2 * cells :], theirs[:, cells:])
+    assert torch.allclose(ours[:, 2 * cells :], theirs[:, cells:], atol=1e-4)
     alike = seen.with_images({HAND: np.tile(seen.images[HAND][:, :SIZE], (1, 2, 1))})
     assert torch.equal(*two.encode(alike)[:, : 2 * cells].split(cells, 1))
     # further training reaches the new encoder
