@@ -20,6 +20,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.heisd import SimilaritySkipSettings
 from kerv_cli.methods.heisd.rules import RetrievalProposer, VerifySkip
 from kerv_cli.methods.kinematics.prediction import Hold, PredictionProposer
+from kerv_cli.methods.merged.proposer import MergedProposer
 from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -75,6 +76,15 @@ def test_a_skipped_decodes_draft_is_in_the_clock() -> None:
     record = Decoder(target, Parts(prefill_draft=slow, skip=AlwaysSkip(slow))).decode(SHOWN)
     assert record.forwards == 0
     assert record.seconds >= record.phases["propose"] >= PAUSE
+
+
+def test_a_merged_draft_goes_unverified_as_its_first_chain() -> None:
+    target = MockTarget()
+    prompt = target.encode(SHOWN)
+    first, second = Near(target, prompt, bins=1), Near(target, prompt)
+    merged = MergedProposer([first, second], 40)
+    record = Decoder(target, Parts(prefill_draft=merged, skip=AlwaysSkip(merged))).decode(SHOWN)
+    assert (record.forwards, list(record.tokens)) == (0, first.drafted)
 
 
 @pytest.mark.parametrize(("slow", "phase"), [("encode", "vision"), ("forward", "prefill")])

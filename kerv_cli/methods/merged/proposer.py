@@ -11,7 +11,7 @@ import torch
 from kerv_cli.base.registry import find
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.draft import Draft
-from kerv_cli.engine.proposer import ChainProposer, Proposer
+from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.transfer import read, upload
 from kerv_cli.engine.tree import ROOT, TokenTree, merge
 from kerv_cli.methods.context import Context
@@ -20,7 +20,7 @@ from kerv_cli.methods.heisd import RetrievalProposerSettings
 from kerv_cli.methods.merged import MergedProposerSettings
 
 
-class MergedProposer(Proposer):
+class MergedProposer(ChainProposer):
     """Merges the chains of several sources into one prefix tree (docs/methods.md §5). At most `nodes` nodes: the last
     chains are dropped first.
 
@@ -64,11 +64,15 @@ class MergedProposer(Proposer):
             draft = Draft.of(tree.tokens, tree.parents)
         return draft
 
-    def _tree(self, chunk: Chunk, depth: int) -> TokenTree:
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """The sources' chains, in order; the fallback sources' too where none of the others is sure."""
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback
-        chains = [chain for source in sources for chain in source.chains(chunk, depth)]
+        return [chain for source in sources for chain in source.chains(chunk, depth)]
+
+    def _tree(self, chunk: Chunk, depth: int) -> TokenTree:
+        chains = self.chains(chunk, depth)
         tree = merge(chains)
         while len(tree) > self.nodes:
             if len(chains) == 1:
