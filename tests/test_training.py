@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.training.imitation import lit, moved, soft_labels, token_loss, vocabulary, waypoints
+from kerv_cli.training.imitation import Imitation, lit, moved, soft_labels, token_loss, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
@@ -346,6 +347,23 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 
 
 @pytest.mark.usefixtures("few_validations")
+def test_training_counts_subnormal_numbers_as_zero_and_nothing_later_does(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halves, loss = [], Imitation.loss
+
+    def watched(*given: Any) -> tuple[torch.Tensor, Metrics]:
+        halves.append(float(torch.tensor(1e-39) * 0.5))
+        return loss(*given)
+
+    monkeypatch.setattr(Imitation, "loss", watched)
+    words = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=2", "train.validate_every=2"]
+    result = CliRunner().invoke(app, ["train", "target", "name=flushed", *words, "demos=few", f"results={results}"])
+    assert result.exit_code == 0, result.output
+    assert halves == [0.0, 0.0]
+    assert float(torch.tensor(1e-39) * 0.5) > 0
+
+
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
     settings = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=4", "train.scene_steps=1"]
     settings += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4"]

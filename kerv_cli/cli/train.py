@@ -60,7 +60,9 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
 def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading: str, training: str) -> None:
     if plan:
         print_plan(run.plan(), as_json)
-    with progress_bar(loading) as advance:
+    from kerv_cli.training.loop import without_subnormals
+
+    with without_subnormals(), progress_bar(loading) as advance:
         run.load(advance)
     started = False
     settings = run.settings
@@ -76,6 +78,7 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
     tracker = settings.log if run.ranks.first else "none"
     name = f"{run.kind}/{run.folder.name}"
     with (
+        without_subnormals(),
         _live(tracker, name, run.folder, settings.train.steps, as_plain(settings)) as log,
         progress_bar(training) as advance,
     ):

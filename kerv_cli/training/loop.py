@@ -10,7 +10,8 @@ import hashlib
 import json
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
@@ -275,6 +276,18 @@ def digest(tensors: Mapping[str, Tensor], text: str) -> str:
         hasher.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         hasher.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return hasher.hexdigest()
+
+
+@contextmanager
+def without_subnormals() -> Iterator[None]:
+    """Numbers below 1e-38 count as zero within, where the CPU can do so: in this thread, and in those that it starts
+    meanwhile. The soft-argmax of image points leaves many in the backward pass once its maps are sharp, and some CPUs
+    take a hundred times as long for each."""
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
 
 
 def schedule(step: int, settings: TrainSettings) -> float:
