@@ -29,6 +29,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, moved, soft_labels, token_loss, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
@@ -362,6 +363,17 @@ def test_training_counts_subnormal_numbers_as_zero_and_nothing_later_does(
     assert result.exit_code == 0, result.output
     assert halves == [0.0, 0.0]
     assert float(torch.tensor(1e-39) * 0.5) > 0
+
+
+@pytest.mark.parametrize("multiplies", [True, False])
+def test_bfloat16_is_for_devices_that_multiply_it(multiplies: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imitation, "multiplies_bfloat16", lambda: multiplies)
+    lesson = object.__new__(Imitation)
+    lesson.device = torch.device("cpu")
+    for asked in (True, False):
+        lesson.settings = replace(TINY, bf16=asked)
+        with lesson.precision():
+            assert torch.is_autocast_enabled("cpu") == (asked and multiplies)
 
 
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:

@@ -23,6 +23,7 @@ from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
+from kerv_cli.targets.compact.packed_bfloat16 import multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Metrics
@@ -164,11 +165,14 @@ class Imitation:
 
     @contextlib.contextmanager
     def precision(self) -> Iterator[None]:
-        """bfloat16 autocast where the settings ask for it. On a CPU attention is then computed by its formula: the
-        backward pass of the fused kernel takes four times as long there."""
-        fused = self.device.type != "cpu" or not self.settings.bf16
+        """bfloat16 autocast where the settings ask for it and the device multiplies it: another CPU is several times
+        slower with it. On one that does attention is computed by its formula: the backward pass of the fused kernel
+        takes four times as long there."""
+        gpu = self.device.type != "cpu"
+        bf16 = self.settings.bf16 and (gpu or multiplies_bfloat16())
+        fused = gpu or not bf16
         kernels = [SDPBackend.MATH] + [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION] * fused
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bf16), sdpa_kernel(kernels):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16), sdpa_kernel(kernels):
             yield
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
