@@ -11,6 +11,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import ViewSettings
 from kerv_cli.cli.command import command
+from kerv_cli.cli.runs import run_ids
 
 Together = Annotated[bool, typer.Option("--together", help="Show two recordings of one seed side by side.")]
 Web = Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser here, until Ctrl-C.")]
@@ -22,8 +23,9 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
     "view",
     ViewSettings,
     keys="results",
-    examples=("kerv view --web", "kerv view --to episode.gif NAME.rrd"),
-    names="NAME: recordings (.rrd) or folders of them, and results=DIR.",
+    examples=("kerv view last", "kerv view --to episode.gif NAME.rrd"),
+    names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
+    completes=run_ids,
     writes=False,
 )
 def view(
@@ -37,7 +39,7 @@ def view(
     """Open recordings in the Rerun viewer; without a display, name the command that serves them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording, read_summary, serve_web
 
-    paths = [Path(name) for name in names] or [Path(settings.results)]
+    paths = [_place(settings.results, name) for name in names] or [Path(settings.results)]
     if together:
         from kerv_cli.report.viewing.together import save_together
 
@@ -59,3 +61,17 @@ def view(
         serve_web(recordings, typer.echo)
         return
     typer.echo(open_recording(recordings))
+
+
+def _place(results: str, name: str) -> Path:
+    """A path as it stands; a name that is none: the folder of the run.
+
+    Raises:
+        UsageError: no such run.
+    """
+    path = Path(name).expanduser()
+    if path.exists() or path.suffix == ".rrd" or len(path.parts) > 1:
+        return path
+    from kerv_cli.lab.catalogue import find_run
+
+    return find_run(results, name).folder
