@@ -64,7 +64,7 @@ def view(
 
 
 def _place(results: str, name: str) -> Path:
-    """A path as it stands; a name that is none: the folder of the run.
+    """A path as it stands; a name that is none: the folder of the run; `last`: of the newest that has episodes.
 
     Raises:
         UsageError: no such run.
@@ -72,6 +72,8 @@ def _place(results: str, name: str) -> Path:
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd" or len(path.parts) > 1:
         return path
-    from kerv_cli.lab.catalogue import find_run
+    from kerv_cli.lab.catalogue import LAST, find_run, find_runs
 
+    if name == LAST:
+        return next((run.folder for run in find_runs(results) if run.has_episodes), Path(results))
     return find_run(results, name).folder
