@@ -365,15 +365,15 @@ def test_training_counts_subnormal_numbers_as_zero_and_nothing_later_does(
     assert float(torch.tensor(1e-39) * 0.5) > 0
 
 
-@pytest.mark.parametrize("multiplies", [True, False])
-def test_bfloat16_is_for_devices_that_multiply_it(multiplies: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imitation, "multiplies_bfloat16", lambda: multiplies)
+@pytest.mark.parametrize("tiles", [True, False])
+def test_bfloat16_is_for_cpus_with_tiles(tiles: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imitation, "has_tiles", lambda: tiles)
     lesson = object.__new__(Imitation)
     lesson.device = torch.device("cpu")
     for asked in (True, False):
         lesson.settings = replace(TINY, bf16=asked)
         with lesson.precision():
-            assert torch.is_autocast_enabled("cpu") == (asked and multiplies)
+            assert torch.is_autocast_enabled("cpu") == (asked and tiles)
 
 
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:

@@ -350,7 +350,7 @@ class TrainSettings:
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
     closed_loop: int = number(0, 0, 100_000, help="episodes per task and validation, closed loop")
     seed: int = number(0, 0, 2**31 - 1, help="of initial weights and order of samples")
-    bf16: bool = setting(True, "training forward in bfloat16, where the device multiplies it")
+    bf16: bool = setting(True, "training forward in bfloat16, on a GPU or a CPU with AMX")
     stored: str = choice(
         "float32", "float32", "float16", "int8", help="weights on disk: for shipping, a half or a quarter"
     )

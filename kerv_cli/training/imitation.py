@@ -23,7 +23,7 @@ from kerv_cli.base.settings import TargetSettings, TrainSettings
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.features import places_of
-from kerv_cli.targets.compact.packed_bfloat16 import multiplies_bfloat16
+from kerv_cli.targets.compact.packed_bfloat16 import has_tiles
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.training.loop import Metrics
@@ -165,11 +165,11 @@ class Imitation:
 
     @contextlib.contextmanager
     def precision(self) -> Iterator[None]:
-        """bfloat16 autocast where the settings ask for it and the device multiplies it: another CPU is several times
-        slower with it. On one that does attention is computed by its formula: the backward pass of the fused kernel
-        takes four times as long there."""
+        """bfloat16 autocast where the settings ask for it, on a GPU or a CPU with AMX: another CPU is slower with it,
+        by a third with AVX512-BF16, several times without. With AMX attention is computed by its formula: the backward
+        pass of the fused kernel takes four times as long there."""
         gpu = self.device.type != "cpu"
-        bf16 = self.settings.bf16 and (gpu or multiplies_bfloat16())
+        bf16 = self.settings.bf16 and (gpu or has_tiles())
         fused = gpu or not bf16
         kernels = [SDPBackend.MATH] + [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION] * fused
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16), sdpa_kernel(kernels):

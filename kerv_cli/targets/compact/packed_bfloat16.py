@@ -26,7 +26,12 @@ ROWS = 32  # for which the layout is chosen; measured, 154 M weights: one row 27
 def multiplies_bfloat16() -> bool:
     """Whether this CPU has products of bfloat16, and this build of torch the layouts for them."""
     supported = torch.ops.mkldnn._is_mkldnn_bf16_supported() if has_blocked_layouts() else False
-    return bool(supported) and (torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+    return bool(supported) and (has_tiles() or torch.cpu._is_avx512_bf16_supported())
+
+
+def has_tiles() -> bool:
+    """Whether this CPU multiplies tiles of bfloat16 (AMX)."""
+    return bool(torch.cpu._is_amx_tile_supported())
 
 
 class BlockedLinear:
