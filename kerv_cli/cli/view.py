@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import check_writable, results_dir
 from kerv_cli.base.settings import ViewSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.runs import run_ids
 
 Together = Annotated[bool, typer.Option("--together", help="Show two recordings of one seed side by side.")]
 Web = Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser here, until Ctrl-C.")]
 To = Annotated[Path | None, typer.Option("--to", help="Write a film of one recording: FILE.mp4 or FILE.gif.")]
 Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording holds instead.")]
+
+
+def _ids() -> list[str]:
+    """Of the sweeps and rollouts in ./results."""
+    from kerv_cli.lab.catalogue import find_runs
+
+    return [run.id for run in find_runs("results") if run.has_episodes]
 
 
 @command(
@@ -25,7 +32,7 @@ Summary = Annotated[bool, typer.Option("--summary", help="Print what a recording
     keys="results",
     examples=("kerv view last", "kerv view --to episode.gif NAME.rrd"),
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
-    completes=run_ids,
+    completes=_ids,
     writes=False,
 )
 def view(
@@ -44,6 +51,7 @@ def view(
         from kerv_cli.report.viewing.together import save_together
 
         check_writable(settings.results)
+        paths = [_only(find_recordings([path]), f"--together: {path}") for path in paths]
         paths = [save_together(paths, results_dir(settings.results) / "together")]
     recordings = find_recordings(paths)
     if summary:
@@ -53,9 +61,7 @@ def view(
     if to is not None:
         from kerv_cli.report.viewing.film import save_film
 
-        if len(recordings) > 1 and names:
-            raise UsageError(f"--to {to} is a film of one recording, there are {len(recordings)}: name one")
-        typer.echo(str(save_film(recordings[0], to)))
+        typer.echo(str(save_film(_only(recordings, f"--to {to}") if names else recordings[0], to)))
         return
     if web:
         serve_web(recordings, typer.echo)
@@ -63,17 +69,30 @@ def view(
     typer.echo(open_recording(recordings))
 
 
+def _only(recordings: Sequence[Path], what: str) -> Path:
+    """The one recording. Raises UsageError: there are several. what: for the message."""
+    if len(recordings) > 1:
+        raise UsageError(f"{what}: one recording is needed, of {len(recordings)} name one, e.g. {recordings[0]}")
+    return recordings[0]
+
+
 def _place(results: str, name: str) -> Path:
-    """A path as it stands; a name that is none: the folder of the run; `last`: of the newest that has episodes.
+    """A path as it stands; a name that is none: the folder of the run; `last`: of the newest that has recordings.
 
     Raises:
         UsageError: no such run.
     """
     path = Path(name).expanduser()
-    if path.exists() or path.suffix == ".rrd" or len(path.parts) > 1:
+    if path.exists() or path.suffix == ".rrd":
         return path
     from kerv_cli.lab.catalogue import LAST, find_run, find_runs
 
     if name == LAST:
-        return next((run.folder for run in find_runs(results) if run.has_episodes), Path(results))
-    return find_run(results, name).folder
+        recorded = (run.folder for run in find_runs(results) if run.has_episodes and any(run.folder.rglob("*.rrd")))
+        return next(recorded, Path(results))
+    try:
+        return find_run(results, name).folder
+    except UnknownName:
+        if len(path.parts) > 1:
+            return path
+        raise
