@@ -28,11 +28,12 @@ from kerv_cli.engine.batched import greedy
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.training import imitation
 from kerv_cli.training.imitation import Imitation, lit, moved, soft_labels, token_loss, vocabulary, waypoints
 from kerv_cli.training.loop import Loop, Metrics, digest, read_state, schedule, write_state
 from kerv_cli.training.runs import run_settings
+from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -291,9 +292,10 @@ def test_waypoints_are_the_hands_at_the_next_change_of_the_gripper_and_at_the_en
     states = np.zeros((10, 39), np.float32)
     states[:, :3] = np.arange(10)[:, None] + np.array([0, 0.1, 0.2])
     labels = np.zeros((13, 4), np.float32)
-    labels[4:, 3] = 1.0  # closes
-    labels[8:, 3] = -1.0  # opens
-    labels[10:, 3] = 1.0  # beyond the success
+    labels[4:, 3] = 0.5  # closes
+    labels[6:, 3] = 0.6  # holds
+    labels[8:, 3] = 1.0  # closes further
+    labels[10:, 3] = -1.0  # beyond the success
     frames, steps = np.zeros((10, 8, 8, 3), np.uint8), np.arange(10)
     episode = DemoEpisode("reach-v3", 0, False, 10, frames, steps, states, labels, labels[:10], np.zeros(3))
     two = waypoints(episode, np.array([0, 3, 4, 7, 8, 9]), 2, ACTIONS)
@@ -348,7 +350,7 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 
 
 @pytest.mark.usefixtures("few_validations")
-def test_training_counts_subnormal_numbers_as_zero_and_nothing_later_does(
+def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later(
     results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     halves, loss = [], Imitation.loss
@@ -376,6 +378,36 @@ def test_bfloat16_is_for_cpus_with_tiles(tiles: bool, monkeypatch: pytest.Monkey
             assert torch.is_autocast_enabled("cpu") == (asked and tiles)
 
 
+def test_a_run_learns_the_experts_own_path_from_moved_views(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learnt, distances, loss = [], [], imitation.position_loss
+
+    def watched(estimated: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+        learnt.append(places)
+        return loss(estimated, places)
+
+    def encoded(module: CompactTarget, inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
+        if inputs.moved is not None:
+            distances.append(inputs.moved)
+        return encode(module, inputs)
+
+    encode = CompactTarget.encode_batch
+    monkeypatch.setattr(imitation, "position_loss", watched)
+    monkeypatch.setattr(CompactTarget, "encode_batch", encoded)
+    words = ["target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3", "train.shift=2"]
+    out = train(results, "target", "name=path", *words, "train.validate_every=3")
+    assert "waypoint_1_error_cm" in out
+    assert "object_error_cm" not in out
+    assert len(learnt) == len(distances) == 3
+    ends = [DemoDataset.open(results / "artifacts/demos/few").load(i) for i in range(6)]
+    hands = torch.stack([torch.from_numpy(one.end_effector[one.steps - 1]).float() for one in ends])
+    for places in torch.cat(learnt):  # the gripper of this expert never changes: both are the end
+        assert (hands == places[0]).all(-1).any()
+        assert torch.equal(places[0], places[1])
+    out = train(results, "target", "name=none", *words, "train.validate_every=3", "train.scene_weight=0")
+    assert "waypoint" not in out
+
+
+@pytest.mark.usefixtures("few_validations")
 def test_vision_target_and_its_drafter_train_from_the_command_line(results: Path) -> None:
     settings = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=4", "train.scene_steps=1"]
     settings += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4"]

@@ -151,9 +151,12 @@ def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
             TargetRun(settings(results, "name=old", same))
     with pytest.raises(UsageError, match=r"train\.init=old: only 'kerv train target'"):
         runs.drafter_run(compose("train_drafter", ["train.init=old"], TrainDrafterSettings))
-    for word in ("colour=0.3", "shift=4", "places=path"):
-        with pytest.raises(UsageError, match=rf"train\.{word}: only 'kerv train target' has this setting"):
+    for word in ("colour=0.3", "shift=4", "places=path", "balance=0.5", "closed_loop=2"):
+        with pytest.raises(UsageError, match=rf"train\.{word}: only the training of a target has this setting"):
             runs.drafter_run(compose("train_drafter", [f"train.{word}"], TrainDrafterSettings))
+    for word in ("colour=0.3", "shift=4", "places=path"):
+        with pytest.raises(UsageError, match=rf"train\.{word} is of images, target\.observation=state has none"):
+            TargetRun(settings(results, "target.observation=state", f"train.{word}"))
 
 
 def test_the_plan_names_it(results: Path) -> None:

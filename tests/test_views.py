@@ -242,10 +242,6 @@ def test_from_recording_to_rollout_and_export(tmp_path: Path) -> None:
     assert described["cameras"] == [HAND]
     run("train", "drafter", "drafter=early", "policy.target=seen", "demos=two", "drafter.samples=8", *steps, common[-1])
     run("rollout", "policy.target=seen", "method=ar", "episodes=1", "world.horizon=8", "record=1", *common)
-    named = run("view", "last", "--summary", common[-1])
-    assert named == run("view", str(tmp_path / "rollouts"), "--summary", common[-1])
-    nothing = CliRunner().invoke(app, ["view", "nobodys", common[-1]])
-    assert (nothing.exit_code, "run 'nobodys'" in nothing.output) == (2, True)
     run("demos", "export", "format=lerobot", "demos=two", common[-1])
     features = json.loads((tmp_path / "lerobot/two/meta/info.json").read_text())["features"]
     assert [features[f"observation.images.{view}"]["shape"] for view in HAND.split("+")] == [[SIZE, SIZE, 3]] * 2
@@ -271,3 +267,7 @@ def test_from_recording_to_rollout_and_export(tmp_path: Path) -> None:
     assert lone.exit_code == 2
     assert "set world.camera.name=corner4+gripperPOV:75" in " ".join(lone.output.split())
     run(*visits, "world.horizon=20", "expert_share=0.5", *common)
+    both = ["train", "target", "name=both", "demos=two+visits", "train.places=path", *sizes, *steps, *common]
+    lost = CliRunner().invoke(app, both)
+    assert (lost.exit_code, "lie on no path of the expert's" in lost.output) == (2, True)
+    run(*both, "train.scene_weight=0")

@@ -80,10 +80,10 @@ def load_samples(
 def waypoints(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
     """(n, K, 3) float32 for K = `count`: where the hand is when strict DoFs (a gripper) next change, K − 1 times behind
     each of `steps` (n,), and at the episode's end, metres. Positions that a demonstration itself shows, without a
-    simulator's state. A change: the expert's command crosses the middle of its range; one that does not come is the
-    end."""
-    strict = episode.labels[: episode.steps, actions.is_strict] > actions.middle[actions.is_strict]
-    changes = np.flatnonzero((strict[1:] != strict[:-1]).any(-1)) + 1
+    simulator's state. A change: the expert's command moves by more than an eighth of its range in one control step; one
+    that does not come is the end."""
+    commands = episode.labels[: episode.steps, actions.is_strict]
+    changes = np.flatnonzero((abs(np.diff(commands, axis=0)) > actions.half[actions.is_strict] / 4).any(-1)) + 1
     last = episode.steps - 1
     times = np.append(changes, [last] * count)
     first = np.searchsorted(changes, steps, side="right")
@@ -227,7 +227,7 @@ class Imitation:
             "action_l1": float(error.mean()),
             **{f"l1_{name}": float(e) for name, e in zip(actions.names, error, strict=True)},
         }
-        if module.cameras:
+        if module.cameras and self.settings.scene_weight:
             medians = torch.cat(offsets).median(0).values.tolist()
             names = [place.name.replace(" ", "_") for place in module.observation.places]
             if self.settings.places == "path":

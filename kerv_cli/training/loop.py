@@ -280,9 +280,9 @@ def digest(tensors: Mapping[str, Tensor], text: str) -> str:
 
 @contextmanager
 def without_subnormals() -> Iterator[None]:
-    """Numbers below 1e-38 count as zero within, where the CPU can do so: in this thread, and in those that it starts
-    meanwhile. The soft-argmax of image points leaves many in the backward pass once its maps are sharp, and some CPUs
-    take a hundred times as long for each."""
+    """Numbers below 1e-38 count as zero within, where the CPU can do so: in this thread, and for good in those that it
+    starts meanwhile. The soft-argmax of image points leaves many in the backward pass once its maps are sharp, and some
+    CPUs take a hundred times as long for each."""
     torch.set_flush_denormal(True)
     try:
         yield

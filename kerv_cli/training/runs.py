@@ -168,6 +168,7 @@ class TargetRun(Run):
         self.dataset = open_demos(settings.results, settings.demos, settings.task)
         settings.task = settings.task or list(self.dataset.manifest.tasks)
         self.tasks = resolve_tasks(settings.task)
+        self.check_places()
         self.spec = spec_of(self.tasks[0])
         self.world = settled(settings.world, self.spec)
         if settings.target.image_size != settings.world.camera.size:
@@ -186,6 +187,26 @@ class TargetRun(Run):
         # {"init": hash of its weights}; empty for a fresh run
         self.init_hash = {"init": read_target(self.init).sha256} if self.init else {}
         self.check_folder(self.kind, "name")
+
+    def check_places(self) -> None:
+        """Refuses what the position loss cannot learn from, and settings of images for a policy that sees none.
+
+        Raises:
+            UsageError: the first of them.
+        """
+        train, manifest = self.settings.train, self.dataset.manifest
+        if not manifest.observation.places:
+            raise UsageError(f"the demonstrations in {self.dataset.path} name no place, as a compact policy needs")
+        if self.settings.target.observation == "state":
+            for key in ("colour", "shift", "places"):
+                if (value := getattr(train, key)) != getattr(TrainSettings, key):
+                    raise UsageError(f"train.{key}={value} is of images, target.observation=state has none")
+        recordings = [manifest.config, *manifest.config.get("joined", ())]
+        if train.places == "path" and train.scene_weight and any(one.get("policy") for one in recordings):
+            raise UsageError(
+                "train.places=path: states that a policy visited lie on no path of the expert's: leave them out of "
+                "demos=, or set train.places=state or train.scene_weight=0"
+            )
 
     def find_init(self) -> Path | None:
         """Folder of the target `train.init`; None for a fresh run.
@@ -294,9 +315,9 @@ class DrafterRun(Run):
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
-        for key in ("colour", "shift", "places"):
+        for key in ("balance", "closed_loop", "colour", "shift", "places"):
             if (value := getattr(settings.train, key)) != getattr(TrainSettings, key):
-                raise UsageError(f"train.{key}={value}: only 'kerv train target' has this setting")
+                raise UsageError(f"train.{key}={value}: only the training of a target has this setting")
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)
