@@ -52,6 +52,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+def test_every_target_of_a_study_is_shipped_or_made_by_a_documented_command() -> None:
+    studies = "\n".join(path.read_text() for path in (ROOT / "conf/study").glob("*.yaml"))
+    shipped = {path.parent.name for path in (ROOT / "results/pretrained").glob("*/target")}
+    made = set(re.findall(r"\bname=(\S+)", "\n".join(commands())))
+    docs = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    for name in set(re.findall(r"policy\.target=([\w-]+)", studies)) - shipped - made:
+        assert f"`{name}`" in docs or f"artifacts/target/{name}" in docs, name
+
+
 def test_the_pages_show_commands() -> None:
     assert len(commands()) > 40
 
