@@ -167,15 +167,28 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Writes `value` as indented JSON, atomically; refuses NaN and infinity, which JSON lacks.
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file, atomically.
 
     Raises:
-        StorageError: the disk is full or read-only, or the folder may not be written to. ValueError: NaN or infinity.
+        StorageError: the disk is full or read-only, or the folder may not be written to.
     """
-    text = json.dumps(value, indent=2, allow_nan=False)
     with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_bytes(content)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes text in UTF-8, as `write_bytes`."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as indented JSON, as `write_bytes`; refuses NaN and infinity, which JSON lacks.
+
+    Raises:
+        ValueError: NaN or infinity.
+    """
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def regular(path: Path, most: int = MOST_BYTES) -> Path:

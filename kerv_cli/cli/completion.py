@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_text
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.cli.command import command
 
@@ -76,8 +76,7 @@ def completion(names: list[str], install: Install = False) -> None:
         typer.echo(script(shell))
         return
     path = script_path(shell)
-    with atomic_path(path) as temporary:
-        temporary.write_text(script(shell) + "\n", encoding="utf-8")
+    write_text(path, script(shell) + "\n")
     typer.echo(f"{path}: a new {shell} completes kerv")
     if shell == "zsh":
         typer.echo("if it does not, ~/.zshrc needs this line: fpath+=~/.zfunc; autoload -Uz compinit && compinit")

@@ -31,7 +31,6 @@ import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import (
-    atomic_path,
     read_json,
     read_mapping,
     read_text,
@@ -43,6 +42,7 @@ from kerv_cli.base.files import (
     visible,
     write_folder,
     write_json,
+    write_text,
 )
 from kerv_cli.base.leftovers import clean
 from kerv_cli.base.limits import check_name
@@ -147,8 +147,7 @@ class StudyStore:
         with write_lock(self.plan_path):
             with contextlib.suppress(UsageError, CheckpointError):  # none yet, or damaged: replaced
                 new = merge_plans(self.read_plan(), new)
-            with atomic_path(self.plan_path) as temporary:
-                temporary.write_text(plan_text(new), encoding="utf-8")
+            write_text(self.plan_path, plan_text(new))
 
     def begin(self, study: StudySettings, cells: Sequence[Cell], arguments: Sequence[str]) -> None:
         """Writes the plan and notes the command. The folder of a new run appears with both in it.
@@ -412,8 +411,7 @@ class StudyStore:
 
     def write_failure(self, name: str, text: str) -> None:
         """Stores the traceback of a cell that failed."""
-        with atomic_path(self.failures / f"{name}.txt") as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(self.failures / f"{name}.txt", text)
 
     def clear_failure(self, name: str) -> None:
         """Removes the traceback of an earlier attempt that failed."""

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import MOST_TEXT, atomic_path, regular
+from kerv_cli.base.files import MOST_TEXT, regular, write_bytes
 from kerv_cli.report.drawing import COLOURS, MUTED, STYLE, entitle, figure_bytes, new_figure
 
 _COLUMNS = 3  # panels beside one another
@@ -77,7 +77,5 @@ def save_curves(folder: Path, losses: Sequence[float]) -> Path:
     figure = (
         loss_figure(losses, title) if any(map(math.isfinite, losses)) and len(log) < _FEW else curves_figure(log, title)
     )
-    content = figure_bytes(figure, "png")
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, figure_bytes(figure, "png"))
     return path

@@ -21,7 +21,7 @@ from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_bytes
 from kerv_cli.base.registry import parts
 from kerv_cli.report.measures import Row
 
@@ -178,8 +178,7 @@ def save_plot(figure: Figure, folder: Path, name: str) -> Plot:
         del contents["svg"]
         (folder / f"{name}.svg").unlink(missing_ok=True)
     for kind, content in contents.items():
-        with atomic_path(folder / f"{name}.{kind}") as temporary:
-            temporary.write_bytes(content)
+        write_bytes(folder / f"{name}.{kind}", content)
     files = tuple(folder / f"{name}.{kind}" for kind in contents)
     return Plot(files, _inline(contents["svg"].decode(), f"{name}-") if small else _embedded(contents["png"]))
 

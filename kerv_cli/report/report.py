@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_text
 from kerv_cli.lab.store import StudyStore, begun_studies
 from kerv_cli.report.drawing import save_plot
 from kerv_cli.report.latency import latency_summary, latency_table
@@ -97,10 +97,8 @@ def write_study(
     plots = [files.add_plot(figure, f"{store.name}{suffix}") for suffix, figure in figures.items()]
     sections = [_machines_section(priced, files), _latency_section(data, files), _stress_section(data, files)]
     page = store.root / "report.html"
-    with atomic_path(page) as temporary:
-        present = [section for section in sections if section is not None]
-        text = render(store, data, plots, present, files.paths, priced, loss)
-        temporary.write_text(text, encoding="utf-8")
+    present = [section for section in sections if section is not None]
+    write_text(page, render(store, data, plots, present, files.paths, priced, loss))
     return [*files.paths, page]
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_text
 from kerv_cli.base.limits import is_formula
 from kerv_cli.base.provenance import PACKAGES
 from kerv_cli.base.settings import MODEL
@@ -266,8 +266,7 @@ def write_csv(table: pd.DataFrame, path: Path) -> Path:
     Raises:
         StorageError: the disk refused.
     """
-    with atomic_path(path) as temporary:
-        temporary.write_text(csv_text(table), encoding="utf-8")
+    write_text(path, csv_text(table))
     return path
 
 

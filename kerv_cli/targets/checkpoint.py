@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import atomic_path, read_json, regular, sha256_of, write_json
+from kerv_cli.base.files import read_json, regular, sha256_of, write_bytes, write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -112,9 +112,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
     """Writes a safetensors file atomically. Raises StorageError: writing failed."""
     from safetensors.torch import save
 
-    payload = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(payload)
+    write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 
 def load_tensors(path: Path, what: str) -> dict[str, Tensor]:

@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
-from kerv_cli.base.files import atomic_path, regular
+from kerv_cli.base.files import regular, write_text
 from kerv_cli.base.manifests import read
 from kerv_cli.base.places import RESUME
 from kerv_cli.base.settings import TrainSettings
@@ -197,8 +197,7 @@ class Loop:
 
         if not self.history:
             return
-        with atomic_path(self.folder / "log.csv") as temporary:
-            pd.DataFrame(self.history).to_csv(temporary, index=False, float_format="%.6g")
+        write_text(self.folder / "log.csv", pd.DataFrame(self.history).to_csv(index=False, float_format="%.6g"))
 
     def restore(self) -> None:
         """Continues from the folder's resume file, if there is one.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_bytes
 from kerv_cli.engine.record import EpisodeRecord
 
 
@@ -23,7 +23,5 @@ def save_recording(record: EpisodeRecord, path: Path, method: str, limits: Mappi
     """
     from kerv_cli.report.viewing.rerun_log import encode
 
-    content = encode(record, method, limits)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, encode(record, method, limits))
     return path

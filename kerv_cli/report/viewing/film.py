@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_bytes
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES
 from kerv_cli.report.viewing.viewer import chunks_of
 
@@ -44,8 +44,7 @@ def save_film(recording: Path, path: Path) -> Path:
     stride = max(1, round(1 / (RATE * seconds)))
     pictures = [_picture(frame, step, tracks) for step, _, frame in camera[::stride]]
     encode = _gif if path.suffix == ".gif" else _mp4
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encode(pictures, stride * seconds))
+    write_bytes(path, encode(pictures, stride * seconds))
     return path
 
 

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import atomic_path
+from kerv_cli.base.files import write_bytes
 from kerv_cli.report.viewing.blueprint import paused
 from kerv_cli.report.viewing.viewer import chunks_of, read_recording
 
@@ -35,8 +35,7 @@ def save_together(paths: Sequence[Path], folder: Path) -> Path:
     out = folder / f"{paths[0].stem}+{paths[1].stem}.rrd"
     with catch_and_log_exceptions(strict=True):
         data = _encode(paths, contents)
-    with atomic_path(out) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(out, data)
     return out
 
 

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import atomic_path, regular
+from kerv_cli.base.files import regular, write_bytes
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds.demos.frames import LENGTH, EncodedFrames, encode_png, header_of
 
@@ -83,9 +83,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
     if width != height:  # square frames need no width, so that their files keep their bytes
         metadata["frame_width"] = str(width)
     # save_file would hide a full disk behind an error type of its own.
-    data = _with_sorted_metadata(save(tensors, metadata=metadata))
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, _with_sorted_metadata(save(tensors, metadata=metadata)))
 
 
 def _with_sorted_metadata(data: bytes) -> bytes:
