@@ -20,7 +20,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
-from kerv_cli.targets.openvla.config import Language
+from kerv_cli.targets.openvla.config import CONFIG, Language
 from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, conversion, open_shards, sizes_of
 from kerv_cli.targets.openvla.trunk import LlamaLayer, run_layers
 
@@ -124,15 +124,13 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
         CheckpointError: an incomplete, damaged or pickled folder, or a drafter of another width than the target's.
         UnknownName: no such convention.
     """
-    value = read_json(folder / "config.json")
-    pickled = folder / "pytorch_model.bin"
+    config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
+    language = read(Language, read_json(config), str(config), tolerant=True)
     if not (folder / SINGLE).is_file() and pickled.is_file():
         raise CheckpointError(
             f"{pickled} is pickled and can run code when it is opened: convert it where you trust it: "
             f"{conversion(str(pickled), str(folder / SINGLE))}"
         )
-    fields = {name: value[name] for name in Language.__dataclass_fields__ if name in value}
-    language = read(Language, fields, str(folder / "config.json"))
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")
     shards = open_shards(folder)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -150,8 +150,7 @@ def read_shape(folder: Path) -> Shape:
         raise CheckpointError(f"{path} has no text_config of a Llama: other language models are not supported")
     if text.get("rope_scaling"):
         raise CheckpointError(f"{path} asks for rope_scaling, which OpenVLA does not have: it cannot be loaded")
-    names = {f.name for f in fields(Language)}
-    language = read(Language, {k: v for k, v in text.items() if k in names}, f"{path}, text_config")
+    language = read(Language, text, f"{path}, text_config", tolerant=True)
     towers = _towers(value, path)
     numbers = {"padding": value.get("pad_to_multiple_of", 64), "bins": value.get("n_action_bins", 256)}
     plain = {"towers": [asdict(t) for t in towers], "language": asdict(language), **numbers}

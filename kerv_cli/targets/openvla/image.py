@@ -62,10 +62,9 @@ def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
         if means is None or stds is None:
             return DEFAULTS
         towers = [{"mean": mean, "std": std} for mean, std in zip(means, stds, strict=False)]
-    plain = [{k: v for k, v in one.items() if k in ("mean", "std")} for one in towers]
-    if len(plain) != 2:
-        raise CheckpointError(f"{path} normalises for {len(plain)} vision towers, OpenVLA has two")
-    first, second = (read(Normalisation, one, f"{path}, tvf_normalize_params") for one in plain)
+    if len(towers) != 2:
+        raise CheckpointError(f"{path} normalises for {len(towers)} vision towers, OpenVLA has two")
+    first, second = (read(Normalisation, one, f"{path}, tvf_normalize_params", tolerant=True) for one in towers)
     return first, second
 
 

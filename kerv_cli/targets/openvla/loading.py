@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import read_json, regular, sha256_of
-from kerv_cli.targets.openvla.config import Shape
+from kerv_cli.targets.openvla.config import CONFIG, Shape
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
 from kerv_cli.targets.openvla.vision import Block, PoolingHead, Projector, VisionBackbone
 
@@ -127,7 +127,7 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
     kinds = {"missing": missing, "unknown": extra, "of another shape": misshapen}
     wrong = [f"{len(names)} {kind}: {_listed(names)}" for kind, names in kinds.items() if names]
     if wrong:
-        raise CheckpointError(f"the weights in {where} are not those of its {'config.json'}: {'; '.join(wrong)}")
+        raise CheckpointError(f"the weights in {where} are not those of its {CONFIG}: {'; '.join(wrong)}")
 
 
 def _text(sizes: Sizes) -> str:
