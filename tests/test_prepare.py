@@ -136,6 +136,8 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results: 
     kerv(*train, *fast)
     assert "1 tasks" in kerv(*rollout)
     assert "4000 steps of 64, about 3 min (a guess)" in kerv("train", "drafter", MINE, "policy.drafter=b", "--plan")
+    few = kerv("train", "drafter", MINE, "policy.drafter=b", "train.steps=400", "--plan")
+    assert "400 steps of 64, about 20 s (a guess)" in few
 
 
 @pytest.mark.usefixtures("results")

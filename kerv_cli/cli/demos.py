@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kerv_cli.base.durations import about
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.places import artifact, results_dir
 from kerv_cli.base.settings import (
@@ -51,8 +52,8 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     )
     if plan:
         steps = spec_of(tasks[0]).horizon / 6 * settings.episodes * len(tasks)  # experts are about that quick
-        minutes = steps * (0.7 + 10 / settings.frame_stride) / 60_000 / settings.runtime.workers
-        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, about {minutes:.0f} min (a guess)")
+        seconds = steps * (0.7 + 10 / settings.frame_stride) / 1000 / settings.runtime.workers
+        print_plan(f"{len(tasks)} tasks x {settings.episodes} episodes -> {folder}, {about(seconds)}")
     try:
         with progress_bar("demonstrations") as advance:
             manifest = record(config, folder, advance, actor)

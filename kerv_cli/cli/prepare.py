@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import typer
 
+from kerv_cli.base.durations import about, duration
 from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
 from kerv_cli.base.settings import PrepareSettings
@@ -47,8 +48,8 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
         return shlex.join([*step.command, *shared])
 
     steps, name = planned(settings), settings.policy.target
-    rows = [(s.kind, s.state, _minutes(s.seconds) if s.seconds else "", f"{kerv_command()} {line(s)}") for s in steps]
-    title = f"{name}, about {_minutes(sum(step.seconds for step in steps))} (a guess)"
+    rows = [(s.kind, s.state, duration(s.seconds) if s.seconds else "", f"{kerv_command()} {line(s)}") for s in steps]
+    title = f"{name}, {about(sum(step.seconds for step in steps))}"
     print_table(("what", "state", "about", "command"), rows, title)
     if plan:
         return
@@ -59,10 +60,6 @@ def prepare(settings: PrepareSettings, words: list[str], plan: ShowPlan = False)
             typer.echo(f"\n{kerv_command()} {line(step)}")
             run(shlex.split(line(step)))
     typer.echo(f"\n{name} is ready: {kerv_command()} sweep study=own policy.target={name}{results_word(words)}")
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min"
 
 
 def run(line: Sequence[str]) -> None:

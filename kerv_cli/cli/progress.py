@@ -17,6 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from kerv_cli.base.durations import duration
 from kerv_cli.lab.events import BlockStarted, BlockWaits, CellEnd, Event, SweepStarted
 from kerv_cli.lab.plan import Block, Cell
 
@@ -71,7 +72,7 @@ class ProgressDisplay:
         elif time.monotonic() - self._logged > LOG_SECONDS:
             self._logged = time.monotonic()
             rest = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
-            self.console.print(f"{self._count}, about {rest / 60:.0f} min left; {now}", soft_wrap=True, highlight=False)
+            self.console.print(f"{self._count}, about {duration(rest)} left; {now}", soft_wrap=True, highlight=False)
 
     @property
     def _done(self) -> float:

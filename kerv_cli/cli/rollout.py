@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kerv_cli.base.durations import about
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.cli.command import command
@@ -64,7 +65,7 @@ def rollout(
         if as_json:
             print_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": 3 * total})
         else:
-            typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, about {3 * total} s (a guess)")
+            typer.echo(f"{names}: {len(tasks)} tasks, {total} episodes, {about(3 * total)}")
         return
     store = run_cells(resolved, cells, ["rollout", *(["-m"] if multirun else []), *words])
     _print_rollout(store, as_json, results_word(words))

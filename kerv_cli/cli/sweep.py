@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.cli.command import command
@@ -141,7 +142,7 @@ def print_sweep_plan(covered: Covered, workers: int, as_json: bool) -> None:
                     "reused": time.reused, "seconds": time.seconds, "source": time.source})  # fmt: skip
         return
     print_table(columns, rows, f"study {store.name}")
-    typer.echo(f"{time.to_run} cells to run, {time.reused} reused, about {time.seconds / 60:.0f} min ({time.source})")
+    typer.echo(f"{time.to_run} cells to run, {time.reused} reused, {about(time.seconds, time.source)}")
 
 
 def run_covered(resolved: ResolvedStudy, covered: Covered, words: list[str]) -> Outcome:

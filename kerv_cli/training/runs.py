@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from torch import Tensor, nn
 
+from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.places import artifact, check_not_shipped, find_target
 from kerv_cli.base.provenance import provenance_of
@@ -62,11 +63,6 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     settings = {k: v for k, v in asdict(train).items() if k not in free}
     settings["closed_loop"] = train.closed_loop > 0  # scores with and without success do not compare
     return {k: v for k, v in settings.items() if k not in later or v != later[k]}
-
-
-def about(seconds: float) -> str:
-    """The time of a plan in words."""
-    return f"about {seconds / 60:.0f} min (a guess)"
 
 
 class Run(ABC):
