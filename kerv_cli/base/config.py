@@ -334,7 +334,8 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
         value = read_yaml_file(path)
         choices = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
         parts = {key.removeprefix("override /"): name for choice in choices for key, name in choice.items()}
-        words = [*(f"{key}={name}" for key, name in parts.items()), *_flat({**value, "method": None})]
+        settings = {key: one for key, one in value.items() if key != "method" and one is not None}
+        words = [*as_words(**parts), *as_words(**settings)]
     except OSError as error:
         raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
     except (ValueError, AttributeError, TypeError) as error:
@@ -342,14 +343,6 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
     rest = [word for word in overrides if word not in files]
     keys = {word.split("=", 1)[0] for word in rest}
     return [*(word for word in words if word.split("=", 1)[0] not in keys), *rest], path.stem
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        elif value is not None:
-            yield f"{prefix}{key}={str(value).lower() if isinstance(value, bool) else value}"
 
 
 def expand(overrides: str | Sequence[str]) -> list[list[str]]:
