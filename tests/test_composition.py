@@ -12,7 +12,7 @@ import pytest
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings
-from kerv_cli.base.settings import RolloutSettings, as_plain, settings_from
+from kerv_cli.base.settings import RolloutSettings, settings_from
 from kerv_cli.lab.policy import check as check_rollout
 from kerv_cli.methods.agreement import WatchSettings
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings
@@ -176,7 +176,7 @@ def test_every_part_of_a_preset_can_be_replaced(method: str) -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_settings_survive_a_file(method: str) -> None:
     asked = composed(f"method={method}", "threshold=change", "datastore=qdrant", "+policy.others={own: mine}")
-    plain = as_plain(asked)
+    plain = dataclasses.asdict(asked)
     assert settings_from(plain) == asked
     again = settings_from(json.loads(json.dumps(plain)))
     assert again == asked
@@ -185,7 +185,7 @@ def test_settings_survive_a_file(method: str) -> None:
 
 
 def damaged(change: Any) -> dict[str, Any]:
-    plain = as_plain(composed("method=spec_vla"))
+    plain = dataclasses.asdict(composed("method=spec_vla"))
     change(plain)
     return plain
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 
 from kerv_cli.base.config import compose, conf_dir
-from kerv_cli.base.settings import RolloutSettings, SweepSettings, as_plain
+from kerv_cli.base.settings import RolloutSettings, SweepSettings
 from kerv_cli.lab.identity import effective, idle_keys, without_effect
 from kerv_cli.lab.resolve import ResolvedStudy, idle_overrides
 
@@ -41,7 +43,7 @@ def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing() -> Non
     for name in names:
         settings = compose("rollout", [f"method={name}"], RolloutSettings)
         assert "rectifier" in idle_keys(settings)
-        assert "rectifier" not in effective(as_plain(settings))
+        assert "rectifier" not in effective(asdict(settings))
 
 
 def test_a_sweep_names_what_none_of_its_settings_reads() -> None:

@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, as_plain, settings_from
+from kerv_cli.base.settings import RolloutSettings, TrainDrafterSettings, settings_from
 from kerv_cli.base.spaces import Observation
 from kerv_cli.cli.app import app
 from kerv_cli.engine.chunk import ActionHistory, Situation
@@ -135,7 +135,7 @@ def test_every_place_loads_its_weights_once_and_decodes_ars_tokens(
     assert set(method.needs) == wanted
     identity = check(asked)
     assert {"target", *wanted} == set(identity) - {"observation"}
-    assert settings_from(as_plain(asked)) == asked
+    assert settings_from(dataclasses.asdict(asked)) == asked
     files = files_of(asked)
     assert files.load("follow") is files_of(asked).load("follow")
     decoder = method.decoder(files.target, files.load)

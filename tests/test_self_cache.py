@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 import torch
 from test_decoding_lossless import plain_greedy, random_prompt, random_target
 
-from kerv_cli.base.settings import RolloutSettings, as_plain
+from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.lab.identity import depends_on_order
 from kerv_cli.methods.certified import ScopedSettings
@@ -85,7 +87,7 @@ def test_the_newest_chunks_are_kept_and_unverified_ones_are_not(target: CompactT
 
 def test_results_that_depend_on_earlier_episodes_are_reused_whole() -> None:
     def settings(draft: object) -> dict[str, object]:
-        return as_plain(RolloutSettings(prefill_draft=draft))
+        return asdict(RolloutSettings(prefill_draft=draft))
 
     assert depends_on_order(settings(SelfCacheSettings()))
     assert depends_on_order(settings(MergedProposerSettings(fallback=["hold", "self_cache"])))

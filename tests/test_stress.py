@@ -18,7 +18,7 @@ from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import Part, parts
-from kerv_cli.base.settings import MOST_STRESS, CameraSettings, RolloutSettings, StressSettings, as_plain, settings_from
+from kerv_cli.base.settings import MOST_STRESS, CameraSettings, RolloutSettings, StressSettings, settings_from
 from kerv_cli.cli.app import app
 from kerv_cli.lab.identity import stress_of, work_of
 from kerv_cli.lab.policy import check
@@ -333,9 +333,9 @@ def test_an_unstressed_cell_is_what_it_was_before_there_was_stress() -> None:
     def whole(plain: dict[str, Any]) -> str:
         return work_of(plain, {})
 
-    now, zero = as_plain(settings()), as_plain(settings("world.stress.kind=light"))
+    now, zero = dataclasses.asdict(settings())(settings("world.stress.kind=light"))
     old = {**now, "world": {key: value for key, value in now["world"].items() if key != "stress"}}
-    two = as_plain(settings("world.stress.kind=light", "world.stress.level=2"))
+    two = dataclasses.asdict(settings("world.stress.kind=light", "world.stress.level=2"))
     assert whole(now) == whole(old) == whole(zero) != whole(two)
     assert settings_from(old).world.stress == StressSettings()  # a plan from before can be read
     assert settings_from(two).world.stress == StressSettings("light", 2)

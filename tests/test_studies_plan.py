@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from studies_synthetic import IDENTITY, settings_of, threshold_settings, thresho
 
 import kerv_cli
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import RolloutSettings, as_plain
+from kerv_cli.base.settings import RolloutSettings
 from kerv_cli.lab.code import _meaning, code_hash
 from kerv_cli.lab.identity import ENGINE, hash_of, work_of
 from kerv_cli.lab.plan import (
@@ -96,7 +96,7 @@ def test_task_and_weights_change_the_id_and_code_does_not(monkeypatch: pytest.Mo
     with monkeypatch.context() as other:
         other.setattr("kerv_cli.lab.code.code_hash", lambda: "f" * 64)
         assert only_id(settings) == before
-    assert work_of(as_plain(settings), IDENTITY, engine=ENGINE + 1) != work_of(as_plain(settings), IDENTITY)
+    assert work_of(asdict(settings), IDENTITY, engine=ENGINE + 1) != work_of(asdict(settings), IDENTITY)
 
 
 def test_id_is_the_hash_of_canonical_json() -> None:

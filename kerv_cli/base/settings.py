@@ -7,7 +7,7 @@ heavy is imported here: a wrong override is answered before torch or MuJoCo load
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, TypeVar
 
 from kerv_cli.base import manifests
@@ -590,18 +590,13 @@ def choices_of(schema: type) -> dict[str, str]:
     return parts | dict(getattr(schema, "groups", {}))
 
 
-def as_plain(settings: Any) -> dict[str, Any]:
-    """A settings dataclass as nested dicts and lists."""
-    return asdict(settings)
-
-
 def settings_from(plain: Mapping[str, Any], tolerant: bool = False) -> RolloutSettings:
     """The settings of a rollout from nested dicts and lists: `read_settings` with its class."""
     return read_settings(RolloutSettings, plain, tolerant)
 
 
 def read_settings(schema: type[S], plain: Mapping[str, Any], tolerant: bool = False) -> S:
-    """Settings of the class `schema` from nested dicts and lists, the inverse of `as_plain`. The settings of a part get
+    """Settings of the class `schema` from nested dicts and lists, the inverse of `asdict`. The settings of a part get
     the class that its registration names. tolerant: keys that this kerv does not know are left out instead of refused.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings, as_plain
+from kerv_cli.base.settings import TrainDrafterSettings, TrainTargetSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures, print_json, print_plan, progress_bar
 
@@ -79,7 +80,7 @@ def run_training(run: TargetRun | DrafterRun, plan: bool, as_json: bool, loading
     name = f"{run.kind}/{run.folder.name}"
     with (
         without_subnormals(),
-        _live(tracker, name, run.folder, settings.train.steps, as_plain(settings)) as log,
+        _live(tracker, name, run.folder, settings.train.steps, asdict(settings)) as log,
         progress_bar(training) as advance,
     ):
         metrics = run.train(on_step)

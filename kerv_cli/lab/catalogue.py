@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.places import shipped_dir
 from kerv_cli.base.registry import parts
-from kerv_cli.base.settings import as_plain, choices_of
+from kerv_cli.base.settings import choices_of
 from kerv_cli.lab.claims import is_claimed
 from kerv_cli.lab.identity import OBSERVATION
 from kerv_cli.lab.plan import Cell, unique_cells
@@ -213,7 +213,7 @@ def command_of(run: RunEntry) -> tuple[str, ...]:
         for value in settings[group].values()
         if value in groups()[group] and value != default
     ]
-    defaults = as_words(**as_plain(compose(name.replace(" ", "_"), chosen, schema)))
+    defaults = as_words(**asdict(compose(name.replace(" ", "_"), chosen, schema)))
     return *run.command, *chosen, *(word for word in as_words(**settings) if word not in defaults)
 
 

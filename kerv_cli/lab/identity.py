@@ -10,6 +10,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from kerv_cli.base.errors import KervError
@@ -22,7 +23,6 @@ from kerv_cli.base.settings import (
     WAITS,
     RolloutSettings,
     TimingSettings,
-    as_plain,
     settings_from,
 )
 
@@ -87,7 +87,7 @@ def effective(settings: Plain) -> dict[str, Any]:
         today = settings_from(settings, tolerant=True)
     except KervError:  # a part that is not registered here, e.g. somebody else's: its settings as they stand
         return without(settings, NOT_DETERMINING)
-    determining = without(_filled(settings, as_plain(today)), NOT_DETERMINING)
+    determining = without(_filled(settings, asdict(today)), NOT_DETERMINING)
     for key in idle_keys(today) if today.policy.kind != EXPERT else ():
         _drop(determining, key.split("."))
     determining["runtime"] = without(determining["runtime"], NOT_DETERMINING_RUNTIME)
@@ -114,7 +114,7 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
 def complete_settings(settings: Plain) -> dict[str, Any]:
     """Stored settings with today's defaults where an older kerv had no such setting."""
     try:
-        return _filled(settings, as_plain(settings_from(settings, tolerant=True)))
+        return _filled(settings, asdict(settings_from(settings, tolerant=True)))
     except KervError:
         return dict(settings)
 

@@ -23,7 +23,7 @@ import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, visible
-from kerv_cli.base.settings import RolloutSettings, StudySettings, as_plain, settings_from
+from kerv_cli.base.settings import RolloutSettings, StudySettings, settings_from
 from kerv_cli.base.spaces import ActionSpace, Group
 from kerv_cli.engine.record import UNTIMED, DecodeRecord, EpisodeRecord
 from kerv_cli.lab.identity import ENGINE, OBSERVATION
@@ -323,10 +323,10 @@ def _settings(side: Side) -> dict[str, Any]:
     """Plain settings of a rollout that say what ran: those of kerv's server, else defaults with the server's name."""
     first = side.evaluations[0]
     stored = first.facts.get("settings")
-    plain = as_plain(RolloutSettings()) | {"method": first.name}
+    plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
         try:
-            plain = as_plain(settings_from(stored, tolerant=True))
+            plain = dataclasses.asdict(settings_from(stored, tolerant=True))
         except KervError:  # a part that is not registered here
             plain |= stored
     if str(first.config.get("benchmark", "")).startswith("kerv_cli."):

@@ -9,14 +9,14 @@ from __future__ import annotations
 import functools
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.settings import DemosSettings, as_plain
+from kerv_cli.base.settings import DemosSettings
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.lab.identity import hash_of
 from kerv_cli.methods.artifacts import Artifacts
@@ -135,4 +135,4 @@ def _hash(settings: DemosSettings) -> str:
         return _artifacts(settings).description.sha256
     hashes = _artifacts(settings).check(Method.of(settings).needs)
     chunk = [settings.chunk] if settings.chunk else []  # the hash of a recording from before it counted stays
-    return hash_of([hashes, {kind: as_plain(part) for kind, part in settings.parts().items()}, *chunk])
+    return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, *chunk])
