@@ -3,17 +3,17 @@ episodes, every predictor's error on held-out ones (docs/methods.md §3.1)."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from kerv_cli.base.errors import CheckpointError, KervError
+from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.methods.calibration import Errors
 from kerv_cli.methods.kinematics.prediction import FILTERS, PREDICTORS, Noise, build_predictor, kalman_weights
-from kerv_cli.training.observations import check_tail
+from kerv_cli.training.demonstrations import check_tasks
+from kerv_cli.training.observations import check_tail, held_out_every
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.episode_file import DemoEpisode
 
@@ -97,24 +97,20 @@ def read_windows(
     return Windows(past, future, np.concatenate(labels), np.concatenate(masks), tasks, counts, paths)
 
 
-def choose_episodes(dataset: DemoDataset, tasks: Iterable[str], limit: int, share: float) -> dict[int, bool]:
+def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int, share: float) -> dict[int, bool]:
     """Index -> held out, of the first `limit` episodes per task (0: all); every k-th of a task's plain episodes and
     every k-th of its perturbed ones is held out.
 
     Raises:
         CheckpointError: a task has no demonstration.
     """
-    by_task: dict[str, list[int]] = defaultdict(list)
-    for index, entry in enumerate(dataset.episodes):
-        by_task[entry.task].append(index)
+    check_tasks(dataset, tasks)
     chosen: dict[int, bool] = {}
     for task in tasks:
-        if task not in by_task:
-            raise CheckpointError(f"the demonstrations hold no episode of {task}: record them first")
-        of_task = by_task[task][: limit or None]
+        of_task = [index for index, entry in enumerate(dataset.episodes) if entry.task == task][: limit or None]
         for perturbed in (False, True):
             kind = [i for i in of_task if dataset.episodes[i].perturbed == perturbed]
-            every = min(max(2, round(1 / share)), max(2, len(kind)))
+            every = held_out_every(max(2, len(kind)), share)
             chosen |= {index: number % every == every - 1 for number, index in enumerate(kind)}
     return chosen
 
