@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_json
+from kerv_cli.base.files import read_mapping
 from kerv_cli.base.settings import BenchSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import print_table
@@ -61,9 +61,9 @@ def bench(settings: BenchSettings, as_json: AsJson = False, compare: Compare = N
 
 
 def _compare(a: Path, b: Path) -> None:
-    documents = {path: read_json(path) for path in (a, b)}
+    documents = {path: read_mapping(path) for path in (a, b)}
     for path, document in documents.items():
-        if not isinstance(document, dict) or not {"phases", "target", "dtype"} <= set(document):
+        if not {"phases", "target", "dtype"} <= set(document):
             raise CheckpointError(f"{path} is no result of 'kerv bench'")
     names = [f"{documents[path]['target']} {documents[path]['dtype']} ms" for path in (a, b)]
     print_table(("phase", *names, "ratio"), _comparison_rows(documents[a], documents[b]), f"{a} and {b}")

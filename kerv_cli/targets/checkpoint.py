@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import read_json, regular, sha256_of, write_bytes, write_json
+from kerv_cli.base.files import read_mapping, regular, sha256_of, write_bytes, write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import find, load, parts
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -241,8 +241,8 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
 @functools.lru_cache(maxsize=256)
 def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int, int, int]) -> T:
     """The JSON file, read once per process as long as inode, size and time of change (version) stay the same."""
-    value = read_json(path)
-    if not isinstance(value, dict) or (value.get("format"), value.get("kind")) != (FORMAT, kind):
+    value = read_mapping(path)
+    if (value.get("format"), value.get("kind")) != (FORMAT, kind):
         raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
     return read(schema, value, str(path), tolerant=True)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.files import read_json
+from kerv_cli.base.files import read_json, read_mapping
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group
 
@@ -166,11 +166,11 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     if not path.is_file():
         raise CheckpointError(f"no {CONFIG} in {folder}: name the folder of a Hugging Face OpenVLA checkpoint")
-    value = read_json(path)
-    kind = value.get("model_type") if isinstance(value, dict) else None
+    value = read_mapping(path)
+    kind = value.get("model_type")
     if kind != "openvla":
         raise CheckpointError(f"{path} is of a model of type {kind}, not openvla")
-    return dict(value)
+    return value
 
 
 def _towers(value: Mapping[str, Any], path: Path) -> list[Tower]:

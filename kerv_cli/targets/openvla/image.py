@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import read_json
+from kerv_cli.base.files import read_mapping
 from kerv_cli.base.manifests import read
 from kerv_cli.targets.openvla.config import Shape
 
@@ -52,8 +52,8 @@ def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
     path = folder / PREPROCESSOR
     if not path.is_file():
         return DEFAULTS
-    value = read_json(path)
-    strategy = value.get("image_resize_strategy", RESIZE) if isinstance(value, dict) else None
+    value = read_mapping(path)
+    strategy = value.get("image_resize_strategy", RESIZE)
     if strategy != RESIZE:
         raise CheckpointError(f"{path} asks for image_resize_strategy={strategy}; OpenVLA's is {RESIZE}")
     towers = value.get("tvf_normalize_params")

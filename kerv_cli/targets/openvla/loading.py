@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_json, regular, sha256_of
+from kerv_cli.base.files import read_mapping, regular, sha256_of
 from kerv_cli.targets.openvla.config import CONFIG, Shape
 from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
 from kerv_cli.targets.openvla.vision import Block, PoolingHead, Projector, VisionBackbone
@@ -75,8 +75,7 @@ def open_shards(folder: Path) -> Shards:
     """
     index = folder / INDEX
     if index.is_file():
-        value = read_json(index)
-        named = value.get("weight_map") if isinstance(value, dict) else None
+        named = read_mapping(index).get("weight_map")
         if not isinstance(named, dict) or not all(isinstance(x, str) and "/" not in x for x in named.values()):
             raise CheckpointError(f"{index} has no weight_map of file names: download it again")
         files = sorted(set(named.values()))

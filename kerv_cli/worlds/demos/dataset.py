@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import read_json, sha256_of
+from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import stands_for_tasks
@@ -216,8 +216,8 @@ class DemoDataset:
 
 
 def _read_manifest(path: Path) -> DemoManifest:
-    value = read_json(path)
-    version = value.get("format") if isinstance(value, dict) else None
+    value = read_mapping(path)
+    version = value.get("format")
     if version not in (1, FORMAT):
         raise CheckpointError(f"{path} has format {version}, this kerv reads {FORMAT} and 1")
     value = with_environment(value)
