@@ -25,7 +25,6 @@ from kerv_cli.lab.executors import check_executor
 from kerv_cli.lab.plan import Cell
 from kerv_cli.lab.store import StudyStore
 
-HERE = Path(__file__).parent
 PACKAGES = {"slurm": "submitit", "ray": "ray"}
 
 
