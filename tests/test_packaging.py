@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import email
-import importlib.util
 import os
 import shutil
 import signal
@@ -14,9 +13,9 @@ import zipfile
 from configparser import ConfigParser
 from email.message import Message
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from loaded import module_of
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -352,17 +351,8 @@ def test_libraries_that_do_not_help_are_an_error(checkout: Checkout) -> None:
 # --- the check for graphics ---
 
 
-def load_check() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("check_gl", ROOT / "scripts" / "check_gl.py")
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_a_library_that_is_absent_or_not_opengl_does_not_count_as_graphics() -> None:
-    check = load_check()
+    check = module_of(ROOT / "scripts" / "check_gl.py")
     assert not check.egl_works(("libkerv-absent.so.1",))
     assert not check.osmesa_works(("libkerv-absent.so.1",))
     assert check.load(("libkerv-absent.so.1", "libc.so.6"), "printf") is not None

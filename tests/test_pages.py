@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from loaded import module_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ("README.md", "results/README.md", "results/LOG.md")
 
 
-def script() -> Any:
-    """The module scripts/figures.py."""
-    spec = importlib.util.spec_from_file_location("figures", ROOT / "scripts/figures.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
 def figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The script over a table of two settings."""
-    module = script()
+    module = module_of(ROOT / "scripts/figures.py")
     module.table_of.cache_clear()
     monkeypatch.setattr(module, "TABLES", tmp_path)
     head = "averaging,label,baseline,successes,episodes,speedup,speedup_low,speedup_high,mcnemar_p"

@@ -3,13 +3,13 @@ not needed: `make docs` runs it."""
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from loaded import module_of
 from typer.testing import CliRunner
 
 from kerv_cli.cli.app import app
@@ -25,13 +25,7 @@ SOURCES = (
 
 @pytest.fixture(scope="module")
 def docs() -> Any:
-    """The module scripts/docs.py."""
-    spec = importlib.util.spec_from_file_location("docs_site", ROOT / "scripts/docs.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_of(ROOT / "scripts/docs.py")
 
 
 def text_of(source: str) -> str:

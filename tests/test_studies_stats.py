@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from loaded import module_of
 from scipy.special import stdtrit
 from statsmodels.stats.contingency_tables import mcnemar as statsmodels_mcnemar
 from statsmodels.stats.proportion import proportion_confint
@@ -137,13 +136,7 @@ def test_what_drifts_from_block_to_block_widens_the_interval() -> None:
 @pytest.fixture(scope="module")
 def coverage() -> Callable[[int, int, int], dict[str, float]]:
     """`coverage` of scripts/coverage.py: tasks, blocks per task, studies -> interval -> share that holds the truth."""
-    spec = importlib.util.spec_from_file_location("coverage_of_intervals", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    found: Callable[[int, int, int], dict[str, float]] = module.coverage
+    found: Callable[[int, int, int], dict[str, float]] = module_of(SCRIPT).coverage
     return found
 
 
