@@ -39,15 +39,13 @@ _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
 def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
     """What the policy sends (`action_spec`) and reads (`observation_spec`), as vla-eval's DimSpecs."""
     actions: dict[str, dict[str, object]] = {}
-    first = 0
     low, high = interface.converted(np.array([interface.actions.low, interface.actions.high]))
     for group in interface.actions.groups:
-        part = slice(first, first + group.size)
+        part = interface.actions.dofs_of(group.name)
         strict = bool(interface.actions.is_strict[part].all())
         form = _gripper_format(interface) if strict else _FORMATS.get((group.name, group.size), "raw")
         ends = [float(np.minimum(low, high)[part].min()), float(np.maximum(low, high)[part].max())]
         actions[group.name] = {"name": group.name, "dims": group.size, "format": form, "range": ends}
-        first += group.size
     inputs = {camera: {"name": "image", "dims": 0, "format": "rgb_hwc_uint8"} for camera in interface.cameras}
     inputs["language"] = {"name": "language", "dims": 0, "format": "language"}
     space = interface.observation
