@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from kerv_cli.base.config import compose, to_yaml
 from kerv_cli.base.settings import CalibrateSettings, CalibrateSuccessSettings, SweepSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, print_json, print_plan, print_table, progress_bar
@@ -136,7 +137,6 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
 def success(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on selection seeds, the most cautious first, and certify which of them keep AR's success.
     Episodes that are there are reused; settle their number before you look."""
-    from kerv_cli.base.config import compose, to_yaml
     from kerv_cli.cli.sweep import covered_cells, print_settings, print_sweep_plan, run_covered
     from kerv_cli.lab.resolve import resolve
     from kerv_cli.report.certificate import candidate_rows, certify, deployment_note, folder_of, write

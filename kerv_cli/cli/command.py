@@ -17,6 +17,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
+from kerv_cli.base.config import compose, conf_dir, groups, keys_of, to_yaml
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_yaml_file
 from kerv_cli.base.limits import field_of
@@ -139,8 +140,6 @@ def _values(part: Part, key: str) -> list[str]:
         return list(parts("stress"))
     for _, schema in schemas_of(part):
         if key in choices_of(schema):
-            from kerv_cli.base.config import groups
-
             return groups()[key]
         for at in fields(schema):
             if at.name == key and "names" in at.metadata:
@@ -150,8 +149,6 @@ def _values(part: Part, key: str) -> list[str]:
 
 def _keys(part: Part, words: Sequence[str], incomplete: str) -> list[str]:
     """Dotted keys of the command, given the parts that the words before choose."""
-    from kerv_cli.base.config import keys_of
-
     for name, schema in schemas_of(part):
         if incomplete.split(".")[0] in {at.name for at in fields(schema)}:
             choices = [word for word in words if word.split("=", 1)[0] in choices_of(schema)]
@@ -217,8 +214,6 @@ def _settings(part: Part, words: list[str], cfg: bool) -> Any:
     Raises:
         UsageError: as `config.compose`. StorageError: as `places.check_writable`.
     """
-    from kerv_cli.base.config import compose, to_yaml
-
     typed = part.traits.get("typed", {})
     pairs = [(typed.get(key, key), equals, value) for key, equals, value in (word.partition("=") for word in words)]
     lists = part.traits.get("lists", ())
@@ -245,8 +240,6 @@ class CommandWithSettings(TyperCommand):
 
     def keys(self) -> list[str]:
         """Every key that the command takes, dotted ones included."""
-        from kerv_cli.base.config import keys_of
-
         if self.part.settings is NoSettings:
             return []
         below = (keys_of(name.replace(" ", "_"), [], schema) for name, schema in schemas_of(self.part))
@@ -294,8 +287,6 @@ def _row(part: Part, key: str) -> tuple[str, str]:
 
 def _of_file(schema: type, key: str, default: object) -> object:
     """The value of a dotted key in the file of conf/ that its group chooses; `default` where that does not say."""
-    from kerv_cli.base.config import conf_dir
-
     group, *path = key.split(".")
     file = conf_dir() / group / f"{choices_of(schema).get(group)}.yaml"
     value = read_yaml_file(file) if path and file.is_file() else {}

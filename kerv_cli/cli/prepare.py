@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import typer
 
+from kerv_cli.base.config import groups
 from kerv_cli.base.durations import about, duration
 from kerv_cli.base.errors import Interrupted
 from kerv_cli.base.registry import parts
@@ -20,8 +21,6 @@ NOT_OF_STEPS = ("for", "steps")
 
 def method_names() -> list[str]:
     """Values of `for=`."""
-    from kerv_cli.base.config import groups
-
     return groups()["method"]
 
 

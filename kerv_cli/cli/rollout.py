@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from kerv_cli.base.config import to_yaml
 from kerv_cli.base.durations import about
 from kerv_cli.base.places import check_writable
 from kerv_cli.base.settings import RolloutSettings
@@ -47,7 +48,6 @@ def rollout(
     words: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
     """Run episodes of one method; print success, forwards, acceptance and time; write one .rrd per task."""
-    from kerv_cli.base.config import to_yaml
     from kerv_cli.lab.identity import without_effect
     from kerv_cli.lab.resolve import resolve_rollout
 

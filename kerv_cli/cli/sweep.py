@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words, to_yaml
 from kerv_cli.base.durations import about
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RolloutSettings, SweepSettings
@@ -71,8 +72,6 @@ def sweep(words: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: 
 
 def print_settings(resolved: ResolvedStudy) -> None:
     """Prints the study and each of its settings as YAML, for --cfg."""
-    from kerv_cli.base.config import to_yaml
-
     typer.echo(to_yaml(resolved.study), nl=False)
     for label, settings in resolved.settings.items():
         typer.echo(f"--- # {label}\n{to_yaml(settings)}", nl=False)
@@ -97,7 +96,6 @@ def covered_cells(resolved: ResolvedStudy, words: list[str]) -> Covered:
 
 def _list_studies(as_json: bool) -> None:
     """Prints the studies of conf/ and how large each is."""
-    from kerv_cli.base.config import Composer, conf_dir, expand, groups, split_words
     from kerv_cli.lab.resolve import study_of_file, tasks_of
 
     rows, composer = [], Composer("rollout", RolloutSettings)

@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from torch import nn
 
+from kerv_cli.base.config import groups
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.manifests import check_files, read_file
@@ -275,8 +276,6 @@ class Artifacts:
 
     def _making(self, files: Artifact[Any]) -> tuple[str, ...]:
         """Words of the command that makes an artifact of the policy: beside its target, or of the name that it has."""
-        from kerv_cli.base.config import groups
-
         target, name = f"policy.target={self.policy.target}", getattr(self.policy, files.kind, None)
         if name is None or "/" in name:
             return "prepare", target
