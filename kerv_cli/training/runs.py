@@ -21,6 +21,7 @@ from kerv_cli.base.provenance import provenance_of
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import TrainDrafterSettings, TrainSettings, TrainTargetSettings
+from kerv_cli.base.views import views_of
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.lab.run import success_of
 from kerv_cli.methods.artifacts import MadeFor, Weights, removal
@@ -234,10 +235,11 @@ class TargetRun(Run):
 
     @property
     def seconds(self) -> float:
-        """A guess, from nano to small targets on one core: the trunk's weights, and the pixels if it sees."""
+        """A guess, from nano to small targets on one core: the trunk's weights, and the pixels of every view."""
         s, train = self.settings.target, self.settings.train
         weights = s.layers * s.width * (4 * s.width + 3 * s.feed_forward)
-        return train.steps * train.batch * (2.2e-9 * weights + 3e-4 * s.channels * (s.observation == "vision"))
+        views = len(views_of(self.world.camera.name)) if s.observation == "vision" else 0
+        return train.steps * train.batch * (2.2e-9 * weights + 3e-4 * s.channels * views)
 
     def load(self, progress: OnProgress) -> None:
         """Reads the demonstrations and the weights of `train.init` into memory, and makes the target.
