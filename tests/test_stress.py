@@ -333,7 +333,7 @@ def test_an_unstressed_cell_is_what_it_was_before_there_was_stress() -> None:
     def whole(plain: dict[str, Any]) -> str:
         return work_of(plain, {})
 
-    now, zero = dataclasses.asdict(settings())(settings("world.stress.kind=light"))
+    now, zero = dataclasses.asdict(settings()), dataclasses.asdict(settings("world.stress.kind=light"))
     old = {**now, "world": {key: value for key, value in now["world"].items() if key != "stress"}}
     two = dataclasses.asdict(settings("world.stress.kind=light", "world.stress.level=2"))
     assert whole(now) == whole(old) == whole(zero) != whole(two)
