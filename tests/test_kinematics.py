@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.engine.chunk import WINDOW, ActionHistory
 from kerv_cli.methods.kinematics.prediction import (
     FILTERS,
@@ -225,6 +225,10 @@ def test_impossible_noise_is_refused(q: float, r: float, damping: float) -> None
 def test_wrong_requests() -> None:
     with pytest.raises(UsageError, match="one number per DoF"):
         Noise((1.0,), (1.0, 1.0), (1.0,))
+    with pytest.raises(UnknownName, match="did you mean kalman"):
+        predictor("kalmann")
+    with pytest.raises(UsageError, match="kerv calibrate"):
+        build_predictor("kalman", np.array(HELD), {})
     with pytest.raises(UsageError, match="minimum history"):
         Acceleration(np.array(HELD), NOISE["acceleration"], minimum=2)
     with pytest.raises(UsageError, match="minimum history"):
