@@ -14,6 +14,7 @@ from statsmodels.stats.contingency_tables import mcnemar as statsmodels_mcnemar
 from statsmodels.stats.proportion import proportion_confint
 
 from kerv_cli.report.statistics import (
+    Estimate,
     PairedCounts,
     mcnemar,
     mean_of,
@@ -26,28 +27,38 @@ from kerv_cli.report.statistics import (
 )
 
 SCRIPT = Path(__file__).parents[1] / "scripts/coverage.py"
+Z = 1.959963984540054  # 97.5th percentile of the normal distribution
 
 
-@pytest.mark.parametrize(("successes", "episodes"), [(0, 7), (10, 10), (3, 8), (1, 3), (43, 50), (187, 200)])
-@pytest.mark.parametrize("confidence", [0.9, 0.95])
-def test_wilson_is_statsmodels(successes: int, episodes: int, confidence: float) -> None:
-    expected = proportion_confint(successes, episodes, 1 - confidence, method="wilson")
-    assert wilson(successes, episodes, confidence)[1:] == pytest.approx(expected, abs=1e-9)
+def wilson_formula(successes: int, episodes: int) -> tuple[float, float]:
+    p = successes / episodes
+    centre = p + Z**2 / (2 * episodes)
+    half = Z * math.sqrt(p * (1 - p) / episodes + Z**2 / (4 * episodes**2))
+    return (centre - half) / (1 + Z**2 / episodes), (centre + half) / (1 + Z**2 / episodes)
+
+
+@pytest.mark.parametrize(("successes", "episodes"), [(0, 10), (10, 10), (7, 10), (43, 50), (1, 3)])
+def test_wilson_is_the_score_interval(successes: int, episodes: int) -> None:
+    assert wilson(successes, episodes)[1:] == pytest.approx(wilson_formula(successes, episodes), abs=1e-12)
 
 
 def test_wilson_without_episodes_is_unknown() -> None:
     assert all(math.isnan(bound) for bound in wilson(0, 0))
 
 
+def rate(successes: int, episodes: int) -> Estimate:
+    return wilson(successes, episodes)
+
+
 def test_the_mean_of_one_group_is_the_group() -> None:
-    assert mean_of([wilson(7, 10)]) == pytest.approx(wilson(7, 10), abs=1e-12)
+    assert mean_of([rate(7, 10)]) == pytest.approx(rate(7, 10), abs=1e-12)
 
 
 def test_the_mean_of_two_groups_by_hand() -> None:
-    (low_a, high_a), (low_b, high_b) = wilson(9, 10)[1:], wilson(6, 20)[1:]
+    (low_a, high_a), (low_b, high_b) = wilson_formula(9, 10), wilson_formula(6, 20)
     low = 0.6 - 0.5 * math.hypot(0.9 - low_a, 0.3 - low_b)
     high = 0.6 + 0.5 * math.hypot(high_a - 0.9, high_b - 0.3)
-    assert mean_of([wilson(9, 10), wilson(6, 20)]) == pytest.approx((0.6, low, high), abs=1e-12)
+    assert mean_of([rate(9, 10), rate(6, 20)]) == pytest.approx((0.6, low, high), abs=1e-12)
 
 
 def test_paired_counts_are_the_four_cells() -> None:
@@ -56,11 +67,11 @@ def test_paired_counts_are_the_four_cells() -> None:
     assert paired_counts(baseline, method) == PairedCounts(both=2, only_baseline=1, only_method=3, neither=1)
 
 
-@pytest.mark.parametrize("counts", [(10, 0, 0, 3), (10, 5, 2, 3), (150, 13, 4, 33), (0, 9, 1, 0), (5, 4, 4, 5)])
-def test_mcnemar_is_statsmodels(counts: tuple[int, int, int, int]) -> None:
-    both, lost, won, neither = counts
-    expected = statsmodels_mcnemar([[both, lost], [won, neither]], exact=True).pvalue
-    assert mcnemar(PairedCounts(*counts)) == pytest.approx(min(1.0, expected), abs=1e-12)
+@pytest.mark.parametrize(("lost", "won"), [(0, 1), (3, 0), (11, 0), (5, 2), (4, 4), (1, 9)])
+def test_mcnemar_is_twice_the_binomial_tail(lost: int, won: int) -> None:
+    n = lost + won
+    tail = sum(math.comb(n, k) for k in range(min(lost, won) + 1)) / 2**n
+    assert mcnemar(PairedCounts(10, lost, won, 10)) == pytest.approx(min(1.0, 2 * tail), abs=1e-12)
 
 
 def test_mcnemar_without_discordant_pairs_is_one() -> None:
@@ -160,10 +171,24 @@ def test_without_pairs_there_is_no_speedup() -> None:
     assert math.isnan(speedup(np.array([]), np.array([]), []).value)
 
 
+@pytest.mark.parametrize(("successes", "episodes"), [(0, 7), (12, 12), (3, 8), (187, 200)])
+@pytest.mark.parametrize("confidence", [0.9, 0.95])
+def test_wilson_is_statsmodels(successes: int, episodes: int, confidence: float) -> None:
+    expected = proportion_confint(successes, episodes, 1 - confidence, method="wilson")
+    assert wilson(successes, episodes, confidence)[1:] == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("counts", [(10, 0, 0, 3), (10, 5, 2, 3), (150, 13, 4, 33), (0, 9, 1, 0)])
+def test_mcnemar_is_statsmodels(counts: tuple[int, int, int, int]) -> None:
+    both, lost, won, neither = counts
+    expected = statsmodels_mcnemar([[both, lost], [won, neither]], exact=True).pvalue
+    assert mcnemar(PairedCounts(*counts)) == pytest.approx(min(1.0, expected), abs=1e-12)
+
+
 def test_paired_difference_by_hand() -> None:
     """Of 50 pairs the method solves 36 + 2, the baseline 36 + 12, none solves 0."""
-    low_a, high_a = wilson(38, 50)[1:]
-    low_b, high_b = wilson(48, 50)[1:]
+    low_a, high_a = wilson_formula(38, 50)
+    low_b, high_b = wilson_formula(48, 50)
     phi = (36 * 0 - 12 * 2) / math.sqrt(38 * 12 * 48 * 2)  # below 0: without the correction for continuity
     below, above = 0.76 - low_a, high_b - 0.96
     low = -0.2 - math.sqrt(below**2 - 2 * phi * below * above + above**2)
@@ -173,8 +198,8 @@ def test_paired_difference_by_hand() -> None:
 
 
 def test_paired_difference_of_correlated_pairs_by_hand() -> None:
-    low_a, high_a = wilson(24, 40)[1:]
-    low_b, high_b = wilson(22, 40)[1:]
+    low_a, high_a = wilson_formula(24, 40)
+    low_b, high_b = wilson_formula(22, 40)
     phi = (20 * 14 - 2 * 4 - 20) / math.sqrt(24 * 16 * 22 * 18)  # less half the pairs, for continuity
     below, above = 0.6 - low_a, high_b - 0.55
     low = 0.05 - math.sqrt(below**2 - 2 * phi * below * above + above**2)

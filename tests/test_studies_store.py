@@ -344,6 +344,15 @@ def test_a_study_that_is_not_there_names_what_to_run(store: StudyStore, cell: Ce
         store.read_cell(cell.id)
 
 
+def test_a_damaged_plan_is_reported_and_replaced_by_the_next_sweep(store: StudyStore) -> None:
+    store.root.mkdir(parents=True)
+    store.plan_path.write_text("cells: [", encoding="utf-8")
+    with pytest.raises(CheckpointError, match=r"plan\.yaml is damaged"):
+        store.read_plan()
+    store.write_plan(threshold_settings(), threshold_study(["push-v3"]))
+    assert len(store.read_plan().cells) == 4
+
+
 @pytest.mark.parametrize("name", ["../up", "a/b", "", ".hidden"])
 def test_a_study_name_is_a_folder_name(tmp_path: Path, name: str) -> None:
     with pytest.raises(UsageError, match="study name"):
