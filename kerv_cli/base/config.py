@@ -334,8 +334,8 @@ def method_of_file(overrides: Sequence[str]) -> tuple[list[str], str | None]:
         value = read_yaml_file(path)
         choices = [choice for choice in value.pop("defaults", []) if isinstance(choice, dict)]
         parts = {key.removeprefix("override /"): name for choice in choices for key, name in choice.items()}
-        settings = {key: one for key, one in value.items() if key != "method" and one is not None}
-        words = [*as_words(**parts), *as_words(**settings)]
+        value.pop("method", None)
+        words = [*as_words(**parts), *(word for word in as_words(**value) if not word.endswith("=null"))]
     except OSError as error:
         raise UsageError(f"method={path} cannot be read: {error.strerror}") from error
     except (ValueError, AttributeError, TypeError) as error:
