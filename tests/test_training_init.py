@@ -159,5 +159,12 @@ def test_what_cannot_begin_a_run_is_refused(results: Path) -> None:
             TargetRun(settings(results, "target.observation=state", f"train.{word}"))
 
 
+def test_demonstrations_without_places_are_refused(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nameless = SimpleNamespace(**{**vars(Demos.manifest), "observation": dataclasses.replace(OBSERVATION, places=())})
+    monkeypatch.setattr(Demos, "manifest", nameless)
+    with pytest.raises(UsageError, match=r"name no places .* a compact policy cannot be trained on them"):
+        TargetRun(settings(results))
+
+
 def test_the_plan_names_it(results: Path) -> None:
     assert TargetRun(settings(results)).plan().endswith(f"beginning with {results}/artifacts/target/old")

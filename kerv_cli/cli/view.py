@@ -86,10 +86,11 @@ def _place(results: str, name: str) -> Path:
     if path.exists() or path.suffix == ".rrd":
         return path
     from kerv_cli.lab.catalogue import LAST, find_run, find_runs
+    from kerv_cli.report.viewing.viewer import recordings_below
 
     if name == LAST:
-        recorded = (run.folder for run in find_runs(results) if run.has_episodes and any(run.folder.rglob("*.rrd")))
-        return next(recorded, Path(results))
+        folders = (run.folder for run in find_runs(results) if run.has_episodes)
+        return next((folder for folder in folders if any(recordings_below(folder))), Path(results))
     try:
         return find_run(results, name).folder
     except UnknownName:

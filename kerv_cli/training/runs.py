@@ -66,6 +66,14 @@ def run_settings(train: TrainSettings) -> dict[str, Any]:
     return {k: v for k, v in settings.items() if k not in later or v != later[k]}
 
 
+def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
+    """Raises UsageError: one of the settings `keys`, which the run does not read, is not its default. why: behind the
+    setting, in the message."""
+    for key in keys:
+        if (value := getattr(train, key)) != getattr(TrainSettings, key):
+            raise UsageError(f"train.{key}={value}{why}")
+
+
 class Run(ABC):
     """A training run: `load` makes the lesson, `train` optimises its module and saves the best checkpoint in `folder`.
     `plan` says in one line what would be done. borders: of `draw_samples`. losses: of every step, once trained."""
@@ -193,11 +201,12 @@ class TargetRun(Run):
         """
         train, manifest = self.settings.train, self.dataset.manifest
         if not manifest.observation.places:
-            raise UsageError(f"the demonstrations in {self.dataset.path} name no place, as a compact policy needs")
+            raise UsageError(
+                f"the demonstrations in {self.dataset.path} name no places (of object and goal): a compact policy "
+                "cannot be trained on them"
+            )
         if self.settings.target.observation == "state":
-            for key in ("colour", "shift", "places"):
-                if (value := getattr(train, key)) != getattr(TrainSettings, key):
-                    raise UsageError(f"train.{key}={value} is of images, target.observation=state has none")
+            refuse_unused(train, ("colour", "shift", "places"), " is of images, target.observation=state has none")
         recordings = [manifest.config, *manifest.config.get("joined", ())]
         if train.places == "path" and train.scene_weight and any(one.get("policy") for one in recordings):
             raise UsageError(
@@ -313,9 +322,8 @@ class DrafterRun(Run):
             raise UsageError(f"train.init={settings.train.init}: only 'kerv train target' begins with given weights")
         if settings.train.freeze:
             raise UsageError(f"train.freeze={settings.train.freeze}: only 'kerv train target' keeps weights")
-        for key in ("balance", "closed_loop", "colour", "shift", "places"):
-            if (value := getattr(settings.train, key)) != getattr(TrainSettings, key):
-                raise UsageError(f"train.{key}={value}: only the training of a target has this setting")
+        of_targets = ("balance", "closed_loop", "colour", "shift", "places")
+        refuse_unused(settings.train, of_targets, ": only the training of a target has this setting")
         self.target_folder = find_target(settings.results, settings.policy.target)
         name = settings.policy.named(self.artifact.kind)
         self.folder = self.artifact.path(settings.results, name, self.target_folder)

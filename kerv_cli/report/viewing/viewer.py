@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,11 @@ _START_SECONDS = 2.0
 _TIMELINES = ("step", "time")
 
 
+def recordings_below(folder: Path) -> Iterator[Path]:
+    """The .rrd files in a folder and its folders, without hidden ones."""
+    return (path for path in folder.rglob("[!.]*.rrd") if path.is_file())
+
+
 def find_recordings(paths: Sequence[Path]) -> list[Path]:
     """The .rrd files among `paths` and in its folders, the newest first.
 
@@ -36,7 +41,7 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     modified: dict[Path, float] = {}
     for path in (Path(p).expanduser() for p in paths):
         if path.is_dir():
-            modified |= {file: file.stat().st_mtime for file in path.rglob("[!.]*.rrd") if file.is_file()}
+            modified |= {file: file.stat().st_mtime for file in recordings_below(path)}
         elif not path.exists():
             raise UsageError(f"{path} does not exist: name a recording (.rrd) or a folder of them")
         elif path.suffix != ".rrd":
