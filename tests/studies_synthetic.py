@@ -179,6 +179,16 @@ def misbehave(cell: Cell) -> RunEpisode:
     return run
 
 
+def unhurried(cell: Cell) -> RunEpisode:
+    """A tenth of a second for each episode."""
+
+    def run(seed: int) -> EpisodeRecord:
+        time.sleep(0.1)
+        return episode(cell, seed)
+
+    return run
+
+
 def slow_elsewhere(cell: Cell) -> RunEpisode:
     """The first task at once, every other in a minute."""
 

@@ -32,6 +32,7 @@ from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.lab import policy as policies_of
 from kerv_cli.lab import run
+from kerv_cli.lab.claims import episodes_ended
 from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.plan import Cell, blocks_of, make_cell
 from kerv_cli.lab.run import CellRunner
@@ -320,6 +321,20 @@ def test_a_batch_is_another_cell_and_has_no_times(tmp_path: Path) -> None:
     assert stored.episodes["seconds.prefill"].isna().all()
     assert stored.episodes["order"].is_unique
     assert (stored.episodes["forwards"] > 0).all()
+
+
+def test_a_batch_notes_how_many_of_its_episodes_have_ended(tmp_path: Path) -> None:
+    store, told = StudyStore(tmp_path, "threshold"), []
+
+    class Watched(Prepared):
+        def together(self, cells: Sequence[Cell]) -> Iterator[tuple[Cell, int, EpisodeRecord | Exception]]:
+            for end in super().together(cells):
+                (note,) = store.claims.glob("*.running")
+                told.append(episodes_ended(store.claims, note.stem))
+                yield end
+
+    execute(ar_cells()[:2], Watched(), store)
+    assert told == list(range(7))
 
 
 def test_blocks_of_a_batch_hold_many_tasks_and_share_out_over_workers() -> None:

@@ -25,6 +25,7 @@ from studies_synthetic import (
     run_cell,
     slow_elsewhere,
     threshold_study,
+    unhurried,
 )
 
 from kerv_cli.base.errors import StorageError, UsageError
@@ -32,7 +33,7 @@ from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.progress import ProgressDisplay
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.lab.claims import is_claimed
-from kerv_cli.lab.events import BlockStarted, CellEnd, Event, SweepStarted
+from kerv_cli.lab.events import BlockRuns, BlockStarted, CellEnd, Event, SweepStarted
 from kerv_cli.lab.execute import RunEpisode, execute
 from kerv_cli.lab.plan import Cell, blocks_of
 from kerv_cli.lab.reuse import Stock, cover, estimate
@@ -299,6 +300,28 @@ def test_progress_on_a_terminal_is_a_bar_that_goes_away(store: StudyStore) -> No
         execute(threshold_study(["reach-v3"]), run_cell, store, on_event=display)
     assert "16/16 episodes" in written.getvalue()  # cells of a block end together
     assert written.getvalue().count("\x1b[?25h") == 1  # the cursor is shown again
+
+
+def test_a_block_in_another_process_tells_its_episodes_as_they_end(
+    store: StudyStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kerv_cli.lab.execute._POLL_SECONDS", 0.02)
+    monkeypatch.setattr("kerv_cli.cli.progress.LOG_SECONDS", -1.0)
+    written, events = io.StringIO(), list[Event]()
+    with ProgressDisplay(Console(file=written, width=60)) as display:
+
+        def on_event(event: Event) -> None:
+            events.append(event)
+            display(event)
+
+        execute(threshold_study(["reach-v3"]), unhurried, store, RuntimeSettings(workers=2), on_event)
+    told = [event.ended for event in events if isinstance(event, BlockRuns)]
+    assert told == sorted(told)
+    assert told[0] == 0
+    assert len(set(told)) > 4
+    told_first = r"^0/16 episodes, reach-v3 100000-100003: 4 settings in turn$"
+    told_later = r"^\d+/16 episodes, about \d+ s left; reach-v3 100000-100003: 4 settings in turn$"
+    assert all(re.search(line, written.getvalue(), re.M) for line in (told_first, told_later))
 
 
 def test_no_workers_is_refused(store: StudyStore) -> None:

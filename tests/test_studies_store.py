@@ -197,9 +197,10 @@ def test_claims_exclude_others_until_their_process_is_gone(store: StudyStore) ->
     assert claims.claim(folder, cells[:2], "run", "block1")
     assert not claims.claim(folder, cells[1:], "other", "block2")  # one of them is taken: none is
     assert not claims.is_claimed(folder, cells[2])
-    claims.note_running(folder, cells[1], "block1")
+    claims.note_running(folder, cells[1], "block1", 3)
     assert claims.running_cell(folder, cells, "block1") is cells[1]
     assert claims.running_cell(folder, cells, "block2") is None
+    assert [claims.episodes_ended(folder, block) for block in ("block1", "block2")] == [3, 0]
     claims.release(folder, cells, "block2")
     assert claims.is_claimed(folder, cells[0])
     claims.release(folder, cells, "block1")

@@ -18,7 +18,7 @@ from rich.progress import (
 )
 
 from kerv_cli.base.durations import duration
-from kerv_cli.lab.events import BlockStarted, BlockWaits, CellEnd, Event, SweepStarted
+from kerv_cli.lab.events import BlockRuns, BlockStarted, BlockWaits, CellEnd, Event, SweepStarted
 from kerv_cli.lab.plan import Block, Cell
 
 LOG_SECONDS = 30.0
@@ -27,8 +27,8 @@ LOG_SECONDS = 30.0
 
 class ProgressDisplay:
     """The `on_event` callback of `execute`; a context manager that ends the bar. The bar counts episodes, because the
-    cells of a block end together; where episodes run in this process, `on_step` moves it within a cell and within an
-    episode too."""
+    cells of a block end together: a block in another process tells the episodes that have ended; where episodes run in
+    this process, `on_step` moves the bar within a cell and within an episode too."""
 
     def __init__(self, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
@@ -37,8 +37,8 @@ class ProgressDisplay:
         self._total = self._finished = 0  # cells
         self._episodes = self._ended = 0  # episodes, of all cells and of the finished ones
         self._began = self._logged = 0.0
-        self._running: dict[str, Block] = {}  # by name, without their ended cells
-        self._parts: dict[str, float] = {}  # of unfinished cells, by id: episodes, one of them in part
+        self._running: dict[str, Block] = {}  # by title, without their ended cells
+        self._parts: dict[str, float] = {}  # episodes, whole and in part, of unfinished cells (by id) or blocks
 
     def __enter__(self) -> ProgressDisplay:
         return self
@@ -53,9 +53,13 @@ class ProgressDisplay:
         if isinstance(event, SweepStarted):
             self._start(event)
         elif isinstance(event, BlockStarted):
-            self._running[event.block.name] = event.block
+            self._running[event.block.title] = event.block
+        elif isinstance(event, BlockRuns):
+            self._parts[event.block.title] = event.ended
+            self._log(self._now)
         elif isinstance(event, BlockWaits):
-            self._running.pop(event.block.name, None)
+            self._running.pop(event.block.title, None)
+            self._parts.pop(event.block.title, None)
             self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
         else:
             self._finish(event.cell, _result(event))
@@ -69,10 +73,16 @@ class ProgressDisplay:
         now = f"{escape(cell.label)} on {cell.task}, seed {seed}: step {step}"
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, count=self._count, description=now)
-        elif time.monotonic() - self._logged > LOG_SECONDS:
+        else:
+            self._log(now)
+
+    def _log(self, now: str) -> None:
+        """Prints a line of progress where no bar is and the last line is old."""
+        if self._bar is None and time.monotonic() - self._logged > LOG_SECONDS:
             self._logged = time.monotonic()
             rest = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
-            self.console.print(f"{self._count}, about {duration(rest)} left; {now}", soft_wrap=True, highlight=False)
+            left = f"about {duration(rest)} left; " if self._done else ""
+            self.console.print(f"{self._count}, {left}{now}", soft_wrap=True, highlight=False)
 
     @property
     def _done(self) -> float:
@@ -107,12 +117,13 @@ class ProgressDisplay:
         self._bar.start()
 
     def _finish(self, cell: Cell, result: str) -> None:
-        for name, block in list(self._running.items()):
+        for title, block in list(self._running.items()):
             rest = block.without({cell.id})
-            if rest is None:
-                del self._running[name]
-            else:
-                self._running[name] = rest
+            if rest != block:
+                del self._running[title]
+                self._parts.pop(title, None)
+            if rest is not None:
+                self._running[rest.title] = rest
         self._finished += 1
         self._ended += len(cell.seeds)
         self._parts.pop(cell.id, None)
@@ -122,12 +133,14 @@ class ProgressDisplay:
         self.console.print(line, soft_wrap=True, highlight=False)
 
     def _refresh(self) -> None:
-        if self._bar is None:
-            return
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self._done, description=self._now, count=self._count)
+
+    @property
+    def _now(self) -> str:
         names = [block.title for block in self._running.values()]
         more = f" +{len(names) - 1}" if len(names) > 1 else ""
-        now = escape(names[0] + more if names else "cells")
-        self._bar.update(self._task, completed=self._done, description=now, count=self._count)
+        return escape(names[0] + more if names else "cells")
 
 
 def _result(end: CellEnd) -> str:

@@ -1,7 +1,8 @@
 """Claims on cells: sweeps that share a study claim a cell before they compute it, so that no two compute the same.
 
 claims/<cell id>.json     the process that computes the cell: run, block, host, pid, started
-claims/<block>.running    id of the block's cell that runs now; the file's age is the time since that episode began
+claims/<block>.running    id of the block's cell that runs now and the number of episodes that have ended; its age is
+                          the time since this episode began
 """
 
 from __future__ import annotations
@@ -83,22 +84,33 @@ def _is_held(path: Path) -> bool:
     return young and (holder.host != socket.gethostname() or is_alive(holder.pid))
 
 
-def note_running(folder: Path, cell: Cell, block: str) -> None:
-    """Notes which cell of a block runs now: if this process is killed, that cell has failed."""
+def note_running(folder: Path, cell: Cell, block: str, ended: int = 0) -> None:
+    """Notes which cell of a block runs now: if this process is killed, that cell has failed. ended: episodes of the
+    block so far."""
     path = folder / f"{block}.running"
     temporary = temporary_beside(path)
     with storage_errors(path):
-        temporary.write_text(cell.id, encoding="utf-8")
+        temporary.write_text(f"{cell.id} {ended}", encoding="utf-8")
         os.replace(temporary, path)
 
 
 def running_cell(folder: Path, cells: Sequence[Cell], block: str) -> Cell | None:
     """The cell that this attempt at the block noted last; None before its first episode."""
-    try:
-        name = read_text(folder / f"{block}.running")
-    except (OSError, ValueError):
-        return None
+    name, _ = _running(folder, block)
     return next((cell for cell in cells if cell.id == name), None)
+
+
+def episodes_ended(folder: Path, block: str) -> int:
+    """Episodes of this attempt at a block that have ended, as far as it has noted them."""
+    return _running(folder, block)[1]
+
+
+def _running(folder: Path, block: str) -> tuple[str, int]:
+    try:
+        name, ended = read_text(folder / f"{block}.running").split()
+        return name, int(ended)
+    except (OSError, ValueError):
+        return "", 0
 
 
 def release(folder: Path, cells: Sequence[Cell], block: str) -> None:

@@ -57,5 +57,13 @@ class BlockWaits:
     block: Block
 
 
-Event = SweepStarted | BlockStarted | BlockWaits | CellEnd
+@dataclass(frozen=True)
+class BlockRuns:
+    """A block runs in another process. ended: its episodes that have ended; its cells are told when all have."""
+
+    block: Block
+    ended: int
+
+
+Event = SweepStarted | BlockStarted | BlockWaits | BlockRuns | CellEnd
 OnEvent = Callable[[Event], None]

@@ -27,16 +27,16 @@ from kerv_cli.base.provenance import git_commit, stamp
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.lab.claims import claim, clean_void, is_claimed, note_running, release, running_cell
+from kerv_cli.lab.claims import claim, clean_void, episodes_ended, is_claimed, note_running, release, running_cell
 from kerv_cli.lab.code import code_hash
-from kerv_cli.lab.events import BlockStarted, BlockWaits, CellEnd, OnEvent, Outcome, SweepStarted
+from kerv_cli.lab.events import BlockRuns, BlockStarted, BlockWaits, CellEnd, OnEvent, Outcome, SweepStarted
 from kerv_cli.lab.executors import Executor, WorkerLost, check_executor
 from kerv_cli.lab.identity import ENGINE
 from kerv_cli.lab.plan import Block, Cell, blocks_of
 from kerv_cli.lab.rows import Circumstances
 from kerv_cli.lab.store import StudyStore, new_run_id
 
-_POLL_SECONDS = 1.0  # between two looks at blocks that another sweep computes
+_POLL_SECONDS = 1.0  # between two looks at blocks that another process computes
 
 RunEpisode = Callable[[int], EpisodeRecord]
 """Runs the episode of a seed."""
@@ -155,6 +155,8 @@ class _Sweep:
                     self.running[executor.submit(attempt)] = attempt
                 for future in wait(self.running, timeout=_POLL_SECONDS, return_when=FIRST_COMPLETED).done:
                     self._settle(self.running.pop(future), future)
+                for attempt in self.running.values():
+                    self.on_event(BlockRuns(attempt.block, episodes_ended(self.store.claims, attempt.name)))
                 self._look_elsewhere()
             finished = True
         finally:
@@ -307,7 +309,7 @@ class _Turn:
 
     def take(self, seed: int, order: int) -> CellEnd | None:
         """Runs one episode; writes the cell after its last one."""
-        note_running(self.work.store.claims, self.cell, self.work.name)
+        note_running(self.work.store.claims, self.cell, self.work.name, order)
         started = datetime.now(UTC)
         load = self.work.gauge(self.device) if self.work.gauge is not None else math.nan
         clock = time.perf_counter()
@@ -316,7 +318,7 @@ class _Turn:
 
     def add(self, result: EpisodeRecord | Exception, order: int) -> CellEnd | None:
         """Takes an episode of a batch, in any order of seeds; writes the cell after its last one."""
-        note_running(self.work.store.claims, self.cell, self.work.name)
+        note_running(self.work.store.claims, self.cell, self.work.name, order + 1)
         if isinstance(result, Exception):
             raise result
         started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
