@@ -316,6 +316,13 @@ def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
     assert announcement == "ar acceptance=relaxed of nano-state on reach-v3: 2 episodes"
 
 
+def test_a_plan_names_every_target_that_it_measures(policies: Path) -> None:
+    words = ["policy=state", "policy.target=nano-state,mt10-state", f"results={policies}", "task=reach", *FAST]
+    run = kerv("rollout", "--plan", "-m", "method=ar", *words)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.splitlines()[-1] == "2 settings of nano-state, mt10-state on reach-v3: 4 episodes"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("late", [False, True])
 def test_an_interrupted_command_says_so_in_one_line(

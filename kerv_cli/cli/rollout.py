@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,9 +91,10 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
     check_writable(first.results)
     # before anything heavy loads
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
-    where = ", ".join(tasks) if len(tasks) < 4 else f"{len(tasks)} tasks"
+    whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
+    where = _few(tasks, "tasks")
     count = len(settings) * len(tasks) * first.episodes * resolved.study.repeats
-    typer.echo(f"{what} of {first.policy.target} on {where}: {count} episodes", err=True)
+    typer.echo(f"{what} of {whose} on {where}: {count} episodes", err=True)
     with at_work("loading the policy"):
         from kerv_cli.lab.policy import cells_of
 
@@ -101,6 +103,11 @@ def planned_cells(resolved: ResolvedStudy) -> list[Cell]:
         if names:
             typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
     return cells
+
+
+def _few(names: Sequence[str], what: str) -> str:
+    """The names; from four on, how many they are."""
+    return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
 
 
 def run_cells(resolved: ResolvedStudy, cells: list[Cell], arguments: list[str]) -> StudyStore:
