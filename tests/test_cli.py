@@ -22,7 +22,7 @@ from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import NoSettings, Part, parts
 from kerv_cli.cli.app import app
-from kerv_cli.cli.common import one_line_errors
+from kerv_cli.cli.common import one_line_errors, progress_bar
 
 FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
@@ -314,6 +314,20 @@ def test_what_has_no_effect_is_said_in_one_line(policies: Path) -> None:
     note, announcement = run.stderr.splitlines()
     assert note == "note: acceptance=relaxed has no effect: method ar drafts nothing"
     assert announcement == "ar acceptance=relaxed of nano-state on reach-v3: 2 episodes"
+
+
+def test_plain_lines_of_progress_say_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 30.0, 45.0])
+    monkeypatch.setattr("kerv_cli.cli.common.time.monotonic", lambda: next(clock))
+    with progress_bar("training") as advance:
+        for done in (41, 42, 51, 56, 61, 101):  # resumed at 40 of 101
+            advance(done, 101, "loss 1")
+    assert capsys.readouterr().err.splitlines() == [
+        "training …", "training 41/101, loss 1", "training 51/101, about 2 min left, loss 1",
+        "training 61/101, about 90 s left, loss 1", "training 101/101, loss 1",
+    ]  # fmt: skip
 
 
 def test_a_plan_names_every_target_that_it_measures(policies: Path) -> None:

@@ -9,12 +9,14 @@ import re
 import shlex
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from kerv_cli.base.durations import duration
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.near import KEYS, OPTIONS, nearest, question
 
@@ -181,7 +183,7 @@ def at_work(what: str) -> Iterator[None]:
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     """Yields `advance(done, total, text="")`: a progress bar on a terminal, elsewhere at most 10 lines (50 for totals
-    from 2000 on). Of several processes that torchrun started, the first shows it."""
+    from 2000 on) with the time left. Of several processes that torchrun started, the first shows it."""
     if os.environ.get("RANK", "0") != "0":
         yield lambda done, total, text="": None
         return
@@ -206,14 +208,18 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
 
 
 def _plain_lines(title: str) -> Callable[..., None]:
-    latest = -1
+    latest, first, began = -1, 0, 0.0  # what is resumed does not begin at 0
 
     def advance(done: int, total: int, text: str = "") -> None:
-        nonlocal latest
+        nonlocal latest, first, began
+        if latest < 0:
+            first, began = done, time.monotonic()
         part = (50 if total >= 2000 else 10) * done // max(1, total)
         if part > latest:
-            latest = part
-            typer.echo(f"{title} {done}/{total} {text}".rstrip(), err=True)
+            latest, left = part, ""
+            if first < done < total:
+                left = f"about {duration((time.monotonic() - began) * (total - done) / (done - first))} left"
+            typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", left, text))), err=True)
 
     return advance
 
