@@ -137,8 +137,10 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
     bound = f"loses less than {loss:g} points of success against {baseline}, with 95 % confidence"
     if choice.chosen:
         times = interval(choice.as_dict(), SPEED)
-        speed = f", per episode {times} times as fast as {baseline} on this machine" if times != "–" else ""
-        return f"the fastest setting that {bound}: {choice.chosen}{speed} ({choice.pairs} pairs)"
+        if times == "–":
+            return f"{choice.chosen} {bound} ({choice.pairs} pairs); which setting is the fastest was not timed"
+        speed = f"per episode {times} times as fast as {baseline} on this machine"
+        return f"the fastest setting that {bound}: {choice.chosen}, {speed} ({choice.pairs} pairs)"
     if not choice.faster:
         return f"no setting is faster per episode than {baseline} ({choice.pairs} pairs)"
     return f"{choice.pairs} pairs do not yet show a setting that is faster and {bound}; {_missing(choice)}"
