@@ -90,7 +90,13 @@ def test_features_of_any_space_depend_on_every_number(felt: int, places: int, se
 # checkpoints
 
 
-@pytest.mark.parametrize("name", ["mt10-vision", "mt10-state", "mt10-state-h8"])
+def test_the_policy_of_the_plain_protocol_sees_two_views() -> None:
+    target, _ = load_target(shipped_dir() / "mt50-plain" / "target")
+    assert target.cameras == ("corner4+gripperPOV:75",)
+    assert target.observation == SPEC.observation
+
+
+@pytest.mark.parametrize("name", ["mt10-vision", "mt10-state"])
 def test_the_shipped_targets_load_with_metaworlds_spaces(name: str) -> None:
     target, description = load_target(shipped_dir() / name / "target")
     assert isinstance(target, CompactTarget)

@@ -11,9 +11,9 @@ from kerv_cli.base.limits import check_name
 
 RELEASED = {
     "mt10-state": "074e70fddd4f9a41885d7af9e93d81c722b3e470e23a2f560facf1556442f050",
-    "mt10-state-h8": "9669af18d21a824f5962a03961226e66fb01ff9a644cfc96ae8d8876af308c52",
     "mt10-vision": "d2bda555360bfcd04b9d3c77a665623b23c1c9fedff1229838ade1f5cfca47de",
     "mt10-vision-parallel": "096ce2dae9793b7f2efa3fbf020bebaf9ec6b664e650ab8ef97efc503db1e7f4",
+    "mt50-plain": "c2455773de37ced5e7a6db9bfda64a36375c27a7c62a8c2b354a9af55e548f54",
     "mt50-vision": "11cbcfd366f20df05355e5715afc4bb0d032547815b0e3821dd8ee66ea46727b",
 }
 """Shipped policy -> SHA-256 of its target's weights. The wheel holds one of them, a checkout and a release all."""
