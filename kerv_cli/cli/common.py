@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kerv_cli.base.durations import duration
+from kerv_cli.base.durations import left
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.near import KEYS, OPTIONS, nearest, question
 
@@ -216,10 +216,9 @@ def _plain_lines(title: str) -> Callable[..., None]:
             first, began = done, time.monotonic()
         part = (50 if total >= 2000 else 10) * done // max(1, total)
         if part > latest:
-            latest, left = part, ""
-            if first < done < total:
-                left = f"about {duration((time.monotonic() - began) * (total - done) / (done - first))} left"
-            typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", left, text))), err=True)
+            latest = part
+            rest = left(time.monotonic() - began, done - first, total - first) if first < done < total else ""
+            typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", rest, text))), err=True)
 
     return advance
 

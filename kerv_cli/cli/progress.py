@@ -17,7 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from kerv_cli.base.durations import duration
+from kerv_cli.base.durations import left
 from kerv_cli.lab.events import BlockRuns, BlockStarted, BlockWaits, CellEnd, Event, SweepStarted
 from kerv_cli.lab.plan import Block, Cell
 
@@ -56,33 +56,30 @@ class ProgressDisplay:
             self._running[event.block.title] = event.block
         elif isinstance(event, BlockRuns):
             self._parts[event.block.title] = event.ended
-            self._log(self._now)
         elif isinstance(event, BlockWaits):
             self._running.pop(event.block.title, None)
             self._parts.pop(event.block.title, None)
             self.console.print(f"{event.block.name}: another sweep computes it", soft_wrap=True, highlight=False)
         else:
             self._finish(event.cell, _result(event))
-        self._refresh()
+        if self._bar is not None or isinstance(event, BlockRuns):
+            self._show(self._now)
 
     def on_step(self, cell: Cell, seed: int, step: int) -> None:
         """Shows that `step` control steps of a seed's episode were executed; at most one episode runs at a time."""
         horizon, seeds = int(cell.settings["world"]["horizon"]), list(cell.seeds)
         # half an episode's share for a step at half the horizon: successful episodes end early and then jump
         self._parts[cell.id] = seeds.index(seed) + min(1.0, step / max(1, horizon))
-        now = f"{escape(cell.label)} on {cell.task}, seed {seed}: step {step}"
+        self._show(f"{escape(cell.label)} on {cell.task}, seed {seed}: step {step}")
+
+    def _show(self, now: str) -> None:
+        """Moves the bar; where there is none, prints a line if the last one is old."""
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, count=self._count, description=now)
-        else:
-            self._log(now)
-
-    def _log(self, now: str) -> None:
-        """Prints a line of progress where no bar is and the last line is old."""
-        if self._bar is None and time.monotonic() - self._logged > LOG_SECONDS:
+        elif time.monotonic() - self._logged > LOG_SECONDS:
             self._logged = time.monotonic()
-            rest = (self._logged - self._began) * (self._episodes / max(self._done, 0.1) - 1)
-            left = f"about {duration(rest)} left; " if self._done else ""
-            self.console.print(f"{self._count}, {left}{now}", soft_wrap=True, highlight=False)
+            rest = f"{left(self._logged - self._began, max(self._done, 0.1), self._episodes)}; " if self._done else ""
+            self.console.print(f"{self._count}, {rest}{now}", soft_wrap=True, highlight=False)
 
     @property
     def _done(self) -> float:
@@ -131,10 +128,6 @@ class ProgressDisplay:
         alone = f", seed {cell.seeds[0]}" if len(cell.seeds) == 1 else ""
         line = f"{count} {escape(cell.label)} on {cell.task}{alone}: {result}"
         self.console.print(line, soft_wrap=True, highlight=False)
-
-    def _refresh(self) -> None:
-        if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, description=self._now, count=self._count)
 
     @property
     def _now(self) -> str:
